@@ -171,6 +171,14 @@ _MODULES = {
 }
 """Public names of each module. A module is imported when one of its names is first used."""
 
+_EXTRAS = {
+    "files.cphd": "radar",
+    "files.cphd_writing": "radar",
+    "mosaics.mosaic": "mosaic",
+    "mosaics.store": "mosaic",
+}
+"""Extras of modules that need more packages when they are used than when they are imported."""
+
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}
 
 
@@ -179,7 +187,11 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module("clsas.plot")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'clsas' has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"clsas.{_MODULE_OF[name]}"), name)
+    from clsas.core.extras import needed
+
+    module = _MODULE_OF[name]
+    with needed(f"clsas.{name}", _EXTRAS.get(module)):
+        value = getattr(importlib.import_module(f"clsas.{module}"), name)
     globals()[name] = value
     return value
 

@@ -5,8 +5,13 @@ import sys
 
 def run() -> None:
     """Run the command; Ctrl-C ends it with code 130 also while its modules are imported."""
+    from clsas.core.extras import needed
+
     try:
-        from clsas.cli import main
+        with needed("the command line", "cli"):
+            from clsas.cli import main
+    except ImportError as error:
+        sys.exit(f"Error: {error}")
     except KeyboardInterrupt:
         print("Interrupted", file=sys.stderr)
         sys.exit(130)

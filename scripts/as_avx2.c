@@ -1,7 +1,7 @@
-/* Hides AVX-512 from a program, so that compilers and libraries take the processor for a Haswell with AVX2.
+/* Hides AVX-512 from a program, so that compilers and libraries see a Haswell processor with AVX2.
  *
- * Preloaded, it lets the kernel fault every CPUID instruction (arch_prctl(ARCH_CPUID), which needs Linux and a
- * processor with CPUID faulting), answers the faults itself, and keeps SIGSEGV's handler from being replaced.
+ * When preloaded, this library makes every CPUID instruction fault (arch_prctl(ARCH_CPUID), which needs Linux and a
+ * processor with CPUID faulting), answers the faults itself, and prevents the handler of SIGSEGV from being replaced.
  */
 #define _GNU_SOURCE
 #include <cpuid.h>
@@ -36,7 +36,7 @@ static void answer(int number, siginfo_t *info, void *context)
 {
     greg_t *registers = ((ucontext_t *)context)->uc_mcontext.gregs;
     if (info->si_code != SI_KERNEL || memcmp((const void *)registers[REG_RIP], "\x0f\xa2", 2)) {
-        /* A fault of the program's own: theirs to handle when it happens again. */
+        /* A fault of the program itself: its own handler takes over when the instruction is repeated. */
         real_sigaction(SIGSEGV, &theirs, NULL);
         return;
     }

@@ -1,4 +1,4 @@
-"""Print the table of docs/how-to/devices.md from what `scripts/drivers` has found."""
+"""Print the table of docs/how-to/devices.md from the results of `scripts/drivers`."""
 
 import json
 import re
@@ -30,7 +30,7 @@ def main() -> None:
 
 
 def selftest(path: Path) -> tuple[str, str]:
-    """Return the driver's version and how many images are within their bounds."""
+    """Return the driver's version, and the number of images within their bounds."""
     if not path.exists() or not path.stat().st_size:
         return "-", "ended early" if path.exists() else "-"
     found = json.loads(path.read_text())
@@ -39,7 +39,7 @@ def selftest(path: Path) -> tuple[str, str]:
 
 
 def tests(path: Path) -> str:
-    """Return what pytest has counted."""
+    """Return the counts that pytest printed."""
     if not path.exists():
         return "-"
     counted = re.findall(r"(\d+ (?:failed|passed|errors?))", path.read_text()[-500:])
@@ -47,7 +47,7 @@ def tests(path: Path) -> str:
 
 
 def bench_seconds(path: Path) -> dict[str, list[float]]:
-    """Return the seconds of every turn of a case: of factorized images by a plan that is given."""
+    """Return the seconds of every turn by case; planning factorized images is not included."""
     seconds = {case: [] for case in CASES}
     for line in path.read_text().splitlines() if path.exists() else ():
         found = json.loads(line)
@@ -56,7 +56,7 @@ def bench_seconds(path: Path) -> dict[str, list[float]]:
 
 
 def relative(seconds: list[float], reference: list[float]) -> str:
-    """Return the median of a driver's times, and of their ratios to the reference's, by turns."""
+    """Return the median of a driver's times, and of their ratios to the reference turn by turn."""
     if not seconds:
         return "-"
     shown = f"{median(seconds):.3g} s"

@@ -1,6 +1,6 @@
-"""Run clsas's tests, tuning and benchmarks on one device, and write a report in Markdown.
+"""Run the tests, tuning and benchmarks of clsas on one device, and write a report in Markdown.
 
-`scripts/gpu` runs this in an environment that has what it needs.
+`scripts/gpu` runs this in an environment with everything that it needs.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from clsas.opencl.device import DeviceError, open_device
 ROOT = Path(__file__).parents[1]
 PYTHON = sys.executable
 LIMIT_S = 3600
-"""Of each part: what hangs is cut off, and the next part runs."""
+"""Limit for each part. A part that hangs is ended, and the next one runs."""
 
 PARTS = {
     "Devices": [PYTHON, "-m", "clsas", "devices"],
@@ -37,15 +37,17 @@ QUICK = {
     "Factorized imaging": [*PARTS["Factorized imaging"], "--case", "ffbp-thesis"],
     "Scaling": [PYTHON, "scripts/bench", "scaling", "--largest", "512", "--device", "{device}"],
 }
-"""A selection of some minutes, which shows whether a report can be made."""
+"""A selection that takes some minutes and shows whether a report can be made."""
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--device", default="gpu", help="as `clsas devices` shows it")
+    parser.add_argument("--device", default="gpu", help="device, as listed by `clsas devices`")
     parser.add_argument("--out", type=Path, default=Path("gpu-report.md"))
-    parser.add_argument("--only", default="", help="parts whose name contains this")
-    parser.add_argument("--quick", action="store_true", help="some parts, in minutes")
+    parser.add_argument("--only", default="", help="text that the name of a part must contain")
+    parser.add_argument(
+        "--quick", action="store_true", help="run only some parts, which take minutes"
+    )
     given = parser.parse_args()
     parts = QUICK if given.quick else PARTS
     try:
@@ -65,14 +67,14 @@ def main() -> int:
             for name, command in parts.items()
             if given.only in name and not run(name, command, given.device, report)
         ]
-        ended = f"failed: {', '.join(failed)}" if failed else "all parts ended well"
+        ended = f"failed: {', '.join(failed)}" if failed else "all parts succeeded"
         report.write(f"\n{ended[0].upper()}{ended[1:]}.\n")
     print(f"wrote {given.out}; {ended}")
     return int(bool(failed))
 
 
 def run(name, command, device, report):
-    """Run a part and write what it printed; return whether it ended well."""
+    """Run a part and write its output to the report; return whether it succeeded."""
     command = [word.format(device=device) for word in command]
     shown = " ".join(["python" if word == PYTHON else word for word in command])
     print(f"== {name}: {shown}", flush=True)
@@ -82,18 +84,18 @@ def run(name, command, device, report):
             command, cwd=ROOT, env=os.environ | {"CLSAS_DEVICE": device}, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=LIMIT_S,
         )  # fmt: skip
-        printed, ended = done.stdout, f"ended with {done.returncode}"
+        printed, ended = done.stdout, f"exit code {done.returncode}"
     except subprocess.TimeoutExpired as error:
-        printed, ended = (error.stdout or b"").decode(errors="replace"), "was cut off"
+        printed, ended = (error.stdout or b"").decode(errors="replace"), "ended by the limit"
     seconds = time.monotonic() - start
     text = printed if printed.startswith("|") else f"```\n{printed}```\n"
     report.write(f"\n## {name}\n\n`{shown}`: {ended} after {seconds:.0f} s.\n\n{text}")
     report.flush()
-    return ended == "ended with 0"
+    return ended == "exit code 0"
 
 
 def commit():
-    """Return the commit of this checkout, or that there is none or no git to ask."""
+    """Return the commit of this checkout, or why it is unknown."""
     command = ["git", "-C", ROOT, "rev-parse", "--short", "HEAD"]
     try:
         done = subprocess.run(command, text=True, capture_output=True)

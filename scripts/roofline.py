@@ -1,8 +1,8 @@
-"""Main loops of the kernels against the limits of a CPU: `scripts/bench roofline`.
+"""Main loops of the kernels compared with the limits of a CPU: `scripts/bench roofline`.
 
-A program of its own forms small images of the cases with PoCL, which leaves its machine code in a
-cache. The main loop of a kernel is its innermost loop with the most multiply-adds. objdump
-(binutils) reads it; llvm-mca (Debian: llvm) schedules it on the ports of a processor that it knows.
+A separate process forms small images of the cases with PoCL, which stores its machine code in a
+cache. The main loop of a kernel is the innermost loop with the most multiply-adds. objdump
+(binutils) disassembles it, and llvm-mca (Debian: llvm) schedules it on the ports of a processor.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ ITERATIONS = 200
 REPEATS = 5
 KERNELS = ("backproject_tiles", "backproject_points", "stage")
 IMAGES = {"bp-2k": (-50.0, -80.0), "ffbp-2k": (-50.0,), "ffbp-relief": (-50.0,)}
-PIXELS = 384  # along a side of the part of bp-2k that is formed
+PIXELS = 384  # along each side of the part of bp-2k that is formed
 
 
 class RooflineError(Exception):
-    """A tool that reads machine code is missing, or the device does not keep any."""
+    """A tool that reads machine code is missing, or the device does not store machine code."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,12 @@ class Loop:
     lines: tuple[str, ...]
 
     def count(self, pattern: str) -> int:
-        """Return how many instructions match a pattern."""
+        """Return the number of instructions that match a pattern."""
         return sum(bool(re.search(pattern, line)) for line in self.lines)
 
     @property
     def multiply_adds(self) -> int:
-        """Fused multiply-adds of vectors."""
+        """Number of fused multiply-adds of vectors."""
         return self.count(r"^vfn?m(add|sub)\w+p[sd] ")
 
 
@@ -75,7 +75,7 @@ def main_loop(library: Path) -> Loop:
 
 
 def counts(loop: Loop) -> dict[str, int]:
-    """Return how many instructions a loop has, and how many of each kind."""
+    """Return the number of instructions in a loop, and the number of each kind."""
     return {
         "instructions": len(loop.lines),
         "multiply-adds": loop.multiply_adds,
@@ -86,9 +86,9 @@ def counts(loop: Loop) -> dict[str, int]:
 
 
 def scheduled(loop: Loop, processor: str) -> tuple[str, str]:
-    """Return a loop's cycles per iteration on a processor, and its busiest port with its cycles.
+    """Return the cycles of an iteration on a processor, and its busiest port with its cycles.
 
-    Both are "-" for a processor without the loop's instructions.
+    Both are "-" if the processor lacks instructions of the loop.
     """
     lines = [re.sub(r"^(j[a-z]+)\s.*", r"\1 .L0", line) for line in loop.lines]
     lines = [re.sub(r"0x[0-9a-f]+\(%rip\)|<.*>", ".LC0(%rip)", line) for line in lines]
@@ -106,7 +106,7 @@ def scheduled(loop: Loop, processor: str) -> tuple[str, str]:
     cycles = region["SummaryView"]["TotalCycles"] / ITERATIONS
     names = report["TargetInfo"]["Resources"]
     usage = region["ResourcePressureView"]["ResourcePressureInfo"]
-    whole = max(each["InstructionIndex"] for each in usage)  # the entry that adds up all
+    whole = max(each["InstructionIndex"] for each in usage)  # the entry with the sum of all
     busy = {
         names[each["ResourceIndex"]]: each["ResourceUsage"]
         for each in usage
@@ -117,7 +117,7 @@ def scheduled(loop: Loop, processor: str) -> tuple[str, str]:
 
 
 def table(device: str | None) -> None:
-    """Print the main loops of the kernels that images of the cases need."""
+    """Print the main loops of the kernels that form the images of the cases."""
     for tool, package in (("objdump", "binutils"), ("llvm-mca", "llvm")):
         if not shutil.which(tool):
             raise RooflineError(f"{tool} is not installed (Debian: apt install {package})")
@@ -146,7 +146,7 @@ def _row(loop: Loop, milliseconds: float) -> list[str]:
 
 
 def _formed(case: str, accuracy_db: float, device: int, cache: str) -> dict[str, float]:
-    """Form an image with an empty cache of kernels; return the kernels' least milliseconds."""
+    """Return the least milliseconds of every kernel, from images with an empty kernel cache."""
     environment = dict(os.environ, POCL_CACHE_DIR=cache)
     words = [sys.executable, __file__, case, str(accuracy_db), str(device)]
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
@@ -154,7 +154,7 @@ def _formed(case: str, accuracy_db: float, device: int, cache: str) -> dict[str,
         raise RooflineError(done.stderr.strip().splitlines()[-1])
     times = json.loads(done.stdout.splitlines()[-1])
     if not any(Path(cache).rglob("*.so")):
-        raise RooflineError("this device keeps no machine code: the table is for PoCL on a CPU")
+        raise RooflineError("this device stores no machine code; the table needs PoCL on a CPU")
     return times
 
 

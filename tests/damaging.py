@@ -1,4 +1,4 @@
-"""Files damaged at random, and what loading them comes to."""
+"""Files that are damaged at random, and the outcome of loading them."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ import clsas
 
 
 def refused(whole, path, *, number, flips, within=None):
-    """How many of `number` damaged copies of a file are refused; each by an error that names it.
+    """Return how many of `number` damaged copies are refused, each with an error that names it.
 
     A copy is cut, or has `flips` bits changed in its first `within` bytes. The others load.
     """
@@ -27,7 +27,7 @@ def refused(whole, path, *, number, flips, within=None):
 
 
 def message_of(path):
-    """The message of the one error that loading a file may end in, or None."""
+    """Return the message of the error that loading a file raises, or None if it is loaded."""
     try:
         clsas.load(path)
     except (ValueError, TypeError) as error:

@@ -1,4 +1,4 @@
-"""A small store with heights, to be damaged."""
+"""A small store with heights, for tests that damage it."""
 
 import json
 
@@ -12,16 +12,16 @@ from clsas.mosaics.documents import with_checksum
 PLANE = Grid.plane((-4, 4, 40), (30, 40, 30))
 GRID = PLANE.with_height(np.linspace(0, 1, PLANE.size).reshape(PLANE.shape))
 LINES = lines_over(GRID, along_x(60, 0.1), carrier_hz=100e3, step_m=0.03)
-WISH = {"accuracy_db": -50, "beam": clsas.BeamWindow(8.0, "hann"), "patches": (2, 3)}
+REQUEST = {"accuracy_db": -50, "beam": clsas.BeamWindow(8.0, "hann"), "patches": (2, 3)}
 
 
 def files_of(path):
-    """The files of a store, by path in it."""
+    """Return the contents of the files of a store, by their path in it."""
     return {each.relative_to(path): each.read_bytes() for each in path.rglob("*") if each.is_file()}
 
 
 def written(path, files):
-    """Write the files of a store."""
+    """Write files into a store; return its path."""
     for name, content in files.items():
         (path / name).parent.mkdir(parents=True, exist_ok=True)
         (path / name).write_bytes(content)

@@ -9,9 +9,54 @@ from pathlib import Path
 import pytest
 
 import clsas
+from clsas.core import extras
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+IMAGING = """
+import numpy as np
+import clsas
+from clsas.planning.costs import Costs
+
+positions_m = np.zeros((64, 3))
+positions_m[:, 0] = np.linspace(-0.5, 0.5, 64)
+range_m = np.hypot(positions_m[:, 0], 20.0)
+step_m, first_m, wavenumber = 0.01, 18.5, 2 * np.pi * 40
+at_m = first_m + step_m * np.arange(300) - range_m[:, None]
+samples = np.exp(-((at_m / 0.04) ** 2) - 2j * wavenumber * range_m[:, None])
+lines = clsas.RangeLines(samples, first_m, step_m, positions_m, positions_m, 40 * 1500, 1500)
+grid = clsas.Grid.plane(x=(-0.4, 0.4, 64), y=(19.6, 20.4, 64))
+exact = clsas.backproject(lines, grid)
+plan = clsas.plan(lines, grid, tolerance_db=-40, costs=Costs(pixel_ns=1e6))
+print(plan.describe())
+image = clsas.factorize(lines, grid, plan)
+assert not plan.is_exact
+assert clsas.relative_error_db(image, exact) < -40
+assert clsas.relative_error_db(clsas.factorize(lines, grid, -40), exact) < -40
+"""
+"""An exact and a factorized image of arrays."""
+
+CORE = """
+import sys
+
+ALLOWED = {"clsas", "numpy", "scipy", "pyopencl", *sys.stdlib_module_names}
+ALLOWED |= {"pytools", "platformdirs", "siphash24", "typing_extensions"}  # of PyOpenCL
+
+class Blocking:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] not in ALLOWED and not name.startswith("_"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Blocking())
+"""
+"""Lets a program import only what a bare installation brings."""
+
+
+def in_core(program, *arguments):
+    """The finished process of a program that can import only what a bare installation brings."""
+    command = [sys.executable, "-c", CORE + program, *arguments]
+    return subprocess.run(command, capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +105,112 @@ print(abs(image.pixels[0]))
     assert float(peak) == pytest.approx(1, abs=1e-3)
 
 
+@pytest.mark.slow
+def test_a_bare_installation_forms_images(wheel, tmp_path):
+    """Only a driver is added to it."""
+    (archive,) = wheel.parent.glob("clsas-*.whl")
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "bare"], check=True)
+    python = tmp_path / "bare" / "bin" / "python"
+    command = [python, "-m", "pip", "install", "--quiet", f"{archive}[pocl]"]
+    installed = subprocess.run(command, capture_output=True, text=True)
+    if installed.returncode and "No matching distribution found" in installed.stderr:
+        pytest.skip("no package index can be reached")
+    assert installed.returncode == 0, installed.stderr
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+
+    def ran(*command):
+        return subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True
+        )
+
+    optional = {
+        re.split(r"[^\w-]", each)[0] for names in extras.PACKAGES.values() for each in names
+    }
+    program = f"""
+import importlib.util
+print({sorted(optional)}, [n for n in {sorted(optional)} if importlib.util.find_spec(n)])
+"""
+    assert ran(python, "-c", program).stdout.endswith("] ['pyopencl']\n")
+    imaged = ran(python, "-c", IMAGING)
+    assert imaged.returncode == 0, imaged.stderr
+    told = ran(python.with_name("clsas"), "devices")
+    assert told.returncode == 1
+    assert told.stderr.startswith("Error: click is not installed, and is needed for the command")
+
+
+def test_images_of_arrays_need_numpy_scipy_and_pyopencl_alone():
+    done = in_core(IMAGING)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_each_public_name_is_there_or_says_what_to_install():
+    program = """
+import clsas
+for name in clsas.__all__:
+    try:
+        getattr(clsas, name)
+    except ImportError as error:
+        print(name, error, sep=": ")
+"""
+    done = in_core(program)
+    assert done.returncode == 0, done.stderr
+    said = dict(line.split(": ", 1) for line in done.stdout.splitlines())
+    for name, message in said.items():
+        pattern = rf"\w+ is not installed, and is needed for clsas\.{name}: pip install '.*'"
+        assert re.fullmatch(pattern, message)
+    assert said.keys() == {
+        *("FileFormatError", "load", "save", "read_airsas", "read_cphd", "read_full_matrix"),
+        *("read_phase_history", "write_cphd", "Mosaic", "Patch", "Store", "mosaic"),
+        *("Processed", "process", "assess", "survey_lines", "simulate", "simulate_lines"),
+        "wavenumber",
+    }
+    assert "'sarkit>=" in said["read_cphd"]
+    assert "'zarr>=" in said["mosaic"]
+
+
+def test_calls_say_what_to_install():
+    calls = {
+        "plan.to_json()": "pydantic is not installed, and is needed for plans as JSON: ",
+        "clsas.Plan.from_json('')": "pydantic is not installed, and is needed for plans as JSON: ",
+        "clsas.compress(echoes)": "finufft is not installed, and is needed for simulation and",
+        "clsas.to_xarray(grid)": "xarray is not installed, and is needed for to_xarray: ",
+        "image.plot()": "matplotlib is not installed, and is needed for pictures: ",
+        "clsas.plot.image_db(image)": "matplotlib is not installed, and is needed for pictures: ",
+    }
+    program = f"""
+import numpy as np
+import clsas
+track = np.zeros((8, 3))
+grid = clsas.Grid.plane(x=(0, 1, 4), y=(9, 10, 4))
+image = clsas.Image(np.ones((4, 4), complex), grid)
+lines = clsas.RangeLines(np.ones((8, 50), complex), 7.0, 0.1, track, track, 0, 1500)
+plan = clsas.plan(lines, grid, stages=[])
+pulse = clsas.Pulse(1e4, 1e3, 1e-2)
+echoes = clsas.Echoes(np.ones((8, 100), complex), 0.0, 4e3, 1e4, track, track, 1500, pulse)
+for call in {list(calls)}:
+    try:
+        eval(call)
+    except ImportError as error:
+        print(error)
+"""
+    done = in_core(program)
+    assert done.returncode == 0, done.stderr
+    for said, expected in zip(done.stdout.splitlines(), calls.values(), strict=True):
+        assert said.startswith(expected)
+        assert "pip install" in said
+
+
+def test_the_command_says_what_to_install():
+    program = "import clsas.__main__ as program; program.run()"
+    done = in_core(program, "devices")
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert done.stderr.startswith(
+        "Error: click is not installed, and is needed for the command line: pip install 'h5py>="
+    )
+
+
 def test_versions_agree():
     assert PROJECT["version"] == clsas.__version__
 
@@ -87,3 +238,17 @@ def test_scripts_without_a_python_say_so(script, tmp_path):
     assert done.returncode == 1
     assert "Python 3.11 or later is needed" in done.stderr
     assert "apt install python3 python3-venv" in done.stderr
+
+
+def test_the_table_of_dependencies_names_each_with_its_extra():
+    text = (ROOT / "docs" / "contributing.md").read_text()
+    rows = re.findall(r"^\| ([\w-]+) \|.*\| (.+) \|$", text, re.MULTILINE)
+    table = {name: needs.strip("`") for name, needs in rows if name != "dependency"}
+    bare = {re.split(r"[^\w-]", each)[0] for each in PROJECT["dependencies"]}
+    assert {name for name, needs in table.items() if needs == "everyone"} == bare
+    for extra, requirements in PROJECT["optional-dependencies"].items():
+        names = {re.split(r"[^\w-]", each)[0] for each in requirements} - {"clsas"}
+        if extra == "pocl":
+            assert table["pocl"] == "pocl"
+        elif extra not in ("all", "test", "docs"):
+            assert {name for name, needs in table.items() if needs == extra} == names

@@ -8,12 +8,11 @@ sums of aligned lines.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from clsas.aperture.dense_channels import (
     SheetChannels,
@@ -34,14 +33,14 @@ from clsas.aperture.predicted_channels import (
 )
 from clsas.aperture.virtual_channels import VirtualChannels, interpolated_channels
 from clsas.core import reprs
-from clsas.core.fields import CONFIG
+from clsas.core.fields import CONFIG, Constraint
 from clsas.signal.fields import RangeFilter
 from clsas.signal.interpolation import Gain, Interpolator
 
-_Cycles = Annotated[float, Field(ge=-0.5, le=0.5)]
+_Cycles = Annotated[float, Constraint(ge=-0.5, le=0.5)]
 
 
-@dataclass(frozen=True, eq=False, config=CONFIG)
+@dataclass(frozen=True, eq=False)
 class InterpolatedAperture:
     """Virtual channels between which steering functions are interpolated.
 
@@ -62,8 +61,8 @@ class InterpolatedAperture:
     """
 
     filter: RangeFilter
-    oversampling: tuple[Annotated[float, Field(ge=1.0, le=100.0)], ...]
-    beam_cycles: Annotated[float, Field(ge=0.0, le=1e3)]
+    oversampling: tuple[Annotated[float, Constraint(ge=1.0, le=100.0)], ...]
+    beam_cycles: Annotated[float, Constraint(ge=0.0, le=1e3)]
     band: tuple[_Cycles, _Cycles]
     shape: Shape = "track"
     method: Literal["interpolated"] = "interpolated"
@@ -74,6 +73,7 @@ class InterpolatedAperture:
     splits_leaves: ClassVar[bool] = False
     """Leaves are small enough for expansions of ranges about their centres."""
 
+    __pydantic_config__ = CONFIG
     __repr__ = reprs.of_fields
 
     @property

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from clsas.aperture.dense_tracks import Shape
 from clsas.aperture.predicted_channels import StageChannels, VisiblePhases
 from clsas.aperture.virtual_channels import VirtualChannels, summed_neighbours
-from clsas.core.fields import CONFIG, Whole
+from clsas.core.fields import CONFIG, Constraint, Whole
 from clsas.signal.interpolation import Gain, Interpolator
 
 Stages = Sequence[tuple[int, int]]
 """(QR, QI) of each stage: the number of lines summed, and the divisor of both image sides."""
 
 
-@dataclass(frozen=True, config=CONFIG)
+@dataclass(frozen=True)
 class NearestBeams:
     """Virtual channels that are plain sums of neighbours, at their mean positions [43].
 
@@ -33,7 +32,7 @@ class NearestBeams:
         Number of neighbours that are summed into one virtual channel, QR, stage by stage.
     """
 
-    factors: Annotated[tuple[Whole, ...], Field(min_length=1)]
+    factors: Annotated[tuple[Whole, ...], Constraint(min_length=1)]
     method: Literal["nearest"] = "nearest"
 
     filter: ClassVar[Interpolator] = Interpolator(1, 1.0, np.zeros((0, 2, 0)), -math.inf, -math.inf)
@@ -47,6 +46,8 @@ class NearestBeams:
     aligns_phases: ClassVar[bool] = False
     splits_leaves: ClassVar[bool] = True
     """Leaves have the size that the stages define, and are backprojected in smaller tiles."""
+
+    __pydantic_config__ = CONFIG
 
     @property
     def stages(self) -> int:

@@ -16,6 +16,7 @@ from typing import Any
 import click
 
 import clsas
+from clsas.core.extras import needed
 
 # Module and first sentence of the help of every command, under the headings of `clsas --help`.
 # Importing the module of a command takes up to a second: --help, --version and completion do not.
@@ -72,7 +73,7 @@ class _Commands(click.Group):
         if cmd_name not in _COMMANDS:
             return None
         module, _ = _COMMANDS[cmd_name]
-        with _importing():
+        with _importing(), needed("the command line", "cli"):
             imported = importlib.import_module(f"clsas.cli.{module}")
         return getattr(imported, cmd_name.replace("-", "_"))
 

@@ -24,7 +24,7 @@ from clsas.cli.inputs import (
 )
 from clsas.cli.outputs import printable, progress_bar, report, say
 from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart, keep_out
-from clsas.core.extras import install_command
+from clsas.core.extras import needed
 from clsas.core.threads import uninterrupted
 from clsas.exact.backprojection import ACCURACY_DB
 from clsas.files.scene_files import SceneFile, simulation_digest
@@ -339,15 +339,11 @@ def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     if workers is None and scheduler is None:
         yield None
         return
-    try:
+    with needed("--workers and --scheduler"):
         from distributed import Client
         from distributed.scheduler import KilledWorker
 
         from clsas.mosaics.workers import local_client
-    except ImportError:
-        raise ImportError(
-            f"--workers and --scheduler need Dask: {install_command('mosaic')}"
-        ) from None
     with ExitStack() as opened:
         if scheduler is not None:
             try:

@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from clsas.core import validate
-from clsas.core.extras import install_command, is_installed
+from clsas.core.extras import check_installed
 from clsas.core.reading import check_ordinary
 
 
@@ -227,6 +227,5 @@ def _exists(path: Path) -> bool:
 
 
 def need_matplotlib() -> None:
-    """Raise ClickException if matplotlib is not installed."""
-    if not is_installed("matplotlib"):
-        raise click.ClickException(f"pictures need matplotlib: {install_command('plot')}")
+    """End the command if pictures cannot be drawn."""
+    check_installed("matplotlib", "pictures")

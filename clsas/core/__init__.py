@@ -1,1 +1,1 @@
-"""Data: range lines, grids and images, with the checks, files and numbers that all rooms share."""
+"""Range lines, grids and images, with the checks, files and numbers that all rooms share."""

@@ -1,8 +1,8 @@
 """Files and folders that appear complete or not at all, even after a crash or power failure.
 
-A file is written under a temporary name, `.clsas-*.part`, in its destination folder. The writer
-holds a lock on it. A temporary file without a lock was left by a killed process; the next writer in
-the folder removes it. The contents reach the disk before the name does.
+A file is written under a temporary name, `.clsas-*.part`, in its destination folder, and its writer
+keeps it locked. A temporary file that is not locked was left behind by a killed process, and the
+next writer in the folder removes it. The contents reach the disk before the file gets its name.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _LOCK = ".clsas.lock"
 def replacing(path: str | os.PathLike) -> Iterator[Path]:
     """Yield an empty temporary file to write; rename it to `path` on success, else remove it.
 
-    A symbolic link stays, and the file that it leads to is replaced. The new file has the mode of
-    the one before and, where that is permitted, its owner and group.
+    If `path` is a symbolic link, the link stays and the file it points to is replaced. The new file
+    keeps the mode of the old one and, where that is permitted, its owner and group.
 
     Raises
     ------
@@ -51,7 +51,8 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         before = path.stat()
     with _temporary(path, _make_file) as (temporary, descriptor):
         if before is not None:
-            # Before there is anything to read in it; whoever writes it must be able to open it.
+            # Done while the file is still empty, so that no other user can read its contents in the
+            # meantime. The writer must be able to open it.
             _own_as(descriptor, before)
             os.fchmod(descriptor, stat.S_IMODE(before.st_mode) | stat.S_IWUSR)
         yield temporary
@@ -59,14 +60,14 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
             os.fchmod(descriptor, stat.S_IMODE(before.st_mode))
         os.fsync(descriptor)
         with suppress(OSError):  # some file systems have no locks
-            # From now on others may read it, and HDF5 shares a lock for that.
+            # From now on other processes may read it, for which HDF5 takes a shared lock.
             fcntl.flock(descriptor, fcntl.LOCK_SH)
         os.replace(temporary, path)
         sync_folder(path.parent)
 
 
 def _own_as(descriptor: int, before: os.stat_result) -> None:
-    """Give a file the owner and the group of another one, or either, where that is permitted."""
+    """Give a file the owner and the group of another one, each where that is permitted."""
     for owner, group in ((before.st_uid, -1), (-1, before.st_gid)):
         with suppress(PermissionError):
             os.fchown(descriptor, owner, group)
@@ -76,7 +77,7 @@ def _own_as(descriptor: int, before: os.stat_result) -> None:
 def creating(path: Path) -> Iterator[Path]:
     """Yield an empty temporary folder to fill; rename it to `path` on success, else remove it.
 
-    If another process has meanwhile created a folder with contents at `path`, that one stays.
+    If another process has meanwhile created a folder with contents at `path`, that folder stays.
 
     Raises
     ------
@@ -102,10 +103,11 @@ def staging(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder, which one process can have at a time.
+    """Keep a folder locked, which only one process can do at a time.
 
-    The lock is on a file that is removed at the end. A killed process leaves the file, but not the
-    lock. Where no file can be made, or the file system has no locks, nothing is locked.
+    The lock is on a file in the folder that is removed at the end. A killed process leaves the file
+    behind, but not the lock. Where the file cannot be created, or the file system has no locks,
+    nothing is locked.
 
     Raises
     ------
@@ -122,7 +124,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _lock(folder: Path) -> int | None:
-    """Return the locked file of a folder, or None where it cannot be made."""
+    """Return the descriptor of a folder's locked file, or None if it cannot be created."""
     path = folder / _LOCK
     while True:
         try:
@@ -142,7 +144,7 @@ def _lock(folder: Path) -> int | None:
             ) from None
         except OSError:  # some file systems have no locks
             return descriptor
-        # The process that had the lock before may have removed the file in the meantime.
+        # The previous owner of the lock may have removed the file in the meantime.
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(descriptor), os.stat(path)):
                 return descriptor
@@ -163,7 +165,7 @@ def sync_folder(path: Path) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        # Some network file systems cannot sync folders, and offer nothing else.
+        # Some network file systems cannot sync folders, and there is no alternative.
         if error.errno not in (errno.EINVAL, errno.ENOTSUP):
             raise
     finally:
@@ -183,7 +185,7 @@ def _temporary(path: Path, make: Callable[[Path], object]) -> Iterator[tuple[Pat
             _remove(temporary)
             os.close(descriptor)
     except OSError as error:
-        # Errors of a full disk name no file, and a temporary name would not help the user.
+        # The error of a full disk names no file, and a temporary name would not help the user.
         named = error.filename
         ours = named is None or (isinstance(named, str | Path) and Path(named).match(_PATTERN))
         if error.errno is not None and ours:
@@ -207,7 +209,7 @@ def _claim(folder: Path, make: Callable[[Path], object]) -> tuple[Path, int]:
 
 def _remove_leftovers(folder: Path) -> None:
     for path in folder.glob(_PATTERN):
-        with suppress(OSError):  # of another user, or removed in the meantime
+        with suppress(OSError):  # it belongs to another user, or was removed in the meantime
             descriptor = _open(path)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises if in use

@@ -1,7 +1,8 @@
 """The cache folder: measured costs, simulated lines, and folders of worker processes.
 
-Worker processes import modules from their folder, and plans follow stored costs. Whoever can write
-to the cache folder therefore acts as its user, so it is used only if nobody else can.
+Worker processes import modules from their folder, and plans depend on stored costs. Anybody who can
+write to the cache folder can therefore act as its user. It is used only if nobody else can write to
+it.
 """
 
 from __future__ import annotations
@@ -11,30 +12,36 @@ import grp
 import os
 import pwd
 import stat
+import sys
 from contextlib import suppress
 from pathlib import Path
 
-from platformdirs import user_cache_path
-
-_MODE = 0o700  # of folders that are made here
+_MODE = 0o700  # of folders that are created here
 
 
 def cache_folder() -> Path:
-    """Return the cache folder: that of the variable CLSAS_CACHE, or else the user's default.
+    """Return the cache folder: the one in the variable CLSAS_CACHE, or the user's default.
 
-    It is not checked and may not exist: see `trusted_cache` and `private_folder`.
+    The folder is not checked and may not exist; see `trusted_cache` and `private_folder`.
     """
-    return Path(os.environ.get("CLSAS_CACHE") or user_cache_path("clsas"))
+    return Path(os.environ.get("CLSAS_CACHE") or _user_caches() / "clsas")
+
+
+def _user_caches() -> Path:
+    """Return the user's cache folder for all programs, by the XDG specification or as on macOS."""
+    if os.path.isabs(given := os.environ.get("XDG_CACHE_HOME", "")):
+        return Path(given)  # the specification tells programs to ignore relative paths
+    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
 
 
 def trusted_cache() -> Path:
-    """Return the cache folder, which may not exist, after a check that nobody else can write to it.
+    """Return the cache folder after checking that nobody else can write to it; it may not exist.
 
     Raises
     ------
     PermissionError
-        If another user can change what the folder holds, or this one cannot read it; the message
-        names the folder and CLSAS_CACHE.
+        If another user can change the contents of the folder, or this user cannot read it. The
+        message names the folder and CLSAS_CACHE.
     """
     folder = cache_folder()
     _check(folder)
@@ -43,7 +50,9 @@ def trusted_cache() -> Path:
 
 
 def private_folder(*names: str) -> Path:
-    """Return the cache folder, or a folder in it, that only this user can write to; make it.
+    """Return the cache folder, or a folder in it, that only this user can write to.
+
+    Folders that do not exist are created.
 
     Parameters
     ----------
@@ -53,14 +62,14 @@ def private_folder(*names: str) -> Path:
     Raises
     ------
     PermissionError
-        If another user can change what the folder holds, or this one cannot write to it.
+        If another user can change the contents of the folder, or this user cannot write to it.
     OSError
-        If it cannot be made.
+        If the folder cannot be created.
     """
     folder = trusted_cache().joinpath(*names)
     for each in reversed([folder, *folder.parents]):
         if not each.is_dir():
-            with suppress(FileExistsError):  # another process of this user, or of somebody else
+            with suppress(FileExistsError):  # another process created it; checked below
                 each.mkdir(_MODE)
     _check(folder)
     if not folder.is_dir():
@@ -70,7 +79,7 @@ def private_folder(*names: str) -> Path:
 
 
 def _check(folder: Path) -> None:
-    """Raise PermissionError if another user can change what a folder holds, or can replace it."""
+    """Raise PermissionError if another user can change the contents of a folder or replace it."""
     try:
         real = Path(os.path.realpath(folder))
         links = _links(Path(os.path.abspath(folder)), set())
@@ -82,21 +91,21 @@ def _check(folder: Path) -> None:
         raise _refusal(folder, found)
 
 
-def _check_access(folder: Path, access: int, what: str) -> None:
-    """Raise PermissionError if this user has no such access to a folder, unless there is none."""
+def _check_access(folder: Path, access: int, verb: str) -> None:
+    """Raise PermissionError if the folder exists and this user has no such access to it."""
     if folder.is_dir() and not os.access(folder, access, effective_ids=True):
-        raise _refusal(folder, f"you cannot {what} it")
+        raise _refusal(folder, f"you cannot {verb} it")
 
 
 def _refusal(folder: Path, reason: str) -> PermissionError:
     return PermissionError(
-        f"the cache folder {folder} is not used, since {reason}: set the environment variable "
+        f"the cache folder {folder} is not used because {reason}: set the environment variable "
         "CLSAS_CACHE to a folder that belongs to you and that others cannot write to"
     )
 
 
 def _links(path: Path, found: set[Path]) -> set[Path]:
-    """Return the symbolic links that a path leads through, each in its real folder."""
+    """Return the symbolic links along a path, each in its real folder."""
     for each in (*reversed(path.parents), path):
         if each.is_symlink():
             link = Path(os.path.realpath(each.parent), each.name)
@@ -107,22 +116,23 @@ def _links(path: Path, found: set[Path]) -> set[Path]:
 
 
 def _exposure(folder: Path, link: Path | None = None) -> str | None:
-    """Return how another user could change a real folder's entries, or None if nobody can.
+    """Return how another user could change the entries of a folder, or None if nobody can.
 
-    A folder's owner and, where its mode allows it, others can rename what is in it. So all folders
-    above count as well. A sticky one, such as /tmp, lets others only add entries, which are then
-    theirs: that is enough for folders above, and for one with a symbolic link.
+    The owner of a folder, and others where its mode allows it, can rename its entries. All folders
+    above it are therefore checked as well. In a sticky folder, such as /tmp, others can only add
+    entries of their own. That is safe for the folders above, and for a folder that contains a
+    symbolic link to the cache.
 
     Parameters
     ----------
     folder : Path
-        Without symbolic links.
+        Path without symbolic links.
     link : Path, optional
-        A symbolic link in the folder, which leads to the cache.
+        Symbolic link in the folder that leads to the cache.
     """
-    # Whoever owns the root can do everything. It need not be user 0 in a container.
+    # The owner of the root folder can do everything. In a container that need not be user 0.
     trusted = {0, os.geteuid(), os.lstat("/").st_uid}
-    is_closed = False  # others cannot get to what lies deeper
+    is_closed = False  # whether others cannot reach deeper folders
     for each in (*reversed(folder.parents), folder, *([link] if link else ())):
         try:
             found = os.lstat(each)
@@ -142,10 +152,10 @@ def _exposure(folder: Path, link: Path | None = None) -> str | None:
 
 
 def _is_private(group: int) -> bool:
-    """Return whether a group has no member but this user, as many systems give each user one."""
+    """Return whether this user is the only member of a group, as many systems arrange it."""
     with suppress(KeyError):
         found, user = grp.getgrgid(group), pwd.getpwuid(os.geteuid())
-        # A group's list leaves out those of whom it is the first group.
+        # The group's list leaves out the users whose primary group it is.
         members = {each.pw_uid for each in pwd.getpwall() if each.pw_gid == group}
         is_own = group == user.pw_gid and found.gr_name == user.pw_name and not found.gr_mem
         return is_own and members == {user.pw_uid}

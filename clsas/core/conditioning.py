@@ -1,4 +1,7 @@
-"""Conditioning of range lines: filter, taper, background, weights. `RangeLines` has the methods."""
+"""Conditioning of range lines: high-pass filter, tapered ends, background and weights.
+
+These are the implementations of the methods of `RangeLines`, whose docstrings describe them.
+"""
 
 from __future__ import annotations
 
@@ -9,21 +12,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from clsas.core import decibels, validate
+from clsas.core import decibels, pings, validate
+from clsas.core.fourier import EDGE_PRODUCT, smooth_edge
 
 if TYPE_CHECKING:
     from clsas.core.lines import RangeLines
 
 _BLOCK = 1 << 22  # complex128 samples of the channels that are filtered together
-_EQUAL_RANGE = 1e-3  # steps by which first ranges of pings may differ: an error of -50 dB
+# Steps by which the first ranges of pings may differ. The resulting error is -50 dB.
+_EQUAL_RANGE = 1e-3
 STATISTICS = ("mean", "median")
 DEAD_DB = -20.0
-"""Power of a channel relative to the usual one up to which it counts as dead. At -10 dB channels
-at the ends of a track, where targets leave the beam, would count too."""
+"""Power relative to the usual channel up to which a channel counts as dead. At -10 dB, channels at
+the ends of a track would also count as dead, because targets leave the beam there."""
 
 
 def are_dead(power: NDArray[np.float64], usual: NDArray[np.float64] | float) -> NDArray[np.bool_]:
-    """Return which channels hold no signal, by their power and that of the usual channel."""
+    """Return a mask of the channels without a signal, from their power and the usual power."""
     return power <= usual * decibels.power(DEAD_DB)
 
 
@@ -32,15 +37,13 @@ def high_passed(lines: RangeLines, cutoff_hz: float, name: str = "cutoff_hz") ->
 
     Messages call the cutoff by `name`.
     """
-    from clsas.core.fourier import EDGE_PRODUCT, smooth_edge  # imports finufft, which is slow
-
     rate = lines.sound_speed_m_s / (2 * lines.range_step_m)
     lowest = max(0.0, lines.carrier_hz - rate / 2)
     cutoff = validate.positive(name, cutoff_hz, "Hz")
     if cutoff <= lowest:
         raise ValueError(
             f"{name} must be finite and > {lowest:g} and < {lowest + rate:g} Hz, got {cutoff:g}: "
-            f"lines on a carrier of {lines.carrier_hz:g} Hz hold nothing below {lowest:g} Hz"
+            f"lines on a carrier of {lines.carrier_hz:g} Hz contain nothing below {lowest:g} Hz"
         )
     validate.number(name, cutoff, "Hz", above=lowest, below=lowest + rate)
     if cutoff * lines.length < rate:
@@ -48,7 +51,7 @@ def high_passed(lines: RangeLines, cutoff_hz: float, name: str = "cutoff_hz") ->
             f"{name} must be at least one cycle per line, {rate / lines.length:g} Hz, "
             f"got {cutoff:g} Hz"
         )
-    # The edge lies between half the cutoff and the cutoff, and above the band's lowest frequency.
+    # The edge begins at half the cutoff, or at the lowest frequency of the band if that is higher.
     width = min(cutoff / 2, cutoff - lowest)
     padded = fft.next_fast_len(lines.length + int(np.ceil(EDGE_PRODUCT * rate / width)))
     validate.memory("the padding for cutoff_hz", 16 * padded)
@@ -81,20 +84,20 @@ def without_background(lines: RangeLines, statistic: str, receivers: int | None)
     """Subtract what all pings have in common; see `RangeLines.without_background`."""
     statistic = validate.one_of("statistic", statistic, STATISTICS)
     count = _receivers(lines) if receivers is None else validate.count("receivers", receivers)
-    pings, rest = divmod(lines.channels, count)
-    if rest or pings < 2:
+    number, rest = divmod(lines.channels, count)
+    if rest or number < 2:
         raise ValueError(
             "receivers must divide the channels into at least 2 pings, "
             f"got {count} receivers and {lines.channels} channels"
         )
-    first_m = lines.first_range_m.reshape(pings, count)
+    first_m = lines.first_range_m.reshape(number, count)
     spread_m = float(np.ptp(first_m, axis=0).max())
     if spread_m > _EQUAL_RANGE * lines.range_step_m:
         raise ValueError(
-            "first_range_m of a receiver must be the same in all pings, since a background lies "
-            f"at one delay; they differ by up to {spread_m:g} m"
+            "first_range_m of a receiver must be the same in all pings, because a background lies "
+            f"at one delay; it differs by up to {spread_m:g} m"
         )
-    samples = np.array(lines.samples).reshape(pings, count, lines.length)
+    samples = np.array(lines.samples).reshape(number, count, lines.length)
     for receiver in range(count):
         own = samples[:, receiver]
         if statistic == "mean":
@@ -121,10 +124,10 @@ def weighted(lines: RangeLines, weights: ArrayLike) -> RangeLines:
 
 def _receivers(lines: RangeLines) -> int:
     """Return the channels per ping, which must be the same for all pings."""
-    counts = np.diff(np.append(lines.ping_starts, lines.channels))
+    counts = pings.channels_per_ping(lines.ping_starts, lines.channels)
     if np.ptp(counts):
         raise ValueError(
-            "receivers must be given, since pings seem to have from "
-            f"{counts.min()} to {counts.max()} channels: consecutive channels with one tx position"
+            "receivers must be given, because pings (consecutive channels with one tx position) "
+            f"have from {counts.min()} to {counts.max()} channels"
         )
     return int(counts[0])

@@ -1,4 +1,4 @@
-"""Sharpness of images: entropy and contrast of the intensity."""
+"""Measures of the sharpness of images: entropy and contrast of the intensity."""
 
 from __future__ import annotations
 
@@ -10,14 +10,38 @@ from clsas.core.image_error import complex_values
 
 
 def entropy(image: Image | ArrayLike) -> float:
-    """Return the entropy of the intensity, nats: least when an image is best focused.
+    """Return the entropy of the intensity of an image, which is lowest at best focus.
 
-    -sum p ln p with p = |I|^2 / sum |I|^2: 0 for one bright pixel, ln(size) for a flat image.
+    Parameters
+    ----------
+    image : Image or array_like
+        Real or complex pixels.
+
+    Returns
+    -------
+    float
+        Entropy, nats: 0 for a single bright pixel, ln(size) for a flat image.
 
     Raises
     ------
     ValueError
         If the image is zero everywhere, or a value is not finite.
+
+    See Also
+    --------
+    contrast : A measure that grows with sharpness.
+
+    Notes
+    -----
+    The entropy is -sum p ln p, where p = |I|^2 / sum |I|^2.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> f"{clsas.entropy([[1, 1], [1, 1]]):.3f}"
+    '1.386'
+    >>> f"{clsas.entropy([[1, 0.1], [0.1, 0.1]]):.3f}"
+    '0.164'
     """
     share = _intensity(image)
     share = share[share > 0] / share.sum()
@@ -25,14 +49,36 @@ def entropy(image: Image | ArrayLike) -> float:
 
 
 def contrast(image: Image | ArrayLike) -> float:
-    """Return the contrast of the intensity |I|^2, its standard deviation over its mean.
+    """Return the contrast of an image: standard deviation over mean of the intensity |I|^2.
 
-    0 for a flat image, 1 for fully developed speckle, and the more the sharper.
+    The contrast is 0 for a flat image and 1 for fully developed speckle. It grows with sharpness.
+
+    Parameters
+    ----------
+    image : Image or array_like
+        Real or complex pixels.
+
+    Returns
+    -------
+    float
+        Contrast, a ratio.
 
     Raises
     ------
     ValueError
         If the image is zero everywhere, or a value is not finite.
+
+    See Also
+    --------
+    entropy : A measure that falls with sharpness and weighs weak pixels more.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> clsas.contrast([[1, 1], [1, 1]])
+    0.0
+    >>> f"{clsas.contrast([[0, 0], [0, 1]]):.3f}"
+    '1.732'
     """
     intensity = _intensity(image)
     return float(intensity.std() / intensity.mean())

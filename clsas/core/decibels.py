@@ -21,7 +21,7 @@ def in_db(power: float) -> float:
 
 
 def largest_amplitude(values: NDArray) -> float:
-    """Return the largest amplitude of real or complex values, also where float32 cannot hold it."""
+    """Return the largest amplitude of real or complex values, even if it exceeds float32."""
     scale, amplitude = _scaled_amplitude(values)
     return scale * float(amplitude.max())
 
@@ -33,7 +33,7 @@ def level_db(values: NDArray, reference: float | None = None) -> NDArray[np.floa
     ----------
     values : ndarray, real or complex
     reference : float, optional
-        Amplitude of 0 dB; the largest of the values unless given.
+        Amplitude of 0 dB. The default is the largest amplitude of the values.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def level_db(values: NDArray, reference: float | None = None) -> NDArray[np.floa
         return np.full(amplitude.shape, -np.inf, np.float32)
     if reference is None:
         unit_db = 20 * math.log10(float(amplitude.max()))
-    else:  # a quotient of extremes is no float
+    else:  # the quotient of two extreme numbers may overflow
         unit_db = 20 * (math.log10(reference) - math.log10(scale))
     with np.errstate(divide="ignore"):
         level = np.log10(amplitude, out=amplitude)
@@ -57,7 +57,7 @@ def level_db(values: NDArray, reference: float | None = None) -> NDArray[np.floa
 
 
 def _scaled_amplitude(values: NDArray) -> tuple[float, NDArray[np.float32]]:
-    """Return a scale and the amplitudes over it, so that no square overflows or vanishes."""
+    """Return a scale and the amplitudes divided by it, so that no square over- or underflows."""
     parts = np.ascontiguousarray(values)
     if parts.dtype.kind == "c":
         parts = parts.view(parts.real.dtype)

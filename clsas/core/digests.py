@@ -1,4 +1,4 @@
-"""Digests of geometries: equal ones have equal digests, whatever the samples are."""
+"""Digests of geometries. Equal geometries have equal digests, whatever the samples are."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from clsas.core.lines import RangeLines
 
 
 def lines_digest(lines: RangeLines) -> str:
-    """Return a digest of everything about lines but their samples."""
+    """Return a digest of everything in range lines except their samples."""
     numbers = np.array([lines.range_step_m, lines.carrier_hz, lines.sound_speed_m_s])
     others = lines.per_channel
-    # This order keeps digests in stores and plans valid.
+    # Changing this order would invalidate the digests in stores and plans.
     arrays = [others.pop(name) for name in ("tx_m", "rx_m", "first_range_m")]
     return _digest(np.array(lines.samples.shape), *arrays, numbers, *others.values())
 

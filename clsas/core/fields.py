@@ -1,46 +1,80 @@
-"""Types of fields that JSON holds: the values they may have, and how they are stored.
+"""Types of fields that are stored as JSON: their allowed values, and how they are stored.
 
-Everything that sizes a buffer or an index has bounds, so that no file makes a kernel read what is
-not there. Pydantic checks them when an object is made or read.
+Every number that sizes a buffer or an index is bounded, so that a damaged file cannot make a kernel
+read beyond its buffers. Pydantic checks the bounds when an object is read from JSON. It is imported
+only then, because forming an image does not require it.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
-from pydantic_core import CoreSchema, core_schema
 
 from clsas.core import validate
 
-CONFIG = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
+if TYPE_CHECKING:
+    from pydantic import ConfigDict, GetCoreSchemaHandler, ValidationError
+    from pydantic_core import CoreSchema
 
-Whole = Annotated[int, Field(ge=1, lt=2**31)]
-Count = Annotated[int, Field(ge=0, lt=2**31)]
-Number = Annotated[float, Field(lt=math.inf)]  # no NaN either, which fails every comparison
-Amount = Annotated[float, Field(ge=0.0, lt=math.inf)]
+CONFIG: ConfigDict = {
+    "strict": True,
+    "extra": "forbid",
+    "arbitrary_types_allowed": True,
+    "revalidate_instances": "always",
+}
+"""Value of `__pydantic_config__` in dataclasses that JSON holds."""
+
+
+class Constraint:
+    """Annotation of the values that a field may have, in the words of pydantic's `Field`.
+
+    Parameters
+    ----------
+    convert : callable, optional
+        Converts a value before it is checked; raises ValueError if it cannot.
+    **limits
+        Keyword arguments of `Field`, such as `ge=1`.
+    """
+
+    def __init__(self, convert: Callable[[Any], Any] | None = None, **limits: Any) -> None:
+        self.convert, self.limits = convert, limits
+
+    def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Return pydantic's schema of the annotated type with these limits."""
+        from pydantic import BeforeValidator, Field
+
+        check = Field(**self.limits) if self.convert is None else BeforeValidator(self.convert)
+        return handler.generate_schema(Annotated[kind, check])
+
+
+Whole = Annotated[int, Constraint(ge=1, lt=2**31)]
+Count = Annotated[int, Constraint(ge=0, lt=2**31)]
+Number = Annotated[float, Constraint(lt=math.inf)]  # no NaN either, which fails every comparison
+Amount = Annotated[float, Constraint(ge=0.0, lt=math.inf)]
 Size = tuple[Whole, Whole]
 
 
 @dataclass(frozen=True)
 class StoredAs:
-    """Annotation of a class of another room, which JSON holds as a table of its fields.
+    """Annotation of a class that is stored in JSON as a table of its fields.
 
     Attributes
     ----------
     table : type
-        What pydantic checks the table with: a dataclass of the same fields, or a dict.
+        Type with which pydantic checks the table: a dataclass with the same fields, or a dict.
     """
 
     table: Any
 
     def __get_pydantic_core_schema__(self, kind: type, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return pydantic's schema: instances are taken as they are, tables are built."""
+        """Return pydantic's schema: instances are accepted as they are, tables are converted."""
+        from pydantic_core import core_schema
 
         def build(value: Any, check: Any) -> Any:
             if isinstance(value, kind):
@@ -59,7 +93,7 @@ class StoredAs:
 
 
 def _plain(stored: Any) -> dict[str, Any] | None:
-    """Return the fields of an instance as numbers, texts and lists."""
+    """Return the fields of an instance as numbers, strings and lists."""
     if stored is None:
         return None
     fields = {field.name: getattr(stored, field.name) for field in dataclasses.fields(stored)}
@@ -79,20 +113,20 @@ def _finite(value: Any) -> NDArray[np.float64]:
     return array
 
 
-Array = Annotated[Any, BeforeValidator(_finite)]
+Array = Annotated[Any, Constraint(_finite)]
 
 
 def explained(error: ValidationError, values: Any) -> str:
-    """Return the first mistake that pydantic found in the values of a JSON text.
+    """Return a message for the first mistake that pydantic found in the values of a JSON text.
 
-    It names the field, what is allowed, and what was given.
+    The message names the field, what is allowed, and what was given.
     """
     mistake = error.errors(include_url=False)[0]
     path, here = [], values
-    for part in mistake["loc"]:  # which also names the members of unions
+    for part in mistake["loc"]:  # some parts are names of union members, not keys
         try:
-            here = here[part]
-        except (KeyError, IndexError, TypeError):
+            here = getattr(here, part) if dataclasses.is_dataclass(here) else here[part]
+        except (AttributeError, KeyError, IndexError, TypeError):
             continue
         path.append(part)
     where = ".".join(map(str, path)) or "it"

@@ -1,4 +1,4 @@
-"""Path lengths between transmitter, point and receiver. All ranges are computed here."""
+"""Path lengths between transmitter, point and receiver, from which all ranges are computed."""
 
 from __future__ import annotations
 
@@ -19,20 +19,23 @@ def legs_m(
     Parameters
     ----------
     points_m, tx_m, rx_m : array_like, [..., 3]
-        Positions in metres; leading axes broadcast. The receiver's position is at transmission.
+        Positions, metres; leading axes broadcast. The receiver's position is that at transmission.
     rx_velocity_m_s : array_like, [..., 3], optional
-        Velocity of the receiver while the sound travels. None is stop-and-hop.
+        Velocity of the receiver while the sound travels, metres per second. None means
+        stop-and-hop.
     sound_speed_m_s : float, optional
-        Required with a velocity.
+        Speed of sound, metres per second. Required with a velocity.
 
     Returns
     -------
     out_m, back_m : float64 arrays, [...]
+        Path lengths, metres.
 
     Raises
     ------
     ValueError
-        If a velocity is given without a sound speed or is not below it, or a last axis is not 3.
+        If a velocity is given without a sound speed or is not below it, or if a last axis does not
+        have length 3.
 
     Notes
     -----
@@ -70,10 +73,10 @@ def bistatic_range_m(
     rx_velocity_m_s: ArrayLike | None = None,
     sound_speed_m_s: float | None = None,
 ) -> NDArray[np.float64]:
-    """Return half the two-way path, rho = (|x - tx| + |x - rx|)/2, in metres.
+    """Return the range, half the two-way path: rho = (|x - tx| + |x - rx|)/2, metres.
 
-    The two-way delay is 2 rho/c. Parameters, exceptions and the motion during flight are those of
-    `legs_m`. The result is float64 with the broadcast leading shape.
+    The two-way delay is 2 rho/c. Parameters, exceptions and the treatment of motion during flight
+    are those of `legs_m`. The result is float64 with the broadcast leading shape.
     """
     out, back = legs_m(points_m, tx_m, rx_m, rx_velocity_m_s, sound_speed_m_s)
     return 0.5 * (out + back)
@@ -88,8 +91,8 @@ def pairwise_range_m(
 ) -> NDArray[np.float64]:
     """Return `bistatic_range_m` for every pair of a point and a channel, [points, channels].
 
-    Points are [points, 3] and channels [channels, 3]. For receivers at rest no memory is needed for
-    [points, channels, 3].
+    Points have the shape [points, 3], positions and velocities of channels [channels, 3]. For
+    receivers at rest no intermediate array of shape [points, channels, 3] is needed.
     """
     if rx_velocity_m_s is not None:
         return bistatic_range_m(points_m[:, None], tx_m, rx_m, rx_velocity_m_s, sound_speed_m_s)

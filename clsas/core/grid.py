@@ -1,4 +1,4 @@
-"""Pixel grids: a plane, a plane with heights, or arbitrary points."""
+"""Grids of pixels: a plane, a plane with heights, or arbitrary points."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ _PARALLEL = 1e-12  # sine of the angle between parallel steps; float64 rounds to
 
 
 class Axis(NamedTuple):
-    """One side of a plane: the coordinate along it, and the positions of its pixels.
+    """One side of a plane: the name of its coordinate, and the pixels' positions along it.
 
     Attributes
     ----------
     name : str
-        "x", "y" or "z" if the side is parallel to that coordinate, else "along columns" or "along
-        rows".
+        "x", "y" or "z" if the side is parallel to that coordinate axis, otherwise "along columns"
+        or "along rows".
     places_m : ndarray of float64
-        That coordinate for every column (or row), or the distance from the first one, metres.
+        The coordinate of every column (or row), metres. If the side is parallel to no coordinate
+        axis, it is the distance from the first column (or row).
     """
 
     name: str
@@ -39,15 +40,15 @@ class Axis(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Pixel positions of an image, in metres (x along-track, y across-track, z up).
+    """Positions of the pixels of an image, metres (x along-track, y across-track, z up).
 
-    Use `Grid.plane`, `Grid.oriented`, `Grid.height_map` or `Grid.points`. On a plane, pixel
-    [row, column] lies at
+    Create grids with `Grid.plane`, `Grid.oriented`, `Grid.height_map` or `Grid.points`. On a plane,
+    pixel [row, column] lies at
 
         origin_m + row row_step_m + column column_step_m (+ height_m[row, column] along z).
 
-    All coordinates are float64, which resolves UTM-sized ones (1e7 m) to nanometres. Arrays that
-    need no conversion are not copied, so do not write into them afterwards.
+    All coordinates are float64, which resolves UTM-sized coordinates (1e7 m) to nanometres. Arrays
+    that need no conversion are not copied, so do not write into them afterwards.
 
     Attributes
     ----------
@@ -58,7 +59,18 @@ class Grid:
     height_m : ndarray of float64, shape [rows, columns], or None
         Height of every pixel above the plane, added to z.
     points_m : ndarray of float64, shape [*shape, 3], or None
-        Arbitrary positions.
+        Arbitrary positions; None for a plane or height map.
+
+    Examples
+    --------
+    A plane of 3 by 5 pixels, 0.5 m apart:
+
+    >>> import clsas
+    >>> grid = clsas.Grid.plane(x=(-1, 1, 5), y=(40, 41, 3))
+    >>> grid
+    Grid(3 x 5 pixels, x -1 to 1 m, y 40 to 41 m, z 0 m)
+    >>> grid.positions_m()[1, 2]
+    array([ 0. , 40.5,  0. ])
     """
 
     origin_m: NDArray[np.float64] | None
@@ -68,7 +80,7 @@ class Grid:
     height_m: NDArray[np.float64] | None = None
     points_m: NDArray[np.float64] | None = None
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,
@@ -112,28 +124,28 @@ class Grid:
             put("height_m", shape)
 
     def __repr__(self) -> str:
-        """Return the shape and extents: x, y and z of the pixels, metres."""
+        """Return the shape and the extents of the pixels in x, y and z."""
         return reprs.summary(self, f"{reprs.by(self.shape)} pixels", reprs.extents(*self.bounds_m))
 
     @classmethod
     def plane(
         cls, x: tuple[float, float, int], y: tuple[float, float, int], z: float = 0.0
     ) -> Self:
-        """Return a horizontal plane; `x` runs along the columns, `y` along the rows.
+        """Return a horizontal plane whose columns run along x and whose rows run along y.
 
         Parameters
         ----------
         x, y : (start, stop, count)
-            Centres of the first and the last pixel, metres, and number of pixels, as for
-            `numpy.linspace`. A single pixel lies at `start`.
+            Centres of the first and the last pixel, metres, and the number of pixels, as for
+            `numpy.linspace`. With one pixel, `start` and `stop` must be equal.
         z : float
             Height of the plane, metres.
 
         Raises
         ------
         TypeError, ValueError
-            If an axis is not (start, stop, count) with finite ends, or has several pixels and
-            equal ends.
+            If an axis is not (start, stop, count) with finite ends, has several pixels between
+            equal ends, or one pixel and different ends.
         """
         x_start, x_step, columns = _axis("x", x)
         y_start, y_step, rows = _axis("y", y)
@@ -155,8 +167,7 @@ class Grid:
         origin_m : array_like, shape [3]
             Position of pixel [0, 0], metres.
         row_step_m, column_step_m : array_like, shape [3]
-            Steps from one pixel to the next row, and to the next column, metres. They need not be
-            perpendicular.
+            Steps to the next row and to the next column, metres. They need not be perpendicular.
         shape : (rows, columns)
             Number of pixels.
 
@@ -172,18 +183,36 @@ class Grid:
     def height_map(
         cls, x: tuple[float, float, int], y: tuple[float, float, int], height_m: ArrayLike
     ) -> Self:
-        """Return the plane z = 0 (see `plane`) raised by `height_m`, shape [rows, columns]."""
-        return cls.plane(x, y).with_height(height_m)
+        """Return the plane z = 0 raised by heights.
 
-    @classmethod
-    def points(cls, points_m: ArrayLike) -> Self:
-        """Return arbitrary pixels at `points_m`, shape [..., 3], metres.
+        Parameters
+        ----------
+        x, y : (start, stop, count)
+            As for `plane`.
+        height_m : array_like, shape [rows, columns]
+            Heights, metres along z.
 
         Raises
         ------
         TypeError, ValueError
-            If the points are not finite real numbers, there is none, or the last axis does not have
-            length 3.
+            As for `plane` and `with_height`.
+        """
+        return cls.plane(x, y).with_height(height_m)
+
+    @classmethod
+    def points(cls, points_m: ArrayLike) -> Self:
+        """Return a grid of pixels at arbitrary positions.
+
+        Parameters
+        ----------
+        points_m : array_like, shape [..., 3]
+            Positions, metres. The image has the shape of the leading axes.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the points are not finite real numbers, there are none, or the last axis does not
+            have length 3.
         """
         given = validate.array("points_m", points_m, np.float64, None)
         shape = (*(None,) * max(given.ndim - 1, 1), 3)
@@ -191,7 +220,12 @@ class Grid:
         return cls(None, None, None, checked.shape[:-1], points_m=checked)
 
     def with_height(self, height_m: ArrayLike) -> Self:
-        """Return this plane raised by `height_m`, shape [rows, columns], metres along z.
+        """Return this plane raised by heights.
+
+        Parameters
+        ----------
+        height_m : array_like, shape [rows, columns]
+            Heights above the plane, metres along z.
 
         Raises
         ------
@@ -199,7 +233,10 @@ class Grid:
             If the grid is not a plane, or the heights do not have its shape or are not finite.
         """
         if not self.is_planar:
-            raise ValueError("height_m can be put only on a plane, and once")
+            raise ValueError(
+                "height_m can be added only to a plane, and only once: the grid has heights "
+                "already, or consists of points"
+            )
         height_m = validate.array("height_m", height_m, np.float64, self.shape)
         return type(self)(
             self.origin_m, self.row_step_m, self.column_step_m, self.shape, height_m=height_m
@@ -207,7 +244,7 @@ class Grid:
 
     @property
     def bounds_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lowest and highest x, y and z of a box that holds all pixels, metres, [3] each."""
+        """Lowest and highest x, y and z of a box that contains all pixels, metres, [3] each."""
         if self.points_m is not None:
             places_m = self.points_m.reshape(-1, 3)
             return places_m.min(axis=0), places_m.max(axis=0)
@@ -222,7 +259,7 @@ class Grid:
 
     @property
     def is_planar(self) -> bool:
-        """True if the pixels lie on a plane with equal steps."""
+        """True if the pixels lie on a plane, in equal steps."""
         return self.points_m is None and self.height_m is None
 
     @property
@@ -237,7 +274,7 @@ class Grid:
         Raises
         ------
         ValueError
-            If the grid holds arbitrary points.
+            If the grid consists of arbitrary points.
         """
         if self.origin_m is None or self.row_step_m is None or self.column_step_m is None:
             raise ValueError("grid must be a plane or height map to have steps, got points")
@@ -261,7 +298,7 @@ class Grid:
             Unless columns run along x and rows along y (`has_axes`).
         """
         if not self.has_axes:
-            raise ValueError("the grid's columns must run along x and its rows along y for axes_m")
+            raise ValueError("grid must have columns along x and rows along y to have axes_m")
         rows, columns = self.shape
         origin_m, row_step_m, column_step_m = self.vectors_m
         return (
@@ -276,7 +313,7 @@ class Grid:
         Raises
         ------
         ValueError
-            If the grid holds arbitrary points.
+            If the grid consists of arbitrary points.
         """
         if self.points_m is not None:
             raise ValueError("grid must be a plane or height map to have axes, got points")
@@ -288,7 +325,7 @@ class Grid:
         return across, self._side("along rows", row_step_m, rows, free="".join(free))
 
     def _side(self, name: str, step_m: NDArray[np.float64], count: int, free: str) -> Axis:
-        """Return the axis of one side; if its step is zero, along the first `free` coordinate."""
+        """Return the axis of one side. If its step is zero, take the first `free` coordinate."""
         along = np.flatnonzero(np.abs(step_m) > _PARALLEL * np.abs(step_m).max())
         if len(along) > 1:
             return Axis(name, np.arange(count) * np.float64(np.linalg.norm(step_m)))
@@ -297,12 +334,12 @@ class Grid:
         return Axis("xyz"[index], first_m + np.arange(count) * step_m[index])
 
     def positions_m(self, rows: slice = _ALL, columns: slice = _ALL) -> NDArray[np.float64]:
-        """Return pixel positions, float64 [..., 3], metres.
+        """Return the positions of the pixels, float64 [..., 3], metres.
 
         Parameters
         ----------
         rows, columns : slice
-            Rows and columns to return (the first two axes of points).
+            Rows and columns to return. For arbitrary points these are the first two axes.
 
         Raises
         ------
@@ -322,12 +359,12 @@ class Grid:
         return positions
 
     def at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the positions of pixels with row-major indices, float64 [..., 3], metres.
+        """Return the positions of pixels given by row-major indices, float64 [..., 3], metres.
 
         Raises
         ------
         TypeError, ValueError
-            If the indices are not whole numbers from 0 to below `size`.
+            If the indices are not whole numbers from 0 to `size` - 1.
         """
         index = validate.indices("index", index, self.size)
         if self.points_m is not None:
@@ -340,7 +377,9 @@ class Grid:
         return positions
 
     def spread(self, most: int) -> NDArray[np.float64]:
-        """Return sample points all over the grid, edges included, [n, 3]; up to `most` a side.
+        """Return the positions of sample points all over the grid, edges included, [n, 3].
+
+        There are up to `most` sample points along either side.
 
         Raises
         ------
@@ -354,11 +393,11 @@ class Grid:
         return self.at(np.ravel_multi_index(np.ix_(*indices), self.shape).ravel())
 
     def window(self, rows: slice = _ALL, columns: slice = _ALL) -> Self:
-        """Return the sub-grid of some rows and columns (the first two axes of points).
+        """Return the grid of some rows and columns. For points these are the first two axes.
 
-        Its pixels are this grid's `positions_m(rows, columns)`: the first one bit for bit, the
-        others of a plane to the last bit of a float64 coordinate. `image.pixels[rows, columns]` are
-        the pixels on it.
+        The pixels lie at `positions_m(rows, columns)` of this grid. The first one does so bit for
+        bit, the others of a plane to the last bit of a float64 coordinate. The pixels of an image
+        on the window are `image.pixels[rows, columns]`.
 
         Raises
         ------
@@ -373,7 +412,7 @@ class Grid:
             return self.points(self.points_m[self._index(rows, columns)])
         row, column = (range(n)[s] for n, s in zip(self.shape, (rows, columns), strict=True))
         if not row or not column:
-            raise ValueError(f"window must hold a pixel, got rows {rows} and columns {columns}")
+            raise ValueError(f"window must contain a pixel, got rows {rows} and columns {columns}")
         if (row, column) == tuple(map(range, self.shape)):
             return self
         origin_m, row_step_m, column_step_m = self.vectors_m
@@ -386,7 +425,7 @@ class Grid:
         )
 
     def _index(self, rows: slice, columns: slice) -> tuple[slice, ...]:
-        """Index of rows and columns of points, which may have only one axis."""
+        """Return the index of rows and columns of points, which may have only one axis."""
         if len(self.shape) > 1:
             return rows, columns
         if columns != _ALL:
@@ -408,13 +447,15 @@ def _axis(name: str, axis: tuple[float, float, int]) -> tuple[float, float, int]
     validate.memory(f"{name} count", 8 * count)
     if count == 1:
         if start != stop:
-            raise ValueError(f"{name} must be one position for 1 pixel, got {start} m to {stop} m")
+            raise ValueError(
+                f"{name} must start and stop at one position for 1 pixel, got {start} m to {stop} m"
+            )
         return start, 0.0, count
     step = (stop - start) / (count - 1)
-    if step == 0 or not math.isfinite(step):  # also of a distance beyond float64
+    if step == 0 or not math.isfinite(step):  # the distance may exceed float64
         raise ValueError(
-            f"{name} must end elsewhere than it starts, got {count} pixels from {start} m to "
-            f"{stop} m"
+            f"{name} must start and stop at different positions, got {count} pixels from {start} m "
+            f"to {stop} m"
         )
     return start, step, count
 
@@ -429,7 +470,7 @@ def _check_steps(
             raise ValueError(f"{name} must not be zero m, got {step} for {count} pixels")
     if min(shape) == 1:
         return
-    # Compare directions, since steps may have any length.
+    # Compare directions, because steps may have any length.
     directions = (step / np.abs(step).max() for step in steps.values())
     sine = np.linalg.norm(np.cross(*(d / np.linalg.norm(d) for d in directions)))
     if sine < _PARALLEL:

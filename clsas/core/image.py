@@ -1,4 +1,4 @@
-"""A complex image and where its pixels lie."""
+"""Complex images on grids."""
 
 from __future__ import annotations
 
@@ -16,38 +16,52 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.axes import Axes
 
-_AT_ONCE = 1 << 16  # pixels that are checked together
+_AT_ONCE = 1 << 16  # pixels that are tested together
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """Complex pixels on a grid.
+    """Complex image: pixels on a grid.
+
+    NumPy's functions accept an `Image` in place of its pixels.
 
     Parameters
     ----------
     pixels : array_like of complex, shape `grid.shape`
-        Kept as complex64. The phase is that of the scene: the carrier's phase at each pixel's
-        range has been restored.
+        Pixels, stored as complex64. Their phase is that of the scene: the phase of the carrier at
+        each pixel's range has been restored.
     grid : Grid
-        Where the pixels lie.
+        Positions of the pixels.
 
     Raises
     ------
     TypeError
         If the pixels are not complex or `grid` is not a Grid.
     ValueError
-        If the pixels do not have the grid's shape, or a pixel is NaN or infinite. Also if
-        wider pixels are all so small or large that complex64 loses their digits.
+        If the pixels do not have the grid's shape, a pixel is NaN or infinite, or the largest
+        complex128 pixel is too large or too small for complex64.
 
     Notes
     -----
-    Pixels that need no conversion are not copied: do not write into them afterwards.
+    Pixels that need no conversion are not copied, so do not write into them afterwards.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> import numpy as np
+    >>> grid = clsas.Grid.plane(x=(0, 1, 2), y=(40, 41, 2))
+    >>> image = clsas.Image(np.array([[1, 0.1j], [0, 0.01]]), grid)
+    >>> image
+    Image(2 x 2 complex pixels, x 0 to 1 m, y 40 to 41 m, z 0 m)
+    >>> image.db()
+    array([[  0., -20.],
+           [-inf, -40.]], dtype=float32)
     """
 
     pixels: NDArray[np.complex64]
     grid: Grid
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,
@@ -67,7 +81,7 @@ class Image:
         return reprs.summary(self, pixels, reprs.extents(*self.grid.bounds_m))
 
     def _repr_html_(self) -> str:
-        import clsas  # the public face, which imports the room of pictures when it is used
+        import clsas  # imports clsas.plot only when it is used
 
         return clsas.plot.image_html(self)
 
@@ -77,17 +91,17 @@ class Image:
         return self.grid.shape
 
     def db(self, *, reference: float | None = None) -> NDArray[np.float32]:
-        """Return the pixels' amplitude in dB.
+        """Return the amplitude of the pixels in dB.
 
         Parameters
         ----------
         reference : float, optional
-            Amplitude of 0 dB; the image's largest unless given.
+            Amplitude of 0 dB. The default is the largest amplitude of the image.
 
         Returns
         -------
         ndarray of float32, shape `grid.shape`
-            20 log10(amplitude / reference); minus infinity where a pixel is 0.
+            20 log10(amplitude / reference), minus infinity where a pixel is 0.
 
         Raises
         ------
@@ -97,13 +111,13 @@ class Image:
         return level_db(self.pixels, reference)
 
     def plot(self, axes: Axes | None = None, **options: Any) -> Axes:
-        """Draw the image in dB over metres; the same as `clsas.plot.image`.
+        """Draw the image in dB over metres, as `clsas.plot.image` does.
 
         Parameters
         ----------
         axes : matplotlib.axes.Axes, optional
-            Where to draw; those of a new pyplot figure unless given, so that notebooks and
-            `pyplot.show` show it.
+            Axes to draw on. By default a new pyplot figure is created, which notebooks and
+            `pyplot.show` display.
         **options
             Further arguments of `clsas.plot.image`, such as `dynamic_range_db`.
 
@@ -116,16 +130,16 @@ class Image:
         ImportError
             If matplotlib is not installed.
         TypeError, ValueError
-            As `clsas.plot.image` does.
+            As for `clsas.plot.image`.
         """
         import clsas
 
         return clsas.plot.image(self, axes, **options)
 
     def to_xarray(self) -> xarray.DataArray:
-        """Return the image as xarray's: the level in dB with coordinates, names and units.
+        """Return the image as an xarray.DataArray: the level in dB with coordinates and units.
 
-        The same as `clsas.to_xarray`, which says what it holds.
+        This is the same as `clsas.to_xarray`, which describes the result.
 
         Raises
         ------
@@ -137,24 +151,27 @@ class Image:
         return clsas.to_xarray(self)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray:
-        """Return the pixels, so that NumPy's functions take an image.
+        """Return the pixels, so that NumPy's functions accept an image.
 
         Parameters
         ----------
         dtype : dtype, optional
-            complex64 unless given. Real ones are refused: they would lose the phase.
+            A complex type, by default complex64. Real types are refused, because they would lose
+            the phase.
         copy : bool, optional
-            True copies, False raises ValueError where a copy is needed, None copies only then.
+            True copies. False raises ValueError if a copy is needed. None copies only if needed.
         """
         wanted = np.dtype(np.complex64 if dtype is None else dtype)
         if wanted.kind != "c":
-            raise TypeError(f"dtype must be complex, as pixels are, got {wanted}: take np.abs")
+            raise TypeError(
+                f"dtype must be complex, as pixels are, got {wanted}: use np.abs for amplitudes"
+            )
         if copy is False and wanted != self.pixels.dtype:
-            raise ValueError(f"copy must not be False where complex64 becomes {wanted}")
+            raise ValueError(f"copy must not be False if complex64 is to become {wanted}")
         return self.pixels.astype(wanted, copy=bool(copy))
 
 
 def holds_any(pixels: NDArray[np.complex64]) -> bool:
-    """Return whether any pixel is not 0, as soon as one is found."""
+    """Return whether any pixel is not 0, without looking past the first one found."""
     flat = pixels.reshape(-1)
     return any(flat[first : first + _AT_ONCE].any() for first in range(0, flat.size, _AT_ONCE))

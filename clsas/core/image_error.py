@@ -12,34 +12,43 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 
 # Pixels along either side over which levels are averaged. Single pixels of speckle are dark by
-# chance: the darkest tenth would be its nulls, 13 dB below the mean. The mean over 81 pixels, of
-# which some 20 are independent, varies by 1 dB.
+# chance, so the darkest tenth of them would be nulls of the speckle, 13 dB below the mean. The mean
+# over 81 pixels, about 20 of which are independent, varies by only 1 dB.
 _AROUND = 9
 
 
 def relative_error_db(
     image: Image | ArrayLike, reference: Image | ArrayLike, *, darkest: float | None = None
 ) -> float:
-    """Return the relative rms error of an image, 20 log10(||I - R|| / ||R||), dB.
+    """Return the relative rms error of an image against a reference, dB.
 
     Parameters
     ----------
     image, reference : Image or array_like
         Complex images of one shape. Two Images must also have the same pixel positions.
     darkest : float, optional
-        Take both norms over this share of the pixels, the darkest of the reference (0.1 is a
-        tenth). This is the error in shadows, relative to their own level; see `darkest_pixels`.
+        Share of the pixels over which both norms are taken: the darkest pixels of the reference
+        (0.1 is a tenth of them). The result is then the error in shadows, relative to their own
+        level. The level of a pixel is the mean intensity of the 9 by 9 pixels around it.
 
     Returns
     -------
     float
-        The error; -inf if the images are equal.
+        20 log10(||I - R|| / ||R||), -inf if the images are equal.
 
     Raises
     ------
     ValueError
-        If the shapes or grids differ, a value is not finite, the reference is zero, or `darkest`
-        is not above 0 and at most 1.
+        If the shapes or grids differ, a value is not finite, the reference is zero everywhere, or
+        `darkest` is not above 0 and at most 1.
+
+    Examples
+    --------
+    An error of 1 % in one of two equal pixels:
+
+    >>> import clsas
+    >>> f"{clsas.relative_error_db([1j, 1.01], [1j, 1]):.2f} dB"
+    '-43.01 dB'
     """
     given, wanted = complex_values("image", image), complex_values("reference", reference)
     if given.shape != wanted.shape:
@@ -53,7 +62,7 @@ def relative_error_db(
     if darkest is not None:
         chosen = darkest_pixels(wanted, darkest)
         given, wanted = given[chosen], wanted[chosen]
-    # Scaled by the largest part, so that no square overflows or underflows.
+    # Scaled by the largest real or imaginary part, so that no square overflows or underflows.
     parts, wanted_parts = given.view(np.float64), wanted.view(np.float64)
     scale = max(np.abs(parts).max(), np.abs(wanted_parts).max())
     error = parts / scale - wanted_parts / scale
@@ -63,7 +72,7 @@ def relative_error_db(
 
 
 def complex_values(name: str, image: Image | ArrayLike) -> NDArray[np.complex128]:
-    """Return checked complex values in double precision."""
+    """Return the values of an image, checked, in double precision."""
     values = np.asanyarray(image.pixels if isinstance(image, Image) else image)
     if values.dtype.kind in "iuf":
         values = values.astype(np.complex128)
@@ -79,8 +88,8 @@ def _check_one_grid(image: Grid, reference: Grid) -> None:
     apart_m = np.abs(image.positions_m(*part) - positions_m).max()
     if apart_m > 1e-9 + 1e-14 * np.abs(positions_m).max():
         raise ValueError(
-            "image and reference must lie on one grid, got pixel positions that are up to "
-            f"{apart_m:g} m apart"
+            "image and reference must lie on one grid, got pixel positions that differ by up to "
+            f"{apart_m:g} m"
         )
 
 
@@ -90,17 +99,18 @@ def _norm_db(values: NDArray[np.float64]) -> float:
 
 
 def darkest_pixels(image: NDArray[np.complexfloating], darkest: float) -> NDArray[np.bool_]:
-    """Return which pixels are the darkest ones, bool with the image's shape.
+    """Return a mask of the darkest pixels, bool with the image's shape.
 
-    The level of a pixel is the mean intensity of the 9 x 9 pixels around it, so that shadows count
-    and nulls of speckle do not. With one axis, whose pixels may lie anywhere, it is the pixel's own
-    intensity. Pixels of exactly zero were not imaged and do not count.
+    The level of a pixel is the mean intensity of the 9 x 9 pixels around it, so that shadows are
+    found and nulls of speckle are not. For an image with one axis, whose pixels may lie anywhere,
+    it is the intensity of the pixel itself. Pixels that are exactly zero were not imaged and are
+    not counted.
 
     Parameters
     ----------
     image : complex array
     darkest : float
-        Share of the pixels, above 0 and at most 1.
+        Share of the pixels to find, above 0 and at most 1.
 
     Raises
     ------

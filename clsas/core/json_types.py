@@ -1,4 +1,4 @@
-"""Values in types of JSON."""
+"""Conversion of values to types that JSON has."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 
 
 def json_able(value: Any) -> Any:
-    """Return a value in types of JSON: paths as text, infinity as null, arrays as lists.
+    """Return a value in JSON's types: paths as strings, infinity and NaN as null, arrays as lists.
 
-    Arrays that are fields of a dataclass are left out: they are data, not results.
+    Arrays in the fields of a dataclass are left out, because they are data and not results.
     """
     if is_dataclass(value):
         parts = {part.name: getattr(value, part.name) for part in fields(value)}

@@ -1,8 +1,7 @@
-"""Range lines: compressed echoes with their geometry, the input of every imager."""
+"""Range lines: pulse-compressed echoes with their geometry, the input of every imager."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,11 +12,11 @@ from clsas.core import conditioning, pings, reprs, validate
 
 _PER_CHANNEL = ("first_range_m", "tx_m", "rx_m", "rx_velocity_m_s")
 GOLDEN = (np.sqrt(5) - 1) / 2
-"""Modulo 1, its multiples fill the interval from 0 to 1 evenly, but never at regular steps."""
+"""Golden ratio minus 1. Modulo 1, its multiples fill [0, 1) evenly, but never in regular steps."""
 
 SAMPLED_CHANNELS = 128
-"""Channels that stand for all in estimates of geometry and coverage. Half or twice as many change
-predicted errors by less than 0.2 dB (`scripts/bench sensitivity`)."""
+"""Number of channels that represent all in estimates of geometry and coverage. Half or twice as
+many change predicted errors by less than 0.2 dB (`scripts/bench sensitivity`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +24,8 @@ class RangeLines:
     """Pulse-compressed complex echoes of every channel, with the channels' geometry.
 
     A channel is one (ping, receiver) pair, in ping-major order. Range is half the two-way path,
-    rho(x) = (|x - tx| + |x - rx|) / 2, so that monostatic range is range. A point of amplitude A
-    at rho appears in a line as
+    rho(x) = (|x - tx| + |x - rx|) / 2. For a monostatic sonar this is the distance to the point. A
+    point of amplitude A at range rho appears in a line as
 
         A p(r - rho) exp(-j 2 k rho),   k = 2 pi carrier_hz / sound_speed_m_s,
 
@@ -35,20 +34,20 @@ class RangeLines:
     Parameters
     ----------
     samples : array_like of complex, shape [channels, length]
-        Complex samples, stored as complex64.
+        Samples, stored as complex64.
     first_range_m : float or array_like, shape [channels]
-        Range of each channel's first sample, metres; one number applies to all channels.
+        Range of each channel's first sample, metres. One number applies to all channels.
     range_step_m : float
         Range between samples, metres: sound_speed_m_s / (2 sample rate).
     tx_m, rx_m : array_like of float, shape [channels, 3] or [3]
-        Transmitter and receiver positions (x, y, z) at transmission, metres, stored as float64; one
-        position applies to all channels. A monostatic sonar has `rx_m=tx_m`.
+        Transmitter and receiver positions (x, y, z) at transmission, metres, stored as float64. One
+        position applies to all channels. For a monostatic sonar give `rx_m=tx_m`.
     carrier_hz : float
-        Frequency that was mixed out, hertz; 0 if the lines still have their carrier.
+        Frequency that was mixed out, hertz; 0 if the lines are still on their carrier.
     sound_speed_m_s : float
         Speed of the waves, metres per second.
     rx_velocity_m_s : array_like of float, shape [channels, 3] or [3], optional
-        Velocity of the receivers during the echoes' flight, metres per second. None is
+        Velocity of the receivers while the sound travels, metres per second. None means
         stop-and-hop.
 
     Raises
@@ -57,13 +56,35 @@ class RangeLines:
         If an argument has the wrong type. This includes real samples, which have no phase.
     ValueError
         If shapes disagree, an array is empty, a value is NaN or infinite, a step or speed is not
-        positive, the carrier is negative, a receiver is not slower than the waves, or complex64
-        cannot represent the samples to its precision.
+        positive, the carrier is negative, a receiver is not slower than the waves, or the largest
+        sample is too large or too small for complex64.
+
+    See Also
+    --------
+    compress : Range lines of recorded echoes.
+    from_phase_history : Range lines of samples over frequency.
+    from_full_matrix : Range lines of an array whose elements transmit in turn.
 
     Notes
     -----
-    Arrays that need no conversion are not copied, since samples are large; the fields are read-only
-    views. Do not write into your arrays afterwards, since new values are not checked.
+    Samples are large, so arrays that need no conversion are not copied. The fields are read-only
+    views of them. Do not write into your arrays afterwards, because new values are not checked.
+
+    Examples
+    --------
+    Two pings of a monostatic sonar, half a metre apart:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> lines = clsas.RangeLines(
+    ...     np.ones((2, 101), complex), first_range_m=40.0, range_step_m=0.05,
+    ...     tx_m=[[0, 0, 0], [0.5, 0, 0]], rx_m=[[0, 0, 0], [0.5, 0, 0]],
+    ...     carrier_hz=100e3, sound_speed_m_s=1500.0,
+    ... )
+    >>> lines
+    RangeLines(2 channels of 101 samples, range 40 to 45 m in steps of 50 mm, carrier 100 kHz)
+    >>> lines.ping_starts
+    array([0, 1])
     """
 
     samples: NDArray[np.complex64]
@@ -75,7 +96,7 @@ class RangeLines:
     sound_speed_m_s: float
     rx_velocity_m_s: NDArray[np.float64] | None = None
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,
@@ -101,7 +122,7 @@ class RangeLines:
             put(name, value)
 
     def __repr__(self) -> str:
-        """Return sizes and extents: the arrays are long."""
+        """Return sizes and extents, because the arrays are long."""
         range_m = float(self.first_range_m.min()), float(self.last_range_m.max())
         return reprs.summary(
             self,
@@ -113,9 +134,9 @@ class RangeLines:
 
     @property
     def per_channel(self) -> dict[str, Any]:
-        """Float64 fields with an entry per channel, by name; only those that are given.
+        """Float64 fields with an entry per channel, by name, without those that are None.
 
-        Whoever selects, joins or compares lines takes the fields from here.
+        Code that selects, joins or compares lines takes the fields from here.
         """
         fields = {name: getattr(self, name) for name in _PER_CHANNEL}
         return {name: values for name, values in fields.items() if values is not None}
@@ -137,17 +158,17 @@ class RangeLines:
 
     @property
     def ping_starts(self) -> NDArray[np.int64]:
-        """First channel of every ping; consecutive channels with one tx position are a ping.
+        """First channel of every ping, int64 [pings].
 
-        Pings at one place count as one; `clsas.core.pings.Transmissions` tells them apart.
+        Consecutive channels with one transmitter position are a ping. Several transmissions from
+        one position therefore count as one; `clsas.core.pings.Transmissions` separates them.
         """
-        return np.flatnonzero(np.append(True, (np.diff(self.tx_m, axis=0) != 0).any(axis=1)))
+        return pings.ping_starts(self.tx_m)
 
     @property
     def ping_numbers(self) -> NDArray[np.int64]:
-        """Number of every channel's ping, shape [channels]."""
-        starts = self.ping_starts
-        return np.repeat(np.arange(len(starts)), np.diff(np.append(starts, self.channels)))
+        """Number of every channel's ping, from 0, shape [channels]."""
+        return pings.ping_numbers(self.ping_starts, self.channels)
 
     @property
     def ping_centres_m(self) -> NDArray[np.float64]:
@@ -161,7 +182,7 @@ class RangeLines:
 
     @property
     def carrier_cycles_per_m(self) -> float:
-        """Phase of the carrier per metre of range (two-way), cycles."""
+        """Phase of the carrier per metre of range (two-way), cycles per metre."""
         return 2 * self.carrier_hz / self.sound_speed_m_s
 
     @property
@@ -175,14 +196,15 @@ class RangeLines:
         Parameters
         ----------
         channels : slice or array_like
-            A slice (samples are then shared, not copied), indices, or a mask of bools.
+            Indices, a mask of bools, or a slice, with which samples are shared and not copied.
 
         Raises
         ------
         TypeError
             If `channels` is neither a slice nor whole numbers nor bools.
         ValueError
-            If an index is out of range, a mask is not one bool per channel, or nothing is selected.
+            If an index is out of range, a mask is not one bool per channel, or no channel is
+            selected.
         """
         index = self._index(channels)
         if len(range(self.channels)[index] if isinstance(index, slice) else index) == 0:
@@ -191,7 +213,7 @@ class RangeLines:
         return replace(self, samples=self.samples[index], **of_channels)
 
     def _index(self, channels: slice | ArrayLike) -> slice | NDArray[np.int64]:
-        """Return checked channels: a slice, or indices [n]."""
+        """Return the channels, checked, as a slice or as indices [n]."""
         if isinstance(channels, slice):
             return validate.selection("channels", channels)
         try:
@@ -215,63 +237,67 @@ class RangeLines:
     def high_passed(self, cutoff_hz: float) -> RangeLines:
         """Return the lines without frequencies below a cutoff.
 
-        Recorders add a constant and slow drifts. On the carrier these lie at 0 Hz, where they add
-        up coherently over a whole image.
+        Recorders add constants and slow drifts. In lines on their carrier these lie near 0 Hz,
+        where they add up coherently over a whole image.
 
         Parameters
         ----------
         cutoff_hz : float
-            Frequency in the recorded signal, before `carrier_hz` was mixed out. Frequencies from
-            the cutoff upwards pass unchanged. The filter falls to zero at half the cutoff, or at
-            the lowest frequency that the samples can hold if that is higher. It shifts nothing.
+            Cutoff frequency in the recorded signal, before `carrier_hz` was mixed out, hertz.
+            Frequencies from the cutoff upwards pass unchanged. The filter falls to zero at half the
+            cutoff, or at the lowest frequency that the samples represent if that is higher. It has
+            no delay.
 
         Raises
         ------
         TypeError, ValueError
-            If the cutoff is not a number, is outside the band that the samples hold, carrier_hz
-            plus or minus half the sample rate, or is below one cycle per line.
+            If the cutoff is not a number, is outside the sampled band (carrier_hz plus or minus
+            half the sample rate), or is below one cycle per line.
         """
         return conditioning.high_passed(self, cutoff_hz)
 
     def tapered_ends(self, length_m: float) -> RangeLines:
         """Return the lines with both ends faded to zero.
 
-        Lines that end sharply in strong echoes cannot be interpolated well, even far from the ends.
+        Lines that end abruptly within strong echoes cannot be interpolated well, even far from
+        their ends.
 
         Parameters
         ----------
         length_m : float
-            Range over which a raised cosine falls from 1 to 0, at each end. At most half a line.
+            Length over which a raised cosine falls from 1 to 0 at each end, metres. At most half a
+            line.
 
         Raises
         ------
         TypeError, ValueError
-            If the length is not a number or outside its limits.
+            If the length is not a number, or is outside its limits.
         """
         return conditioning.tapered_ends(self, length_m)
 
     def without_background(
         self, statistic: str = "mean", *, receivers: int | None = None
     ) -> RangeLines:
-        """Return the lines without what all pings have in common.
+        """Return the lines without the background that all pings have in common.
 
         Direct arrivals, ringing and interference of the electronics lie at the same delay in every
         ping. Echoes of points move through the lines and mostly remain. A reflector at constant
-        range, such as a flat seabed seen vertically, is removed too.
+        range, such as a flat seabed seen vertically, is removed as well.
 
         Parameters
         ----------
         statistic : {"mean", "median"}
-            Over the pings, per receiver and sample. The median (of real and imaginary parts) is
-            less affected by strong echoes.
+            Estimate of the background over the pings, for every receiver and sample. The median (of
+            real and imaginary parts) is less affected by strong echoes.
         receivers : int, optional
-            Channels per ping; by default consecutive channels with one tx position are a ping.
+            Number of channels per ping. By default consecutive channels with one transmitter
+            position are a ping.
 
         Raises
         ------
         TypeError, ValueError
-            If there are fewer than 2 pings, pings have different numbers of channels, or a
-            receiver's lines do not begin at the same range in all pings.
+            If there are fewer than 2 pings, pings have different numbers of channels, or the lines
+            of a receiver do not begin at the same range in all pings.
         """
         return conditioning.without_background(self, statistic, receivers)
 
@@ -279,26 +305,26 @@ class RangeLines:
         """Return the lines without pings taken standing still.
 
         A platform that stands still repeats one view of the scene. Hundreds of equal pings add up
-        to a bright circle about their place and hide what the moving ones show. Of the pings of
-        a halt the first stays.
+        to bright circles around their position, which hide the image formed by the moving pings.
+        The first ping of every halt is kept.
 
         Parameters
         ----------
         least_advance_m : float, optional
-            Distance from the last ping that stays, below which a ping is dropped, metres. By
-            default a tenth of the usual advance: the median over the pings that move. Then only
-            halts of five pings or more count, and pings that repeat the place of the one before:
-            noisy positions bring single pings together.
+            A ping is dropped if it lies closer than this to the last ping that was kept, metres.
+            The default is a tenth of the usual advance, the median over the pings that move.
+            Because noise in positions brings single pings together, the default drops only halts of
+            five pings or more, and pings that repeat the position of the one before exactly.
 
         Raises
         ------
         TypeError, ValueError
-            If the distance is not a positive number, or only one of several pings would stay.
+            If the distance is not a positive number, or only one of several pings would be kept.
         """
         return pings.without_still_pings(self, least_advance_m)
 
     def weighted(self, weights: ArrayLike) -> RangeLines:
-        """Return the lines, each multiplied by its weight.
+        """Return the lines, each multiplied by a weight.
 
         Parameters
         ----------
@@ -308,12 +334,13 @@ class RangeLines:
         Raises
         ------
         TypeError, ValueError
-            If the weights are not finite numbers, one per channel.
+            If the weights are not finite numbers, one per channel, or weighted samples exceed
+            float32.
         """
         return conditioning.weighted(self, weights)
 
     def without_samples(self) -> RangeLines:
-        """Return these lines with a single sample per channel, which is zero."""
+        """Return the geometry of these lines, with a single sample of zero per channel."""
         return replace(self, samples=np.zeros((self.channels, 1), np.complex64))
 
 
@@ -323,9 +350,9 @@ def checked_channels(received: Any, start: str) -> dict[str, Any]:
     Parameters
     ----------
     received : RangeLines or Echoes
-        Object whose `samples` are checked already.
+        Object whose `samples` have been checked.
     start : str
-        Name of the field with the first range or time of every channel.
+        Name of the field that has the first range or time of every channel.
 
     Raises
     ------
@@ -353,7 +380,7 @@ def checked_channels(received: Any, start: str) -> dict[str, Any]:
 def some_channels(count: int, most: int = SAMPLED_CHANNELS) -> NDArray[np.int64]:
     """Return up to `most` of `count` channels, spread evenly but at irregular intervals.
 
-    Regular intervals could always pick the same receiver of an array.
+    With regular intervals, all of them could belong to one receiver of an array.
     """
     if count <= most:
         return np.arange(count)
@@ -361,20 +388,12 @@ def some_channels(count: int, most: int = SAMPLED_CHANNELS) -> NDArray[np.int64]
     return ((number + number * GOLDEN % 1) * count / most).astype(np.int64)
 
 
-def wavelength_m(lines: RangeLines) -> float:
-    """Return the wavelength of the carrier, for elements' patterns; infinite without a carrier.
-
-    Lengths are compared with `clsas.signal.spectrum.band_wavelength_m`, which every line has.
-    """
-    return lines.sound_speed_m_s / lines.carrier_hz if lines.carrier_hz else math.inf
-
-
 def antennas_of(
     lines: RangeLines, channels: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None, float]:
-    """Return positions of transmitters and receivers, velocities of receivers, and sound speed.
+    """Return the transmitters, receivers and velocities of some channels, and the sound speed.
 
-    They are those of some channels, as functions of ranges in `clsas.core.geometry` take them.
+    These are the arguments that the functions of `clsas.core.geometry` take after the points.
     """
     velocity = lines.rx_velocity_m_s
     moving = None if velocity is None else velocity[channels]
@@ -382,16 +401,16 @@ def antennas_of(
 
 
 def steepest(lines: RangeLines) -> float:
-    """Return an upper bound of how fast ranges change per metre that a point moves.
+    """Return an upper bound on the change of range per metre that a point moves.
 
-    With unit vectors u from both antennas, the gradient of range is (u_tx + u_rx) / 2 over
+    With unit vectors u from both antennas, the gradient of range is (u_tx + u_rx) / 2 divided by
     1 + u_rx . velocity / c.
     """
     return 1 / (1 - min(fastest(lines), 0.999))
 
 
 def fastest(lines: RangeLines) -> float:
-    """Return the speed of the fastest receiver relative to the sound speed."""
+    """Return the speed of the fastest receiver divided by the sound speed."""
     if lines.rx_velocity_m_s is None:
         return 0.0
     return float(np.linalg.norm(lines.rx_velocity_m_s, axis=1).max()) / lines.sound_speed_m_s

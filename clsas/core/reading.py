@@ -1,4 +1,4 @@
-"""Reading of users' files, after checks of their type, size and nesting."""
+"""Reading of users' files, with checks of their type, size and nesting."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from typing import Any
 
 from clsas.core import validate
 
-# Memory for parsing one byte of TOML or JSON: an empty list, "[],", takes 64 bytes in Python.
+# Memory that parsing one byte of TOML or JSON may take. The worst case is an empty list: "[],"
+# becomes 64 bytes in Python.
 _PARSED_BYTES = 32
 _NOT_ORDINARY = {
     stat.S_ISFIFO: "a pipe",
@@ -22,7 +23,7 @@ _NOT_ORDINARY = {
 
 
 def check_ordinary(path: str | os.PathLike) -> None:
-    """Raise ValueError if a path is a pipe, a socket or a device, whose reading may never end.
+    """Raise ValueError if a path is a pipe, socket or device, from which reading may never end.
 
     Raises OSError if the path does not exist.
     """
@@ -33,12 +34,12 @@ def check_ordinary(path: str | os.PathLike) -> None:
 
 
 def read_bytes(path: str | os.PathLike) -> bytes:
-    """Return the content of an ordinary file, to be parsed.
+    """Return the contents of an ordinary file that is to be parsed.
 
     Raises
     ------
     ValueError
-        If the file is not an ordinary one, or too large to be parsed in this machine's memory.
+        If the file is not an ordinary file, or is too large to be parsed in the memory left.
     OSError
         If the file cannot be read.
     """
@@ -49,7 +50,7 @@ def read_bytes(path: str | os.PathLike) -> bytes:
 
 
 def parse_toml(text: bytes) -> dict[str, Any]:
-    """Return the tables of a TOML text; raises ValueError if it is invalid or nested too deep."""
+    """Return the tables of a TOML text; raises ValueError if it is invalid or too deeply nested."""
     try:
         return tomllib.loads(text.decode())
     except RecursionError:
@@ -57,7 +58,7 @@ def parse_toml(text: bytes) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value of a JSON text; raises ValueError if it is invalid or nested too deep."""
+    """Return the value of a JSON text; raises ValueError if it is invalid or too deeply nested."""
     try:
         return json.loads(text)
     except RecursionError:

@@ -1,7 +1,7 @@
-"""Short texts that say what an object is: sizes, extents and units, never whole arrays.
+"""Short descriptions of objects: sizes, extents and units, never whole arrays.
 
-Every public class takes its `repr` from here: `summary` for one that says what matters in words of
-its own, `of_fields` for one whose fields say it.
+Every public class builds its `repr` with these functions: `of_fields` if listing the fields is
+enough, else `summary`.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ _UNITS = {
     "_rad": "rad", "_deg": "deg", "_m2": "per m2", "_bytes": "bytes",
 }  # fmt: skip
 _PREFIXES = {
-    "m": ((1e-6, "µm"), (1e-3, "mm"), (0.1, "m")),  # metres from 0.1 on, as people say it
+    "m": ((1e-6, "µm"), (1e-3, "mm"), (0.1, "m")),  # metres from 0.1 m on, as people say it
     "s": ((1e-6, "µs"), (1e-3, "ms"), (1.0, "s")),
     "Hz": ((1.0, "Hz"), (1e3, "kHz"), (1e6, "MHz"), (1e9, "GHz")),
     "bytes": ((1.0, "bytes"), (2**20, "MiB"), (2**30, "GiB")),
 }
 _SCALES = {"µm": 1e-6, "mm": 1e-3, "µs": 1e-6, "ms": 1e-3}
 _SCALES |= {"kHz": 1e3, "MHz": 1e6, "GHz": 1e9, "MiB": 2**20, "GiB": 2**30}
-_DIGITS = {"s": 4, "bytes": 4, "dB": 4}  # that matter; of others, such as places, 6
-_MOST_ITEMS = 4  # of a tuple or array that is written out; more are counted
+_DIGITS = {"s": 4, "bytes": 4, "dB": 4}  # significant digits; other units, such as metres, have 6
+_MOST_ITEMS = 4  # longer tuples and arrays are described by their size
 
 
 def summary(obj: object, *parts: str | None) -> str:
-    """Return "Type(part, part, ...)" of the parts that are not None or empty."""
+    """Return "Type(part, part, ...)" from the parts that are not None or empty."""
     return f"{type(obj).__name__}({', '.join(filter(None, parts))})"
 
 
 def of_fields(obj: Any) -> str:
-    """Return a summary of a dataclass's fields in their order: name, value and unit.
+    """Return a summary of the fields of a dataclass in their order: name, value and unit.
 
-    Units follow from the ends of names, such as `carrier_hz`. Fields that are None are left out,
-    as are private ones; long arrays and tuples are told by their size.
+    Units follow from the ends of names, as in `carrier_hz`. Private fields and fields that are None
+    are left out. Long arrays and tuples are described by their size.
     """
     shown = [f for f in fields(obj) if f.repr and not f.name.startswith("_")]
     values = {field.name: getattr(obj, field.name) for field in shown}
@@ -48,7 +48,7 @@ def of_fields(obj: Any) -> str:
 
 
 def quantity(value: float, unit: str) -> str:
-    """Return a number with its unit, metres, seconds and hertz with a prefix that suits it."""
+    """Return a number with its unit; metres, seconds, hertz and bytes get a suitable prefix."""
     digits = _DIGITS.get(unit, 6)
     for least, prefixed in reversed(_PREFIXES.get(unit, ())):
         if abs(value) >= least * (1 - 1e-9):
@@ -57,32 +57,32 @@ def quantity(value: float, unit: str) -> str:
 
 
 def span(low: float, high: float, unit: str) -> str:
-    """Return "low to high" with the unit, or one value where they are the same."""
+    """Return "low to high" with the unit, or one value if both are equal."""
     if low == high:
         return f"{_place(low, unit)} {unit}"
     return f"{_place(low, unit)} to {_place(high, unit)} {unit}"
 
 
 def extents(low_m: Sequence[float] | NDArray, high_m: Sequence[float] | NDArray) -> str:
-    """Return the extents of a box: "x -2.5 to 2.5 m, y 40 to 45 m, z 0 m"."""
+    """Return the extents of a box, such as "x -2.5 to 2.5 m, y 40 to 45 m, z 0 m"."""
     ends = zip("xyz", low_m, high_m, strict=True)
     return ", ".join(f"{name} {span(low, high, 'm')}" for name, low, high in ends)
 
 
 def by(shape: Sequence[int]) -> str:
-    """Return a shape as "401 x 501"."""
+    """Return a shape as text, such as "401 x 501"."""
     return " x ".join(map(str, shape))
 
 
 def _place(value: float, unit: str) -> str:
-    """Return an end of a span; metres to micrometres, also where they are UTM-sized."""
+    """Return one end of a span. Metres are rounded to micrometres, even if they are UTM-sized."""
     if unit != "m":
         return f"{value:.{_DIGITS.get(unit, 6)}g}"
     return f"{round(float(value), 6) + 0.0:.14g}"
 
 
 def _field(name: str, value: Any) -> str:
-    """Return a field as "carrier 1 MHz"."""
+    """Return a field as text, such as "carrier 1 MHz"."""
     end = max((end for end in _UNITS if f"_{name}".endswith(end)), key=len, default="")
     unit = _UNITS.get(end, "")
     words = (name[: -len(end)] if end and len(end) < len(name) else name).replace("_", " ")

@@ -1,4 +1,4 @@
-"""Tables of results: one model that is written as text for terminals and as HTML for notebooks."""
+"""Tables of results, which are written as text for terminals and as HTML for notebooks."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from itertools import chain
 
 @dataclass(frozen=True)
 class Table:
-    """Cells under headings.
+    """Rows of cells under headings.
 
     Parameters
     ----------
     headings : sequence of str
         One per column.
     rows : sequence of sequences of str
-        Cells, as many in every row as there are headings.
+        Cells. Every row has as many as there are headings.
     align : str
         "right" for numbers, "left" for words.
     """
@@ -50,7 +50,7 @@ class Report:
     Parameters
     ----------
     parts : sequence of str and Table
-        A string is a line: one sentence or finding.
+        Each string is a line: one sentence or finding.
     """
 
     parts: Sequence[str | Table]
@@ -61,7 +61,7 @@ class Report:
         return "\n".join(chain.from_iterable(lines))
 
     def html(self) -> str:
-        """Return the report for a notebook; lines keep their columns."""
+        """Return the report for a notebook. Spaces in lines are kept, so that columns stay."""
         style = ' style="white-space: pre-wrap"'
         parts = [
             part.html() if isinstance(part, Table) else f"<p{style}>{escape(part)}</p>"

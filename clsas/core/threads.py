@@ -1,7 +1,7 @@
-"""Work in threads that Ctrl-C can end at any time.
+"""Work in threads that Ctrl-C can interrupt at any time.
 
 Python raises `KeyboardInterrupt` anywhere in the main thread, even between acquiring a lock and the
-code that releases it. Threads that need the lock then wait for ever. Ctrl-C is therefore held back
+code that releases it. Threads that need the lock then wait for ever. Ctrl-C is therefore delayed
 while the main thread uses objects that it shares with other threads.
 """
 
@@ -19,7 +19,7 @@ from typing import TypeVar
 
 from clsas.core import validate
 
-_POLL_S = 0.1  # longest time for which waiting holds Ctrl-C back
+_POLL_S = 0.1  # longest time for which waiting delays Ctrl-C
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -27,9 +27,9 @@ Result = TypeVar("Result")
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C back until the end of the block, which must be short."""
+    """Delay Ctrl-C until the end of the block, which must be short."""
     handler = signal.getsignal(signal.SIGINT)
-    # Only handlers of Python interrupt, and only the main thread.
+    # Only Python's handlers interrupt, and they interrupt only the main thread.
     if threading.current_thread() is not threading.main_thread() or not callable(handler):
         yield
         return
@@ -44,7 +44,7 @@ def uninterrupted() -> Iterator[None]:
 
 
 def wait(futures: Collection[Future], timeout: float | None = None) -> set[Future]:
-    """Wait until any future is done, and return those that are; none after `timeout` seconds."""
+    """Wait until any future is done and return those that are; none after `timeout` seconds."""
     left = timeout
     while True:
         with uninterrupted():
@@ -66,7 +66,7 @@ def in_threads(
     function : callable
         Called with one item. Ctrl-C, or closing the generator, waits for the calls that have begun.
     items : iterable
-        Read completely before the first result.
+        Items, all of which are read before the first result.
     workers : int, optional
         Number of threads; by default as many as the machine has cores.
     """

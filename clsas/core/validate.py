@@ -1,6 +1,6 @@
-"""Checks of user input, at the point where it enters the library.
+"""Checks of user input at the point where it enters the library.
 
-Every check raises one exception that names the argument, its value and what is allowed.
+A check that fails raises one exception, which names the argument, its value and what is allowed.
 """
 
 from __future__ import annotations
@@ -24,31 +24,37 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 _LONGEST = 100  # characters of a value in a message
 _LONGEST_LINE = 1000  # characters of a line of a message
 _BARE_BREAK = re.compile(r"\n(?!  )")
-# Largest parts of a value in a message; longer parts and deeper lists end in "...".
+# Limits on the parts of a value in a message. Longer parts and deeper lists end in "...".
 _REPR = reprlib.Repr()
 _REPR.maxlevel = 4
 _REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = _REPR.maxfrozenset = 20
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 2 * _LONGEST
-# Files with the memory limit of a process's control group, versions 2 and 1.
+# Files with the memory limit of the process's control group, in versions 2 and 1 of the kernel's
+# interface.
 _GROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 MOST_HZ, MOST_M_S = 1e15, 3e8
-"""Largest frequency and speed of waves that recordings may have: those of light."""
+"""Largest frequency and speed of waves in a recording: those of light."""
+FARTHEST_M = 1e9
+"""Largest distance from antennas to pixels, and largest coordinate of a simulated point. Up to it
+squares of distances stay within float32, and float64 resolves ranges to 1e-7 m."""
 _MOST_COUNT = 2**63 - 1
-_MOST_OVERSAMPLING = 1e4  # far beyond what any interpolation gains from
-_MOST_CYCLES = 1e10  # of phase: float64 holds them to 1e-6 of a cycle
+_MOST_OVERSAMPLING = 1e4  # arbitrary, far beyond what improves any interpolation
+_MOST_CYCLES = 1e10  # of phase, which float64 still resolves to 1e-6 of a cycle
 
-_SMALL_BYTES = 1 << 20  # of an array; asking the system for its memory takes longer
+# Size of arrays below which memory is not checked. Asking the system for its free memory takes
+# longer than such an allocation.
+_SMALL_BYTES = 1 << 20
 
 _T = TypeVar("_T")
 
 
 class ClsasWarning(UserWarning):
-    """The result is valid but probably not the intended one."""
+    """Warning that a result is valid but probably not the intended one."""
 
 
 def warn(message: str, category: type[ClsasWarning] = ClsasWarning) -> None:
-    """Warn with a ClsasWarning that points at the first caller outside clsas."""
+    """Issue a ClsasWarning that points to the first caller outside clsas."""
     level = 2
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_globals["__name__"].split(".")[0] == "clsas":
@@ -67,14 +73,14 @@ def number(
     least: float | None = None,
     most: float | None = None,
 ) -> float:
-    """Return `value` as a finite float inside the given limits.
+    """Return `value` as a finite float within limits.
 
     Raises
     ------
     TypeError
         If `value` is not a real number.
     ValueError
-        If it is not finite, or not above `above` and below `below`, or outside [`least`, `most`].
+        If it is not finite, not above `above` or not below `below`, or not from `least` to `most`.
     """
     scalar: Any = value
     if getattr(value, "ndim", None) == 0:
@@ -84,7 +90,7 @@ def number(
         raise TypeError(f"{name} must be one real {kind}, got {shown(value)}")
     try:
         result = float(scalar)
-    except OverflowError:  # a whole number or fraction beyond float64
+    except OverflowError:  # an int or a fraction beyond float64
         result = math.inf if scalar > 0 else -math.inf  # type: ignore[operator]
     limits = []
     if above is not None:
@@ -116,12 +122,12 @@ def positive(name: str, value: float, unit: str = "") -> float:
 def count(name: str, value: int, *, least: int = 1, most: int | None = None) -> int:
     """Return `value` as an int from `least` to `most`; raises TypeError or ValueError.
 
-    Without `most` the largest is that of a 64-bit integer, which sizes of arrays cannot exceed.
+    The default of `most` is the largest 64-bit integer, which sizes of arrays cannot exceed.
     """
     try:
         if isinstance(value, (bool, np.bool_)) or np.ma.is_masked(value):
             raise TypeError
-        result = operator.index(value)  # of Python's and NumPy's integers, and 0-d arrays of them
+        result = operator.index(value)  # accepts ints of Python and NumPy, and 0-d arrays of them
     except TypeError:
         raise TypeError(f"{name} must be a whole number, got {shown(value)}") from None
     if result < least:
@@ -133,16 +139,16 @@ def count(name: str, value: int, *, least: int = 1, most: int | None = None) -> 
 
 
 def flag(name: str, value: object) -> bool:
-    """Return `value` as a bool; raises TypeError unless it is one of Python or NumPy."""
+    """Return `value` as a bool; raises TypeError unless it is a bool of Python or NumPy."""
     if not isinstance(value, (bool, np.bool_)):
         raise TypeError(f"{name} must be of type bool, got {type(value).__name__}")
     return bool(value)
 
 
 def one_of(name: str, value: object, allowed: Sequence[_T]) -> _T:
-    """Return the one of `allowed` that equals `value`; raises ValueError if there is none.
+    """Return the member of `allowed` that equals `value`; raises ValueError if there is none.
 
-    NumPy's scalars equal Python's; a float never equals a whole number, nor a bool.
+    NumPy's scalars may equal Python's. A float never equals a whole number or a bool.
     """
     if isinstance(value, (np.generic, np.ndarray)) and value.ndim == 0:
         value = value.item()
@@ -155,7 +161,7 @@ def one_of(name: str, value: object, allowed: Sequence[_T]) -> _T:
 
 
 def named(name: str, values: object, allowed: Sequence[str]) -> tuple[str, ...]:
-    """Return one or several of the allowed names as a tuple; a single one may stand alone."""
+    """Return one or several of the allowed names as a tuple; a single name may be given alone."""
     if isinstance(values, str):
         values = (values,)
     if not isinstance(values, Sequence):
@@ -164,7 +170,7 @@ def named(name: str, values: object, allowed: Sequence[str]) -> tuple[str, ...]:
 
 
 def entries(name: str, value: object, meaning: str) -> list[Any]:
-    """Return the entries of a sequence or array; raises TypeError for others, also for text."""
+    """Return the entries of a sequence or array; raises TypeError for other types and for text."""
     several = isinstance(value, (Sequence, np.ndarray)) and not isinstance(value, (str, bytes))
     if not several or (isinstance(value, np.ndarray) and value.ndim == 0):
         raise TypeError(f"{name} must be {meaning}, got {shown(value)}")
@@ -191,7 +197,7 @@ def path(name: str, value: object) -> Path:
 
 
 def text(name: str, value: object) -> str:
-    """Return `value`; raises TypeError unless it is text, ValueError if no file can hold it."""
+    """Return `value`; raises TypeError unless it is text, ValueError if UTF-8 cannot encode it."""
     if not isinstance(value, str):
         raise TypeError(f"{name} must be text, got {shown(value)}")
     try:
@@ -202,7 +208,7 @@ def text(name: str, value: object) -> str:
 
 
 def sides(name: str, value: object) -> tuple[int, int]:
-    """Return the rows and columns of a block of pixels, from 1."""
+    """Return the rows and columns of a block of pixels, at least 1 each."""
     given = entries(name, value, "(rows, columns)")
     if len(given) != 2:
         raise ValueError(f"{name} must be (rows, columns), got {shown(value)}")
@@ -211,7 +217,7 @@ def sides(name: str, value: object) -> tuple[int, int]:
 
 
 def oversampling(value: float) -> float:
-    """Return samples over those of the band alone; raises TypeError or ValueError as `number`."""
+    """Return an oversampling factor, checked; raises TypeError or ValueError as `number` does."""
     return number("oversampling", value, least=1.0, most=_MOST_OVERSAMPLING)
 
 
@@ -230,7 +236,7 @@ def selection(name: str, value: object, *, ascending: bool = False) -> slice:
 
 
 def indices(name: str, value: ArrayLike, count: int, *, least: int = 0) -> NDArray[np.int64]:
-    """Return `value` as whole numbers of any shape, from `least` to below `count`.
+    """Return `value` as whole numbers of any shape, from `least` to `count` - 1.
 
     Raises
     ------
@@ -246,7 +252,7 @@ def indices(name: str, value: ArrayLike, count: int, *, least: int = 0) -> NDArr
     if given.dtype.kind not in "iu":
         raise TypeError(f"{name} must be whole numbers, got {shown(value)}")
     if np.ma.is_masked(value):
-        raise ValueError(f"{name} must hold no masked value, got {shown(value)}")
+        raise ValueError(f"{name} must have no masked value, got {shown(value)}")
     if given.size and not (least <= given.min() and given.max() < count):
         raise ValueError(
             f"{name} must be from {least} to {count - 1}, got {given.min()} to {given.max()}"
@@ -255,7 +261,7 @@ def indices(name: str, value: ArrayLike, count: int, *, least: int = 0) -> NDArr
 
 
 def suffix(name: str, value: Path, *allowed: str) -> None:
-    """Raise ValueError if a file's name has the suffix of another format.
+    """Raise ValueError if a file name has the suffix of another format.
 
     A name without a suffix, such as `image`, is allowed.
     """
@@ -278,17 +284,17 @@ def shown(value: object) -> str:
     """Return a value as text for a message: shortened, and without control characters."""
     try:
         text = _REPR.repr(value)
-    except Exception:  # an error in another library's __repr__ must not hide the message
+    except Exception:  # an error in the __repr__ of another library must not hide the message
         text = f"<{type(value).__name__}>"
     text = text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
     return printable(text)
 
 
 def printable(text: str) -> str:
-    """Return a message as a terminal may show it: escaped, with shortened lines.
+    """Return a message that is safe to print on a terminal: escaped, with shortened lines.
 
-    Line feeds are escaped too, unless an indented line follows. Whatever a name contains can then
-    not look like a line of its own.
+    Line feeds are escaped as well, unless an indented line follows. A name that contains line feeds
+    can therefore not imitate a message of its own.
     """
     return "\n".join(
         line if len(line) <= _LONGEST_LINE else f"{line[: _LONGEST_LINE - 3]}..."
@@ -297,9 +303,9 @@ def printable(text: str) -> str:
 
 
 def escaped(text: str) -> str:
-    """Return a text with escaped control characters, except line feeds.
+    """Return a text with its control characters escaped, except line feeds.
 
-    Terminals obey control characters, and names of files may contain any.
+    Terminals execute control characters, and file names may contain any of them.
     """
     return "\n".join(
         line
@@ -312,23 +318,23 @@ def escaped(text: str) -> str:
 class Budget:
     """Memory that one call may take: what is left to this process when the call begins.
 
-    Every allocation that stays is subtracted, so that their sum is checked, and
-    each of them before it is made. Nothing is refused if the system does not report its memory.
+    Every allocation is checked before it is made. Allocations that stay are subtracted, so that
+    their sum is checked. Nothing is refused if the system does not report its memory.
     """
 
     def __init__(self) -> None:
         self._left_bytes = _memory_bytes()
 
     def take(self, name: str, size_bytes: float, *, passing_bytes: float = 0) -> None:
-        """Subtract an allocation for `name`, or raise ValueError if it is larger than what is left.
+        """Subtract an allocation for `name`; raise ValueError if it exceeds the memory left.
 
-        `passing_bytes` are needed besides, but only for a time.
+        `passing_bytes` are needed in addition, but only temporarily.
         """
         wanted = size_bytes + passing_bytes
-        if not wanted <= self._left_bytes:  # nor NaN
+        if not wanted <= self._left_bytes:  # also refuses NaN
             try:
                 asked = f"{wanted / 2**30:.3g} GiB"
-            except OverflowError:  # a whole number beyond float64
+            except OverflowError:  # an int beyond float64
                 asked = "more than 1e300 GiB"
             raise ValueError(
                 f"{name} must ask for at most {self._left_bytes / 2**30:.3g} GiB, what is left of "
@@ -337,33 +343,33 @@ class Budget:
         self._left_bytes -= size_bytes
 
     def give_back(self, size_bytes: float) -> None:
-        """Add what was taken before and is released."""
+        """Add memory that was taken before and has been released."""
         self._left_bytes += size_bytes
 
 
 def memory(name: str, size_bytes: float) -> None:
     """Raise ValueError if the argument `name` requires more memory than this process has left.
 
-    See `Budget`, for calls that allocate more than once.
+    Calls that allocate more than once use a `Budget`.
     """
     Budget().take(name, size_bytes)
 
 
 def _memory_bytes() -> float:
-    """Memory that this process may still take, infinite if the system does not report it.
+    """Return the memory that this process may still take; infinite if the system reports none.
 
-    That is the machine's memory or the limit of the process's control group, less what the process
-    holds; or what its address space has left, if that is limited.
+    This is the machine's memory or the limit of the process's control group, minus the memory that
+    the process uses. If its address space is limited, it is at most what is left of that.
     """
     limits = [math.inf]
     if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", ()):
         limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     for file in _GROUP_LIMITS:
-        with contextlib.suppress(OSError, ValueError):  # no such group, or "max"
+        with contextlib.suppress(OSError, ValueError):  # no such file, or the word "max"
             limits.append(int(Path(file).read_text()))
     held_bytes, addressed_bytes = _held_bytes()
     left_bytes = min(limits) - held_bytes
-    with contextlib.suppress(ImportError):  # of Unix
+    with contextlib.suppress(ImportError):  # not Unix
         import resource
 
         soft, _ = resource.getrlimit(resource.RLIMIT_AS)
@@ -373,7 +379,7 @@ def _memory_bytes() -> float:
 
 
 def _held_bytes() -> tuple[int, int]:
-    """Memory of this process's own, without files and libraries, and all of its address space."""
+    """Return the private memory of this process, and the size of its address space."""
     try:
         addressed, resident, shared = map(int, Path("/proc/self/statm").read_text().split()[:3])
     except (OSError, ValueError):  # not Linux
@@ -383,16 +389,16 @@ def _held_bytes() -> tuple[int, int]:
 
 
 def phase(carrier_hz: float, sound_speed_m_s: float, farthest_m: float) -> None:
-    """Raise ValueError if float64 cannot hold the phase of the farthest range.
+    """Raise ValueError if float64 cannot resolve the phase of the farthest range.
 
-    `carrier_hz` and `farthest_m` may have overflown.
+    `carrier_hz` and `farthest_m` may be infinite after an overflow.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         cycles = np.float64(2) * carrier_hz / sound_speed_m_s * farthest_m
-    if not cycles <= _MOST_CYCLES:  # nor NaN
+    if not cycles <= _MOST_CYCLES:  # also refuses NaN
         raise ValueError(
             f"carrier_hz = {carrier_hz:g} Hz makes {cycles:.3g} cycles over {farthest_m:g} m "
-            f"at sound_speed_m_s = {sound_speed_m_s:g} m/s; float64 holds the phase of "
+            f"at sound_speed_m_s = {sound_speed_m_s:g} m/s; float64 resolves the phase of up to "
             f"{_MOST_CYCLES:g}"
         )
 
@@ -410,29 +416,29 @@ def array(
     Parameters
     ----------
     name : str
-        The argument's name, for the message.
+        Name of the argument, for the message.
     value : array_like
-        The argument. Integers and other floats are converted to `dtype`, complex128 to complex64. A
-        caller's own array is never modified.
+        The argument. Integers and other floats are converted to `dtype`, complex128 to complex64.
+        The caller's array is never modified.
     dtype : dtype
-        Required type. Real arrays are refused for complex types, and the reverse.
+        Required type. Real arrays are refused for complex types, and complex arrays for real types.
     shape : tuple of int or None, or None
-        Required shape; None within it stands for any length of at least 1. None in its place allows
-        any shape, also an empty one.
+        Required shape. None within the tuple allows any length of at least 1. None in place of the
+        tuple allows any shape, even an empty one.
     broadcast : bool
-        True repeats a value of shape `shape[1:]` along the first axis.
+        If True, a value of shape `shape[1:]` is repeated along the first axis.
 
     Raises
     ------
     TypeError
-        If the values are not numbers of a kind that fits `dtype`.
+        If the values are not numbers of a kind that can be converted to `dtype`.
     ValueError
-        If the shape differs, an axis is empty, a value is NaN, infinite or masked, or `dtype`
-        cannot represent the values: they overflow, or all of them underflow.
+        If the shape differs, an axis is empty, a value is NaN, infinite or masked, or the largest
+        value overflows or underflows in `dtype`.
 
     Notes
     -----
-    An array that needs no conversion is not copied; the result is a read-only view of it.
+    An array that needs no conversion is not copied. The result is a read-only view of it.
     """
     dtype = np.dtype(dtype)
     try:
@@ -447,12 +453,12 @@ def array(
         reason = ""
         if name == "samples" and given.dtype.kind in "iuf":
             reason = (
-                ": real samples hold no phase; form the analytic signal first (clsas.compress does)"
+                ": real samples have no phase; form the analytic signal first (clsas.compress does)"
             )
         raise TypeError(f"{name} must be {wanted} numbers, got {got}{reason}")
     if np.ma.is_masked(value):
         masked = np.ma.count_masked(value)
-        raise ValueError(f"{name} must hold no masked value, got {masked} of {given.size}")
+        raise ValueError(f"{name} must have no masked value, got {masked} of {given.size}")
     if shape is None:
         shape = given.shape
     elif broadcast and given.shape == shape[1:]:
@@ -470,7 +476,7 @@ def array(
     if copied and given.size * dtype.itemsize > _SMALL_BYTES:
         memory(name, given.size * dtype.itemsize)
     with np.errstate(over="ignore", under="ignore"):
-        result = np.asarray(given, dtype=dtype, order="C")  # keeps arrays of no axis
+        result = np.asarray(given, dtype=dtype, order="C")  # keeps 0-d arrays as they are
     with np.errstate(over="ignore", invalid="ignore"):
         finite = np.isfinite(np.add.reduce(result, axis=None))  # or the sum overflowed
     if not finite and not np.isfinite(result).all():
@@ -493,10 +499,10 @@ def real_or_complex(
     *,
     broadcast: bool = False,
 ) -> NDArray:
-    """Return `value` as `array` does: of a complex type, or the real counterpart if it is real."""
+    """Return `value` as `array` does, of a complex type or, if it is real, of the real type."""
     try:
         given = np.asarray(value).dtype
-    except (TypeError, ValueError):  # the check below refuses it
+    except (TypeError, ValueError):  # `array` refuses the value below
         given = np.dtype(dtype)
     if given.kind not in "iufc":
         raise TypeError(f"{name} must be real or complex numbers, got {given}")
@@ -505,10 +511,9 @@ def real_or_complex(
 
 
 def _check_narrowing(name: str, given: NDArray, dtype: np.dtype) -> None:
-    """Raise ValueError unless a narrower float type represents the largest value to its precision.
+    """Raise ValueError unless the largest value is a normal number of a narrower float type.
 
-    The largest value must be a normal number of the type. Values that are small relative to it may
-    become 0.
+    Values that are small relative to the largest one may become 0.
     """
     kind = np.finfo(dtype)
     least, most = float(kind.tiny), float(kind.max)
@@ -517,8 +522,8 @@ def _check_narrowing(name: str, given: NDArray, dtype: np.dtype) -> None:
     largest = float(np.max(np.abs(ends)))
     if 0 < largest < least or most < largest < math.inf:
         raise ValueError(
-            f"{name} must have a largest value from {least:.2g} to {most:.2g}, as {kind.dtype} "
-            f"holds it, got {largest:.3g}: scale them"
+            f"{name} must have a largest value from {least:.2g} to {most:.2g}, the range of "
+            f"{kind.dtype}, got {largest:.3g}: scale the values"
         )
 
 

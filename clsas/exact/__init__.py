@@ -1,1 +1,1 @@
-"""The image, whatever it takes: backprojection, float64 reference, wavenumber imager."""
+"""Exact imaging: backprojection, the float64 reference, and the wavenumber imager."""

@@ -21,9 +21,9 @@ from clsas.sonar.coverage import reaches
 from clsas.sonar.simplify import simplify
 
 BEST_ACCURACY_DB = BEST_DB
-"""The best accuracy that may be asked for; float32 allows no better."""
+"""Best accuracy that may be requested; float32 does not allow a better one."""
 ACCURACY_DB = -60.0
-"""The accuracy of exact images by default."""
+"""Accuracy of exact images by default."""
 
 
 def backproject(
@@ -38,70 +38,78 @@ def backproject(
     accumulate: Image | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Image:
-    """Form the exact image of range lines on a grid.
+    """Return the exact image of range lines on a grid, formed by backprojection.
 
     Parameters
     ----------
     lines : RangeLines
-        Any number of channels, monostatic, bistatic or moving.
+        Lines of any number of channels, which may be monostatic, bistatic or moving.
     grid : Grid
-        Any number of pixels: a plane, a height map or arbitrary points.
+        Any number of pixels on a plane, on a height map or at arbitrary points.
     device : Device, str or int, optional
-        See `clsas.opencl.device.choose`.
+        OpenCL device: an index of `list_devices`, a kind ("gpu", "cpu"), or part of a platform or
+        name. The default is the environment variable CLSAS_DEVICE, then the first GPU, then the
+        CPU with the widest vectors.
     accuracy_db : float
-        Relative rms error allowed against the ideal sum, dB, from -85 to below 0. It decides how
-        the lines are interpolated, from their own spectrum.
+        Allowed relative rms error against the ideal sum, dB, from -85 to below 0. Together with the
+        spectrum of the lines it determines how they are interpolated.
     taps : 2, 4, 6 or 8, optional
-        Samples per interpolation (2 is linear), instead of the fastest choice.
+        Samples per interpolation (2 is linear). By default the fastest number is chosen.
     upsampling : float, optional
-        Factor by which lines are upsampled before interpolation, instead of the fastest choice.
-        With `taps` too, `accuracy_db` plays no part.
+        Factor by which lines are upsampled before interpolation, 1 to 64. By default the fastest
+        factor is chosen. If both `taps` and `upsampling` are given, `accuracy_db` has no effect.
     beam : BeamWindow, optional
-        Weights of the channels by aspect angle. Pixels outside a channel's beam cost nothing.
-        Without a beam every channel weighs 1 everywhere.
+        Weights of the channels by aspect angle. Pixels outside the beam of a channel take no time.
+        Without a beam every channel has the weight 1 everywhere.
     accumulate : Image, optional
         Image on the same grid to which this one is added, so that data may arrive in pieces.
     progress : callable, optional
-        Called as progress(done, total), in pairs of parts of the image and channels.
+        Called as progress(done, total), counted in pairs of a part of the image and a channel.
 
     Returns
     -------
     Image
-        complex64, phase-preserving.
+        Complex image that preserves phase.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is of a wrong kind or out of range; `accumulate` is on another grid, or given
-        with a normalising beam; the beam's track cannot be found from the lines; receivers move
-        faster than 0.05 sound speeds; or numbers are too large or too small for float32 sums or
-        float64 phases.
+        If an argument has the wrong type or is out of range, `accumulate` is on another grid or is
+        given with a normalising beam, the track of the beam cannot be found from the lines,
+        receivers move faster than 0.05 times the sound speed, or numbers are too large or too small
+        for float32 sums or float64 phases.
     DeviceError
         If there is no such device.
 
     Warns
     -----
     ClsasWarning
-        If no pixel lies within the range of any line and the beam, so that the image is zero; or if
+        If no pixel lies in the beam and within the range of any line, so that the image is zero. If
         the image may miss `accuracy_db`, because the grid reaches ends of lines that do not fade,
-        or because the lines' band fills the whole sampled band.
+        or because the band of the lines fills the whole sampled band.
+
+    See Also
+    --------
+    plan, factorize : Much faster images of a chosen accuracy.
+    wavenumber : Images of straight tracks in the frequency domain.
 
     Notes
     -----
-    I(x) = sum_i w_i(x) s_i(rho_i(x)) exp(+j 2 k rho_i(x)), with rho half the path from transmitter
-    to pixel to receiver, k = 2 pi carrier/c, and w the beam's weights (1 without a beam) [1]_ [2]_.
+    The image is I(x) = sum_i w_i(x) s_i(rho_i(x)) exp(+j 2 k rho_i(x)), where rho is half the path
+    from transmitter to pixel to receiver, k = 2 pi carrier/c, and w are the weights of the beam (1
+    without a beam) [1]_ [2]_.
 
-    The lines are assumed to be band-limited about their spectral centre, and zero beyond their
-    ends. A line adds nothing to a pixel outside its range, by more than the taps of one
-    interpolation. Where a line does not fade towards an end, the pixels there depend on the taps,
-    and so on `accuracy_db`.
+    Lines are assumed to be band-limited about their spectral centre, and zero beyond their ends. A
+    line contributes to pixels outside its range only within the taps of the interpolation. Where a
+    line does not fade towards an end, the pixels there depend on the taps, and thus on
+    `accuracy_db`.
 
-    Motion during flight, the distance between transmitter and receiver and a grid's relief are left
-    out where the error that this adds lies far below `accuracy_db` (docs/assess.md).
+    Motion during flight, the distance between transmitter and receiver, and the relief of a grid
+    are left out if the resulting error is far below `accuracy_db` (docs/assess.md).
 
-    A pixel behind the antennas is the mirror image of the one at the same range before them, with
-    or without a beam. The host computes ranges and phases of centres near the pixels in float64;
-    the device computes differences from them in float32.
+    With or without a beam, a pixel behind the antennas is the mirror image of the pixel at the same
+    range in front of them. The host computes ranges and phases of centres near the pixels in
+    float64. The device computes differences from them in float32.
 
     References
     ----------
@@ -109,6 +117,20 @@ def backproject(
        wide-bandwidth arbitrary-motion synthetic aperture radar", SPIE 2747, 1996.
     .. [2] Ødegaard, "Fast time domain beamforming for synthetic aperture sonar", thesis,
        University of Oslo, 2004.
+
+    Examples
+    --------
+    The image of a point, from a track of 4 m:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> tx_m = np.stack([np.linspace(-2, 2, 41), np.zeros(41), np.zeros(41)], axis=1)
+    >>> point = clsas.PointTargets([[0, 40, 0]])
+    >>> lines = clsas.simulate_lines(tx_m, tx_m, point, carrier_hz=100e3, bandwidth_hz=30e3)
+    >>> grid = clsas.Grid.plane(x=(-1, 1, 41), y=(39.8, 40.2, 41))
+    >>> image = clsas.backproject(lines, grid)
+    >>> print(*np.unravel_index(np.abs(image.pixels).argmax(), image.shape))  # row, column
+    20 20
     """
     preparation = prepare(
         lines,
@@ -141,9 +163,9 @@ def prepare(
 ) -> Preparation:
     """Check the input of `backproject` and decide how to form the image.
 
-    Parameters and errors are those of `backproject`. Effects far below `accuracy_db` are left out,
-    unless `full_model` is set, or `taps` and `upsampling` are given so that `accuracy_db` plays no
-    part.
+    Parameters and errors are those of `backproject`. Effects far below `accuracy_db` are left out
+    unless `full_model` is set, or `taps` and `upsampling` are both given, so that `accuracy_db` has
+    no effect.
     """
     accuracy_db = check_input(lines, grid, beam, accuracy_db, BEST_ACCURACY_DB)
     fixed = taps is not None and upsampling is not None
@@ -156,7 +178,8 @@ def prepare(
     is_reached = reaches(model.lines, model.grid, model.beam, along)
     decision = decide(
         model.lines,
-        # Nothing is formed: far away, all pixels would take long to lay out.
+        # If no line reaches the grid nothing is formed, but laying out distant pixels would take
+        # long.
         model.grid if is_reached else Grid.points(model.grid.spread(1)),
         device=device,
         accuracy_db=accuracy_db,
@@ -193,15 +216,15 @@ def form_exactly(
     warned: bool = False,
     **request: Any,
 ) -> Image:
-    """Form an image as `backproject` does, without its warnings of ambiguous lines.
+    """Return the image of `backproject`, without its warnings about ambiguous lines.
 
     Parameters
     ----------
     lines, grid, progress
-        As of `backproject`.
+        As for `backproject`.
     warned : bool
-        True if the user has been warned already that no line adds anything to the image.
+        True if the user has already been warned that no line contributes to the image.
     **request
-        As of `prepare`.
+        As for `prepare`.
     """
     return execute(prepare(lines, grid, **request), progress=progress, warned=warned)

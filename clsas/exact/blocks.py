@@ -1,4 +1,4 @@
-"""Blocks: how much of an exact image's data is on a device at once."""
+"""Blocks: the amount of data of an exact image that is on a device at once."""
 
 from __future__ import annotations
 
@@ -11,25 +11,28 @@ from clsas.opencl.device import Device
 from clsas.signal.interpolation import Resampling
 from clsas.sonar.beam import BeamWindow
 
-_CHANNELS_AT_ONCE = 512  # bounds a float32 partial sum; their lines stay in a CPU's cache
-_PART_BYTES = 64 << 20  # device memory for one set of parts: a job of some tenths of a second
+# Channels of a block. The number bounds float32 partial sums, and their lines stay in the cache of
+# a CPU.
+_CHANNELS_AT_ONCE = 512
+_PART_BYTES = 64 << 20  # device memory for one set of parts, a job of some tenths of a second
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """The data on a device at once: lines of a block of channels, references of a set of parts.
+    """Sizes of a block of channels and of a set of parts, which are on a device at once.
 
     Attributes
     ----------
     reach : int
-        Samples by which a part may extend beyond a line's end.
+        Samples by which a part may extend beyond the end of a line.
     margin : int
         Zeros on either side of a line.
     pitch : int
-        Samples of a line with both margins.
+        Samples of a line including both margins.
     terms : int
-        Coefficients per (tile, channel); none for groups.
+        Coefficients per (tile, channel); 0 for groups.
     channels_at_once, parts_at_once : int
+        Channels of a block, and tiles or groups of a set.
     """
 
     reach: int
@@ -51,10 +54,10 @@ def blocks_of(
     tiled: bool,
     beam: BeamWindow | None,
 ) -> Blocks:
-    """Return how much of an image's data is on a device at once.
+    """Return the sizes of the blocks and sets of an image.
 
-    Two blocks of lines take up to an eighth of the device's memory each, two sets of references a
-    sixteenth each.
+    Two blocks of lines take up to an eighth of the device's memory each, and two sets of references
+    up to a sixteenth each.
 
     Raises
     ------
@@ -64,7 +67,7 @@ def blocks_of(
     reach = math.ceil(radius_m * resampling.samples_per_m(lines) * 1.1) + taps
     margin = 2 * reach + 2 * device.info.width
     pitch = round_up(resampling.length + 2 * margin, 16)
-    if pitch % 256 == 0:  # lines at equal positions in cache sets would evict each other
+    if pitch % 256 == 0:  # lines at the same positions of cache sets would evict each other
         pitch += 16
     terms = expansion_terms(beam) if tiled else 0
     line_bytes = 8 * pitch
@@ -73,8 +76,9 @@ def blocks_of(
     room = min(most, device.info.memory_bytes // 8)
     if line_bytes > most:
         raise ValueError(
-            f"lines of {lines.length} samples need {line_bytes / 2**10:.0f} KiB each when "
-            f"upsampled, more than a buffer of {device.info.label}, {most / 2**10:.0f} KiB"
+            f"lines of {lines.length} samples are too long: upsampled they take "
+            f"{line_bytes / 2**10:.0f} KiB each, but a buffer of {device.info.label} has at most "
+            f"{most / 2**10:.0f} KiB"
         )
     return Blocks(
         reach,
@@ -87,9 +91,9 @@ def blocks_of(
 
 
 def band_parts(device: Device, part_pixels: int, across: int, normalise: bool) -> int:
-    """Return how many parts a band of the image holds, whole rows of tiles.
+    """Return the number of parts in a band of the image, which is made of whole rows of tiles.
 
-    A band's pixels, and its sums of weights, are on the device together.
+    The pixels of a band, and its sums of weights, are on the device together.
     """
     most = min(device.info.max_buffer_bytes, device.info.memory_bytes // 4)
     return max(most // (8 * (1 + normalise) * part_pixels) // across, 1) * across

@@ -1,7 +1,7 @@
-"""The buffers of an exact image on a device: names, shapes and types.
+"""Names, shapes and types of the buffers of an exact image on a device.
 
-The run allocates from these lists, and the prediction of memory adds them up. Lines and parts
-come in two sets: the host fills one while the device works on the other.
+The run allocates buffers from these lists, and the prediction of memory adds up their sizes. There
+are two sets for lines and for parts: the host fills one while the device works on the other.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from clsas.sonar.beam import BeamWindow
 
 
 def is_bistatic(lines: RangeLines) -> bool:
-    """Return whether paths out and back differ."""
+    """Return whether the paths to a point and back differ."""
     return lines.rx_velocity_m_s is not None or not np.array_equal(lines.tx_m, lines.rx_m)
 
 
 def block_buffers(
     lines: RangeLines, channels: int, blocks: Blocks, beam: BeamWindow | None
 ) -> Buffers:
-    """Return what a block of channels takes: upsampled lines, and the antennas' geometry.
+    """Return the buffers of a block of channels: upsampled lines and the antennas' geometry.
 
     Parameters
     ----------
     lines : RangeLines
-        All lines, whose kind of path decides about the geometry.
+        All lines. Whether they are bistatic or moving determines the rows of the geometry.
     channels : int
-        Channels of the block.
+        Number of channels of the block.
     blocks : Blocks
     beam : BeamWindow or None
     """
@@ -43,14 +43,14 @@ def block_buffers(
 
 
 def part_buffers(parts: int, part_pixels: int, channels: int, blocks: Blocks) -> Buffers:
-    """Return what some parts take in one job besides their pixels.
+    """Return the buffers of some parts in one job, except their pixels.
 
     Parameters
     ----------
     parts, part_pixels : int
-        Tiles or groups of the job, and the pixels of each.
+        Number of tiles or groups of the job, and of pixels in each.
     channels : int
-        Channels of a block that any part needs, at most.
+        Largest number of channels of a block that a part needs.
     blocks : Blocks
     """
     row = (parts, channel_pitch(channels))

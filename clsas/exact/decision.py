@@ -1,4 +1,4 @@
-"""The decision how to form an exact image, which predicting its time and memory shares."""
+"""The decision how to form an exact image, from which its time and memory are also predicted."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, fastest, some_channels, wavelength_m
+from clsas.core.lines import RangeLines, fastest, some_channels
+from clsas.core.wavelengths import cycles_per_m_at, wavelength_m
 from clsas.exact.checks import check_distances
 from clsas.exact.groups import Groups, GroupsEstimate
 from clsas.exact.layout import GEOMETRY_ERROR, Conditions, allowed, estimate_layout, lay_out
@@ -20,29 +21,31 @@ from clsas.opencl.device import Device
 from clsas.signal import interpolation
 from clsas.signal.ambiguity import Ambiguity
 from clsas.signal.interpolation import Interpolator, Resampling
-from clsas.signal.spectrum import Spectrum, cycles_per_m_at
+from clsas.signal.spectrum import Spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
-_SAMPLED_CHANNELS = 256  # spread evenly; the beam's fullness is evaluated at these,
-_SAMPLED_PIXELS = 16  # and at so many pixels along either side of the grid
+# Channels, and pixels along either side of the grid, for which the beam's fullness is evaluated.
+_SAMPLED_CHANNELS = 256
+_SAMPLED_PIXELS = 16
 _BAND_RMS = 0.3  # rms frequency of lines within their band, cycles per sample
 
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """The way to form an exact image.
+    """Choices with which an exact image is formed.
 
     Attributes
     ----------
     layout : Tiles, Groups or GroupsEstimate
-        The parts into which the grid is divided.
+        Parts into which the grid is divided.
     interpolator, resampling : Interpolator, Resampling
-        The interpolation of range lines, and their upsampling before it.
+        Interpolation of range lines, and the upsampling before it.
     phase_terms : int
-        Terms of the polynomials for sine and cosine.
+        Number of terms of the polynomials for sine and cosine.
     one_cubic : bool
-        Whether one cubic of the beam's weights serves a work-item of a tile, or a block of points.
+        Whether one cubic of the beam's weights is used for all pixels of a work-item (tiles) or of
+        a block (groups).
     """
 
     layout: Tiles | Groups | GroupsEstimate
@@ -73,17 +76,17 @@ def decide(
     Parameters
     ----------
     lines, grid, device, accuracy_db, beam, taps, upsampling
-        As of `clsas.backproject`. With both `taps` and `upsampling`, `accuracy_db` plays no part.
+        As for `clsas.backproject`. With both `taps` and `upsampling`, `accuracy_db` has no effect.
     spectrum, left_open : Spectrum, Ambiguity
-        Measured from the lines.
+        Spectrum and ambiguity measured from the lines.
     along : float64 [channels, 3], optional
-        The track's unit directions, for a beam.
+        Unit directions of the track, for a beam.
     left_out_error : float
-        Error power of effects that the model leaves out.
+        Error power of the effects that the model leaves out.
     estimate : bool
-        Estimate groups in place of gathering pixels, which takes longest.
+        If True, groups are estimated instead of gathered, which would take longest.
     windows : int
-        Of estimated groups, in which they look samples up: see `Groups.windows`.
+        Number of windows of estimated groups; see `Groups.windows`.
     """
     fixed = taps is not None and upsampling is not None
     accuracy_db = left_open.of_passed_db(accuracy_db)
@@ -123,7 +126,7 @@ def decide(
 
 
 def antennas_of(lines: RangeLines, beam: BeamWindow | None) -> NDArray[np.float64]:
-    """Return every position from which ranges or aspect angles are measured, [n, 3]."""
+    """Return all positions from which ranges or aspect angles are measured, [n, 3]."""
     antennas_m = lines.tx_m
     if not np.array_equal(lines.tx_m, lines.rx_m):
         antennas_m = np.unique(np.concatenate([lines.tx_m, lines.rx_m]), axis=0)
@@ -133,9 +136,9 @@ def antennas_of(lines: RangeLines, beam: BeamWindow | None) -> NDArray[np.float6
 
 
 def cycles_per_m_of(lines: RangeLines, spectrum: Spectrum) -> float:
-    """Return the error that rounding a range causes, cycles per metre.
+    """Return the rms error due to rounding a range, cycles per metre.
 
-    A rounded range shifts the phase, and the position within the lines' band.
+    A rounded range shifts the phase as well as the position at which the line is interpolated.
     """
     of_phase = cycles_per_m_at(lines, spectrum.centre)
     return math.hypot(of_phase, _BAND_RMS / lines.range_step_m)
@@ -144,7 +147,7 @@ def cycles_per_m_of(lines: RangeLines, spectrum: Spectrum) -> float:
 def fullness_of(
     lines: RangeLines, grid: Grid, beam: BeamWindow | None, along: NDArray[np.float64] | None
 ) -> float:
-    """Return `BeamWindow.fullness` of some channels at pixels all over a grid; 1 without a beam."""
+    """Return `BeamWindow.fullness` for sampled channels and pixels of a grid; 1 without a beam."""
     if beam is None or along is None:
         return 1.0
     some = some_channels(lines.channels, _SAMPLED_CHANNELS)

@@ -1,7 +1,7 @@
-"""Groups: pixels anywhere, gathered with their neighbours about common centres.
+"""Groups: pixels at any positions, gathered with their neighbours around common centres.
 
-Ranges and phases of a centre are computed in float64; the device computes the pixels' differences
-from it in float32, without expanding them.
+Ranges and phases of a centre are computed in float64. The device computes the differences of the
+pixels from it in float32, without expanding them.
 """
 
 from __future__ import annotations
@@ -14,32 +14,32 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from clsas.core.grid import Grid
-from clsas.exact.tiles import BLOCKS, STACK
+from clsas.exact.tiles import BLOCKS, STACK, item_pixels
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Boxes
 
-_GROUPS_AT_ONCE = 1024  # stays in a core's cache
-_MORE_THAN_ROUNDING = 1.00001  # of float32 offsets
+_GROUPS_AT_ONCE = 1024  # groups whose offsets stay in a core's cache
+_MORE_THAN_ROUNDING = 1.00001  # factor that covers the rounding of float32 offsets
 
 
 @dataclass(frozen=True, eq=False)
 class Groups:
-    """Pixels in groups of STACK blocks.
+    """Pixels in groups of `STACK` blocks, one group per work-item.
 
     Attributes
     ----------
     grid : Grid
         The pixels.
     index : int64 [parts, part_pixels]
-        Flat number of each group's pixels. A pixel may stand several times to fill a group.
+        Flat indices of the pixels of each group. To fill a group, pixels are repeated.
     centre_m : float64 [parts, 3]
-        Origin of the offsets, near a group's pixels.
+        Origin of the offsets, near the pixels of a group.
     offset_m : float32 [parts, part_pixels, 3]
-        Positions from the centre.
+        Positions relative to the centre.
     width : int
         Float lanes per work-item.
     across : int
-        Groups that have to be in the same band of the image: any one.
+        Number of groups that must be in the same band of the image: 1.
     """
 
     grid: Grid
@@ -56,7 +56,7 @@ class Groups:
 
     @property
     def part_pixels(self) -> int:
-        """Padded pixels of a group."""
+        """Number of pixels of a group, including repeated ones."""
         return self.index.shape[1]
 
     @functools.cached_property
@@ -73,20 +73,20 @@ class Groups:
         return _longest(blocks - blocks[:, middle, None])
 
     def windows(self, most_m: float) -> int:
-        """Return how many windows a group looks samples up in; 0 if even blocks are too large.
+        """Return the number of windows in which a group looks up samples; 0 if blocks are too wide.
 
-        No pixel is farther than `most_m` from the point about which its window lies. That is the
-        centre of a whole group, or the middle pixel of a block.
+        No pixel is farther than `most_m` from the point around which its window lies. With one
+        window this is the centre of the group, otherwise the middle pixel of each block.
         """
         if self.radius_m <= most_m:
             return 1
         return STACK if self.block_radius_m <= most_m else 0
 
     def one_cubic_error(self, beam: BeamWindow, nearest_m: float, wavelength_m: float) -> float:
-        """Return the rms error of a beam's weights if one cubic serves all pixels of a block.
+        """Return the rms error of beam weights if one cubic is used for all pixels of a block.
 
-        `nearest_m` is the least distance of a pixel from the phase centres. The wavelength plays
-        no part, since every pixel has its own sine.
+        `nearest_m` is the least distance of a pixel from the phase centres. The wavelength has no
+        effect, because the sine is computed for every pixel.
         """
         return beam.block_error(min(self.block_radius_m / nearest_m, 2.0))
 
@@ -99,15 +99,15 @@ class Groups:
         return self.centre_m[parts]
 
     def boxes(self, parts: slice) -> Boxes:
-        """Return boxes around the centres and pixels of some groups."""
+        """Return boxes that contain the centres and pixels of some groups."""
         axes, half_m = self._extents
         return Boxes(self.centre_m[parts], axes, half_m[parts])
 
     @functools.cached_property
     def _extents(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Directions of the boxes' sides, [axes, 3], and half their lengths, [parts, axes].
+        """Directions of the sides of the boxes, [axes, 3], and half their lengths, [parts, axes].
 
-        Points are gathered along the coordinate axes, all others along rows and columns.
+        The sides are parallel to the coordinate axes for points, and to rows and columns otherwise.
         """
         axes = np.eye(3)
         if self.grid.points_m is None:
@@ -128,18 +128,18 @@ class Groups:
 
 @dataclass(frozen=True, eq=False)
 class GroupsEstimate:
-    """Groups before they are gathered, as if all were full and as wide as float32 allows.
+    """Estimate of groups before they are gathered: all are full and as wide as float32 allows.
 
     Attributes
     ----------
     grid : Grid
         The pixels.
     part_pixels : int
-        Padded pixels of a group.
+        Number of pixels of a group.
     radius_m : float
-        Largest distance of a pixel from its group's centre.
+        Largest distance of a pixel from the centre of its group.
     assumed_windows : int
-        See `windows`: how far apart the pixels of a block lie is not known yet.
+        Number of `windows`, assumed because the extents of blocks are not known yet.
     """
 
     grid: Grid
@@ -154,16 +154,16 @@ class GroupsEstimate:
         return -(-self.grid.size // self.part_pixels)
 
     def windows(self, most_m: float) -> int:
-        """Return the windows assumed, whatever pixels may be apart."""
+        """Return the assumed number of windows, whatever the extents of blocks."""
         return self.assumed_windows
 
 
 def gather(grid: Grid, largest_radius_m: float, width: int) -> Groups:
-    """Return groups whose pixels lie within a radius of their centre."""
+    """Return groups in which no pixel is farther than a given radius from the centre."""
     position_m = grid.positions_m().reshape(-1, 3)
-    size = STACK * width
+    size = item_pixels(width)
     rest = _neighbours(grid, position_m, width)
-    # Runs of neighbours that are too wide are halved until they fit or hold one pixel.
+    # Runs of neighbours that are too wide are halved until they fit, or consist of one pixel.
     found = []
     length = size
     while len(rest):
@@ -186,23 +186,27 @@ def groups_within(
     middle_m: NDArray[np.float64],
     width: int,
 ) -> tuple[Groups, NDArray[np.int64]]:
-    """Return groups of pixels that each lie within one part, about the middle of that part.
+    """Return groups of pixels that each lie within one part, with the middle of that part.
 
     Parameters
     ----------
+    grid : Grid
     part : int64 [pixels]
-        Number of the part that holds each pixel.
+        Number of the part that contains each pixel.
     rank : int64 [pixels]
-        Order of the pixels within a part, in which near pixels follow each other.
+        Order of the pixels within a part, in which neighbours follow each other.
     middle_m : float64 [parts, 3]
+        Middle of each part.
+    width : int
+        Float lanes per work-item.
 
     Returns
     -------
     groups : Groups
     part : int64 [groups]
-        Number of the part that holds each group, ascending.
+        Number of the part that contains each group, ascending.
     """
-    size = STACK * width
+    size = item_pixels(width)
     order = np.argsort(part * (rank.max() + 1) + rank)
     held = np.bincount(part, minlength=len(middle_m))
     counts = -(-held // size)
@@ -214,7 +218,7 @@ def groups_within(
     centre_m, offset_m = middle_m[of_group], np.empty((*index.shape, 3), np.float32)
     for start in range(0, len(index), _GROUPS_AT_ONCE):
         some = slice(start, start + _GROUPS_AT_ONCE)
-        # The last pixel of a part fills up the part's last group.
+        # The last pixel of a part is repeated to fill the last group of the part.
         member = np.minimum(first[some, None] + np.arange(size), last[some, None])
         index[some] = order[before[some, None] + member]
         offset_m[some] = grid.at(index[some]) - centre_m[some, None]
@@ -222,9 +226,9 @@ def groups_within(
 
 
 def _neighbours(grid: Grid, position_m: NDArray[np.float64], width: int) -> NDArray[np.int64]:
-    """Return every pixel's flat index, neighbours in sequence; edge pixels may stand twice."""
+    """Return the flat indices of all pixels, neighbours in sequence; edge pixels may repeat."""
     if grid.points_m is not None:
-        return KDTree(position_m, leafsize=STACK * width).indices
+        return KDTree(position_m, leafsize=item_pixels(width)).indices
     rows, columns = BLOCKS[width]
     rows *= STACK
     index = np.arange(grid.size).reshape(grid.shape)

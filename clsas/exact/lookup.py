@@ -1,4 +1,4 @@
-"""Lookup of samples: how many vectors of them the lanes of a block pick theirs from."""
+"""Lookup of samples: the number of vectors from which the lanes of a block pick their samples."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from clsas.core.lines import RangeLines, fastest
 from clsas.exact.tiles import HELD
 from clsas.opencl.device import Device
 
-_FLOAT32 = 0.05  # samples of room for the rounding of positions
+_FLOAT32 = 0.05  # margin for the rounding of positions, samples
 
-# Relative time of a pixel and channel, measured with PoCL.
-_COSTS = {16: {2: 1.0}, 8: {1: 1.0, 2: 1.4}}  # by lanes, and vectors from which they pick
-_SINGLY = 3.0  # each lane reads its own samples
+# Relative time of a pixel and channel, measured with PoCL, by the number of lanes and the number of
+# vectors from which they pick.
+_COSTS = {16: {2: 1.0}, 8: {1: 1.0, 2: 1.4}}
+_SINGLY = 3.0  # relative time if each lane reads its own samples
 
 
 class _Layout(Protocol):
@@ -25,10 +26,10 @@ def lookup_options(
 ) -> dict[str, int]:
     """Return the build options of the lookup (cl/lookup.h).
 
-    They are the fastest with which every pixel finds its samples: in one vector where the
-    positions of a block fit, else in two, else singly.
+    These are the fastest options with which every pixel finds its samples: in one vector if the
+    positions of a block fit into it, else in two, else every lane for itself.
     """
-    # Ranges to moving receivers change a little faster than pixel positions.
+    # Ranges to moving receivers change a little faster than the positions of pixels.
     metres = 1 / samples_per_m / (1 + 2 * fastest(lines))
     for vectors in _lookups(device):
         windows = layout.windows(lookup_room(vectors, taps, device.info.width) * metres)
@@ -40,7 +41,7 @@ def lookup_options(
 def lookup_cost(
     device: Device, layout: _Layout, lines: RangeLines
 ) -> Callable[[int, float], float]:
-    """Return the time of a pixel and channel, 1 at best, as a function of taps and upsampling."""
+    """Return the relative time per pixel and channel as a function of taps and upsampling."""
     if not _lookups(device):
         return lambda taps, upsampling: 1.0
     costs = _lookups(device) | {0: _SINGLY}
@@ -53,15 +54,15 @@ def lookup_cost(
 
 
 def lookup_room(vectors: int, taps: int, width: int) -> float:
-    """Return the largest distance, samples, of a pixel's echo from the middle of its window.
+    """Return the largest allowed distance of a pixel's echo from the middle of its window, samples.
 
-    A window of AVX-512 is two vectors with the samples of all taps; one of AVX2 is the samples of
-    one tap. Rounding positions to whole samples takes half a sample.
+    With AVX-512, a window is two vectors with the samples of all taps. With AVX2 it contains the
+    samples of one tap. Rounding positions to whole samples takes half a sample.
     """
     positions = 2 * width - taps + 1 if width == HELD else vectors * width
     return (positions - 1) / 2 - _FLOAT32
 
 
 def _lookups(device: Device) -> dict[int, float]:
-    """Return the costs of picking, by vectors; {} where lanes cannot pick."""
+    """Return the costs of picking by number of vectors; {} if lanes cannot pick."""
     return _COSTS.get(device.info.width, {}) if device.info.permute else {}

@@ -1,4 +1,4 @@
-"""Migration: the sums of a wavenumber image, by non-uniform FFTs."""
+"""Migration: the sums of a wavenumber image, computed by non-uniform FFTs."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from clsas.core.threads import in_threads
 from clsas.exact.straight_track import Aspects, Band, StraightTrack
 
 _FINUFFT = {"eps": 1e-7, "nthreads": 1}  # as accurate as complex64
-_TAIL_ZONES, _TAIL_SAMPLES = 8.0, 64  # room against wrap-around, beyond the visible pixels
+# Padding against wrap-around beyond the visible pixels: Fresnel zones along the track, and samples.
+_TAIL_ZONES, _TAIL_SAMPLES = 8.0, 64
 _LINES_AT_ONCE = 64  # bounds memory
 
 
 @dataclass(frozen=True, eq=False)
 class _Waves:
-    """Wavenumbers of the image: two-way ones from the band, and modes along the track.
+    """Wavenumbers of the image: two-way wavenumbers of the band, and modes along the track.
 
     Attributes
     ----------
@@ -31,9 +32,9 @@ class _Waves:
     cycles : int64 [n]
         Frequencies within the band, cycles per padded line.
     wave : float64 [n]
-        Two-way wavenumbers K at these, rad/m.
+        Two-way wavenumbers K at these frequencies, rad/m.
     period_m : float
-        Period along the track.
+        Period along the track, metres.
     modes : int64 [m]
         Cycles per period along the track.
     """
@@ -51,7 +52,7 @@ class _Waves:
 
 
 def _waves(lines: RangeLines, track: StraightTrack, aspects: Aspects, band: Band) -> _Waves:
-    """Return the wavenumbers of an image, with periods so long that nothing wraps onto a pixel."""
+    """Return the wavenumbers of an image, with periods that keep echoes from wrapping around."""
     near_m, far_m = track.ranges_m
     first_m, last_m = lines.first_range_m - track.shift_m, lines.last_range_m - track.shift_m
     farthest_m = far_m / math.cos(max(-aspects.low, aspects.high))
@@ -74,7 +75,7 @@ def _waves(lines: RangeLines, track: StraightTrack, aspects: Aspects, band: Band
 def migrate(
     lines: RangeLines, track: StraightTrack, aspects: Aspects, band: Band, workers: int
 ) -> NDArray[np.complex128]:
-    """Return the pixels [rows, columns]."""
+    """Return the pixels of a wavenumber image, [rows, columns]."""
     waves = _waves(lines, track, aspects, band)
     rows, columns = track.pixel_along_m.shape
     span = len(waves.modes) - 1
@@ -93,14 +94,14 @@ def migrate(
 
 
 def _middle(modes: NDArray[np.int64]) -> np.int64:
-    """Return the mode about which finufft's, which are about 0, are shifted."""
+    """Return the middle mode, by which finufft's modes, which lie around 0, are shifted."""
     return modes[len(modes) // 2]
 
 
 def _spectrum(
     lines: RangeLines, track: StraightTrack, waves: _Waves, band: Band, workers: int
 ) -> NDArray[np.complex128]:
-    """Return the lines' spectrum over wavenumbers K and modes along the track, [n, m]."""
+    """Return the spectrum of the lines over wavenumbers K and modes along the track, [n, m]."""
     spectra = np.empty((len(waves.wave), lines.channels), np.complex128)
     for first in range(0, lines.channels, _LINES_AT_ONCE):
         some = slice(first, first + _LINES_AT_ONCE)
@@ -127,7 +128,7 @@ def _focus(
     scale = math.sqrt(2 * np.pi) * np.exp(0.25j * np.pi) / (waves.period_m * waves.length)
 
     def focus(mode: int) -> NDArray[np.complex128]:
-        """Return one mode, at every row."""
+        """Return one mode at every row."""
         along = waves.per_m * waves.modes[mode]
         visible = (along > low * waves.wave) & (along < high * waves.wave)
         if not visible.any():

@@ -1,4 +1,4 @@
-"""Preparation: an exact image with all decisions made, before the device starts."""
+"""Preparation: an exact image for which all decisions are made, before the device starts."""
 
 from __future__ import annotations
 
@@ -20,40 +20,42 @@ from clsas.sonar.beam import BeamWindow
 
 @dataclass(frozen=True, eq=False)
 class Preparation:
-    """An exact image that is ready to be formed.
+    """Everything from which an exact image is formed.
 
     Attributes
     ----------
     device : Device
     lines : RangeLines
-        The lines to image, without the effects that are left out.
+        Lines to image, without the effects that are left out.
     grid : Grid
-        The pixels, without the relief if that is left out.
+        Pixels, without the relief if that is left out.
     layout : Tiles or Groups
-        The parts into which the grid is divided.
+        Parts into which the grid is divided.
     interpolator, resampling : Interpolator, Resampling
-        The interpolation of range lines, and their upsampling before it.
+        Interpolation of range lines, and the upsampling before it.
     phase_terms : int
-        Terms of the polynomials for sine and cosine.
+        Number of terms of the polynomials for sine and cosine.
     beam : BeamWindow or None
     along : float64 [channels, 3] or None
-        The track's unit direction at every channel; None without a beam.
+        Unit direction of the track at every channel; None without a beam.
     one_cubic : bool
-        Whether one cubic of the beam's weights serves a work-item of a tile, or a block of points.
+        Whether one cubic of the beam's weights is used for all pixels of a work-item (tiles) or of
+        a block (groups).
     requested_db : float
-        Accuracy asked for. It is 0 dB with a fixed interpolator: any error is allowed.
+        Requested accuracy, dB. It is 0 with a fixed interpolator, with which any error is allowed.
     ambiguity : Ambiguity
-        Errors that the lines themselves leave open.
+        Errors that follow from the lines themselves.
     given_grid : Grid or None
-        The grid asked for, where `grid` leaves out its relief.
+        The requested grid, if its relief is left out in `grid`.
     left_out : tuple of str
-        Effects that `lines` and `grid` leave out: see `clsas.sonar.simplify`.
+        Effects that `lines` and `grid` leave out; see `clsas.sonar.simplify`.
     left_out_error : float
-        Error power that this adds.
+        Error power that the omissions add.
     is_reached : bool
-        False if no line reaches any pixel: the image is zero, and `layout` that of a single pixel.
+        False if no line reaches any pixel. The image is then zero, and `layout` is that of a single
+        pixel.
     band : (centre, half width)
-        Band, in cycles per sample, that the interpolation is made for.
+        Band for which the interpolation is made, cycles per sample.
     """
 
     device: Device
@@ -82,7 +84,7 @@ class Preparation:
         return in_db(error + self.left_out_error)
 
     def warn_of_ambiguity(self) -> None:
-        """Warn if the lines themselves may keep the image from the accuracy asked for."""
+        """Warn if the lines themselves may keep the image from meeting the requested accuracy."""
         self.ambiguity.warn("accuracy_db", self.requested_db)
 
     @property
@@ -92,5 +94,5 @@ class Preparation:
 
     @property
     def cycles_per_m(self) -> float:
-        """Phase to restore, cycles per metre of range: that of the lines' spectral centre."""
+        """Phase to restore: that of the spectral centre of the lines, cycles per metre of range."""
         return self.resampling.cycles_per_m(self.lines)

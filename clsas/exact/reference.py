@@ -1,19 +1,20 @@
-"""Reference images in float64, at a few points, against which device images are measured."""
+"""Reference images in float64 at a few points, with which images of devices are compared."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import finufft
 import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import validate
+from clsas.core.extras import needed
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
-from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import wavelength_m
 from clsas.exact.preparation import Preparation
 from clsas.signal.readout import interpolated
 from clsas.signal.spectrum import measure_spectrum
@@ -23,8 +24,8 @@ from clsas.sonar.visibility import sines
 Progress = Callable[[int, int], None] | None
 Evaluate = Callable[[NDArray[np.complex128], NDArray[np.float64]], NDArray[np.complex128]]
 
-_PAIRS_AT_ONCE = 1 << 18  # of points and channels: bounds the memory
-_SUM_ERROR = 1e-12  # relative, of non-uniform FFTs
+_PAIRS_AT_ONCE = 1 << 18  # pairs of points and channels; bounds memory
+_SUM_ERROR = 1e-12  # relative error of non-uniform FFTs
 
 
 def same_interpolator(
@@ -32,14 +33,14 @@ def same_interpolator(
 ) -> NDArray[np.complex128]:
     """Return the image of a preparation at some points, as the device forms it but in float64.
 
-    The device's image differs by its rounding, its expansion of the geometry, and its polynomials
-    for sine and cosine where these are short (`clsas.opencl.phases`).
+    The image of the device differs by rounding, by the expansion of the geometry, and by short
+    polynomials for sine and cosine (`clsas.opencl.phases`).
 
     Parameters
     ----------
     preparation : Preparation
-        From `clsas.exact.backprojection.prepare`: the lines, their interpolation, and the beam. The
-        device itself is not used.
+        Lines, their interpolation and the beam, from `clsas.exact.backprojection.prepare`. The
+        device is not used.
     points_m : array_like, [..., 3]
         Positions, metres.
     progress : callable, optional
@@ -73,7 +74,7 @@ def ideal(
     padding: int = 64,
     progress: Progress = None,
 ) -> NDArray[np.complex128]:
-    """Return the ideal image at some points: every line evaluated exactly, in float64.
+    """Return the ideal image at some points, for which lines are evaluated exactly in float64.
 
     Parameters
     ----------
@@ -85,8 +86,8 @@ def ideal(
         Weights of the channels by aspect angle.
     padding : int
         Zeros added at either end of a line, samples. Their number matters only for lines that are
-        cut off within strong echoes: the samples beyond are unknown, and the zeros that
-        replace them ring into the line.
+        cut off within strong echoes. The samples beyond are unknown, and the zeros that replace
+        them ring into the line.
     progress : callable, optional
         Called as progress(channels done, channels).
 
@@ -102,12 +103,15 @@ def ideal(
 
     Notes
     -----
-    I(x) = sum_i w_i(x) s_i(rho_i(x)) exp(+j 2 k rho_i(x)), with w_i the beam's weights (1 without
-    a beam). s_i is the trigonometric polynomial through the line's samples and the zeros around
-    them. Its frequencies lie within half a cycle per sample of the lines' spectral centre. A line
-    adds nothing to points beyond its first or last sample. A type-2 non-uniform FFT sums the
-    polynomial, to twelve digits.
+    The image is I(x) = sum_i w_i(x) s_i(rho_i(x)) exp(+j 2 k rho_i(x)), where w_i are the weights
+    of the beam (1 without a beam). s_i is the trigonometric polynomial through the samples of a
+    line and the zeros around them. Its frequencies lie within half a cycle per sample of the
+    spectral centre of the lines. A line does not contribute to points beyond its first or last
+    sample. A type-2 non-uniform FFT evaluates the polynomial to twelve digits.
     """
+    with needed("the float64 reference"):
+        import finufft  # slow to import
+
     validate.instance("lines", lines, RangeLines)
     padding = validate.count("padding", padding, least=0)
     if beam is not None:
@@ -118,7 +122,8 @@ def ideal(
     def evaluate(
         samples: NDArray[np.complex128], position: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
-        # finufft's frequencies run from -(modes // 2): here they are those about the centre.
+        # Frequencies of finufft start at -(modes // 2), so the spectrum is rolled to be about its
+        # centre.
         spectra = np.roll(scipy.fft.fft(samples, modes, axis=1), modes // 2 - shift, axis=1)
         values = np.zeros(position.shape, np.complex128)
         for line, spectrum, at in zip(values, spectra / modes, position, strict=True):
@@ -146,17 +151,18 @@ def sampled_error_db(
     image : Image
         Image to measure.
     reference : callable
-        Maps positions [n, 3] (metres) to the correct pixels there, complex [n]: for example
-        `functools.partial(same_interpolator, preparation)` or `functools.partial(ideal, lines)`.
+        Function of positions [n, 3], metres, that returns the correct pixels there, complex [n].
+        Examples are `functools.partial(same_interpolator, preparation)` and
+        `functools.partial(ideal, lines)`.
     pixels : int
-        Number of pixels to compare; all pixels of smaller images.
+        Number of pixels to compare. If the image has fewer, all of them are compared.
     seed : int
         Seed of the random choice.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is of a wrong kind, or the reference is zero at every pixel compared.
+        If an argument has the wrong type, or the reference is zero at every pixel compared.
     """
     validate.instance("image", image, Image)
     pixels = min(validate.count("pixels", pixels), image.grid.size)
@@ -174,7 +180,7 @@ def _sum_channels(
 ) -> NDArray[np.complex128]:
     """Return the sum over channels of evaluate(samples, positions), in phase and weighted.
 
-    Positions count in samples from each line's first, [channels, points].
+    Positions are in samples from the first sample of each line, [channels, points].
     """
     leading = np.shape(points_m)[:-1]
     points = validate.array("points_m", points_m, np.float64, (*(None,) * len(leading), 3))

@@ -1,6 +1,6 @@
-"""References: ranges and phases of the parts' centres, in float64, and the antennas' geometry.
+"""References: ranges and phases of the centres of parts in float64, and the antennas' geometry.
 
-A reference is a whole sample, a fraction of a sample and a phase in cycles, reduced to
+A reference consists of a whole sample, a fraction of a sample, and a phase in cycles, reduced to
 [-0.5, 0.5]. The device only computes differences from it.
 """
 
@@ -24,19 +24,20 @@ def geometry_rows(
     bistatic: bool,
     directions: NDArray[np.float64] | None,
 ) -> NDArray[np.float32]:
-    """Return the antennas' geometry as kernels take it (cl/antennas.h), float32 [rows, pitch].
+    """Return the antennas' geometry in the format of the kernels, float32 [rows, pitch].
 
-    The rows hold positions about the origin, receivers' velocities over the speed of sound, and the
-    directions. They are so much longer than the channels that a vector may begin at the last one.
+    The rows contain positions relative to the origin, velocities of receivers over the speed of
+    sound, and track directions (cl/antennas.h). They are padded, so that a vector may begin at the
+    last channel.
 
     Parameters
     ----------
     lines : RangeLines
     origin_m : float64 [3]
     bistatic : bool
-        Whether kernels take receivers' positions.
+        Whether kernels need the positions of receivers.
     directions : float64 [channels, 3] or None
-        For a beam, the track's directions times `BeamTable.per_sine`.
+        Directions of the track times `BeamTable.per_sine`; None without a beam.
     """
     rows = [float_pairs(lines.tx_m - origin_m)]
     if bistatic:
@@ -57,21 +58,21 @@ def references_of(
     resampling: Resampling,
     blocks: Blocks,
 ) -> dict[str, NDArray]:
-    """Return the sample, its fraction and the phase of each centre's echo in each line.
+    """Return the sample, its fraction and the phase of the echo of each centre in each line.
 
     Parameters
     ----------
     centres_m : float64 [parts, 3]
     lines : RangeLines
     ranges : int32 [parts, 2]
-        First channel that a part needs, and the one after the last.
+        First channel that each part needs, and the one after the last.
     resampling : Resampling
     blocks : Blocks
 
     Returns
     -------
     dict of str to int32 or float32 [parts, channels]
-        "sample", "fraction" and "phase", from the first channel of each part's range on.
+        "sample", "fraction" and "phase", from the first channel in the range of each part.
     """
     visible = ranges[:, 1] > ranges[:, 0]
     count = int((ranges[:, 1] - ranges[:, 0]).max())
@@ -93,7 +94,7 @@ def references_of(
     position += blocks.margin - resampling.first
     nearest = np.rint(position)
     position -= nearest
-    # A part that lies outside a line altogether is moved to where it reads zeros only.
+    # A part that lies completely outside a line is moved to where only zeros are read.
     nearest = np.clip(
         nearest,
         blocks.margin - blocks.reach,
@@ -113,9 +114,9 @@ def references_of(
 def _windowed_ranges(
     centres_m: NDArray[np.float64], lines: RangeLines, first: NDArray[np.int32], count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the ranges of centres to `count` channels from each one's first, [centres, count].
+    """Return the ranges of centres to `count` channels from the first of each, [centres, count].
 
-    The second result holds the ranges of the lines' first samples. The last channel is repeated.
+    The second result is the range of the first sample of these lines. The last channel is repeated.
     """
 
     def window(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""The run: a prepared exact image formed on its device."""
+"""Run of an exact image that was prepared, on its device."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from clsas.exact.kept import Kept
 from clsas.exact.lookup import lookup_options
 from clsas.exact.preparation import Preparation
 from clsas.exact.references import geometry_rows, references_of
-from clsas.exact.tiles import STACK, Tiles
+from clsas.exact.tiles import Tiles, item_pixels
 from clsas.opencl.buffers import (
     Slot,
     beam_table,
@@ -38,8 +38,8 @@ from clsas.sonar.beam import INTERVALS, normalising
 from clsas.sonar.coverage import warn_unreached
 from clsas.sonar.visibility import BeamTrack
 
-_SINE_ROUNDING = 1e-5  # more than the device's rounding error of a sine
-_MOST_KEPT_BYTES = 256 << 20  # of references; more than 20 million, each of 12 bytes
+_SINE_ROUNDING = 1e-5  # upper bound on the device's rounding error of a sine
+_MOST_KEPT_BYTES = 256 << 20  # of references that are kept: more than 20 million of 12 bytes each
 
 
 def execute(
@@ -48,21 +48,21 @@ def execute(
     progress: Callable[[int, int], None] | None = None,
     warned: bool = False,
 ) -> Image:
-    """Form the one image that was prepared: see `ExactImager`."""
+    """Return the one image that was prepared; see `ExactImager`."""
     imager = ExactImager(preparation, warned=warned, most_kept_bytes=0)
     return imager.form(preparation.lines, progress)
 
 
 class ExactImager:
-    """Forms exact images of any samples of the lines that one was prepared for.
+    """Imager that forms exact images of any samples of the lines for which it was prepared.
 
     Parameters
     ----------
     preparation : Preparation
     warned : bool
-        True if the user has been warned already that no line adds anything to the image.
+        True if the user has already been warned that no line contributes to the image.
     most_kept_bytes : int
-        Most memory of references that are kept for the next image.
+        Largest memory of the references that are kept for the next image.
     """
 
     def __init__(
@@ -78,9 +78,9 @@ class ExactImager:
     def form(self, lines: RangeLines, progress: Callable[[int, int], None] | None = None) -> Image:
         """Return the image of lines of the same geometry.
 
-        The image is formed band by band, each from blocks of channels, each block in jobs of so
-        many (part, channel) pairs. The host prepares a job while the device runs the one before.
-        With a beam it only prepares pairs that the beam connects.
+        The image is formed band by band, each band from blocks of channels, and each block in jobs
+        for some of the parts. The host prepares a job while the device runs the one before. With a
+        beam, it only prepares pairs of parts and channels that the beam connects.
 
         Parameters
         ----------
@@ -121,7 +121,7 @@ class ExactImager:
         return image
 
     def _warn_unreached(self) -> None:
-        """Warn once that no line adds anything to the image."""
+        """Warn once that no line contributes to the image."""
         if not self._warned:
             self._warned, p = True, self.preparation
             warn_unreached(p.lines, p.given_grid or p.grid, p.beam, p.along)
@@ -129,18 +129,18 @@ class ExactImager:
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """Some parts of a band and a block of channels, which the device works on in one go.
+    """Some parts of a band and a block of channels, on which the device works in one launch.
 
     Attributes
     ----------
     line_slot, slot : Slot
         Buffers of the lines, and of the parts.
     geometry, ranges : dict
-        Arguments of the kernels: antennas and centres; the channels that each part needs.
+        Arguments of the kernels for antennas and centres, and for the channels of each part.
     parts : slice
         Parts of the image.
     first_part : int
-        Number of the first one within the band.
+        Number of the first part within the band.
     """
 
     line_slot: Slot
@@ -152,12 +152,12 @@ class _Job:
 
     @property
     def filled(self) -> list[cl.Event]:
-        """Copies to the device that kernels have to wait for."""
+        """Copies to the device for which kernels have to wait."""
         return self.line_slot.filled + self.slot.filled
 
 
 class _Run:
-    """A preparation at work: its kernels, its buffers, and how many pairs are done."""
+    """Running image: its preparation, kernels and buffers, and the number of pairs done."""
 
     def __init__(
         self,
@@ -196,7 +196,7 @@ class _Run:
         self.done = 0
 
     def _kernel(self, paths: dict[str, int]) -> Kernel:
-        """Return the backprojecting kernel; `paths` says how transmitters and receivers move."""
+        """Return the backprojection kernel; `paths` are its options BISTATIC and MOVING."""
         p, device = self.p, self.p.device
         options = {
             "WIDTH": device.info.width,
@@ -221,7 +221,7 @@ class _Run:
         if not visible.any():
             self._report((band.stop - band.start) * count)
             return
-        # Lines from which no part receives anything are left out.
+        # Lines that no part needs are left out.
         first, end = int(ranges[visible].min()), int(ranges[visible].max())
         ranges = np.where(visible[:, None], ranges - np.int32(first), ranges)
         some = slice(channels.start + first, channels.start + end)
@@ -235,7 +235,7 @@ class _Run:
             self._report((parts.stop - parts.start) * count)
 
     def _ranges(self, channels: slice, band: slice) -> NDArray[np.int32]:
-        """Return which of some channels each part of a band needs, [parts, 2]: first and end."""
+        """Return the first channel and the end of those that each part of a band needs."""
         p = self.p
         if p.beam is None or p.along is None:
             every = np.array([0, channels.stop - channels.start], np.int32)
@@ -246,9 +246,9 @@ class _Run:
         return track.spans(p.layout.boxes(band)).ranges
 
     def _upload_lines(self, channels: slice) -> tuple[RangeLines, dict[str, Any], Slot]:
-        """Start copying some lines to the device, upsampled, and their antennas' geometry.
+        """Start copying upsampled lines and their antennas' geometry to the device.
 
-        Returns the lines, the kernels' arguments for the geometry, and the slot that holds both.
+        Returns the lines, the kernels' arguments for the geometry, and the slot with the buffers.
         """
         p, blocks = self.p, self.blocks
         lines = p.lines.select(channels)
@@ -303,7 +303,7 @@ class _Run:
         )
 
     def _launch(self, job: _Job, pixels: dict[str, Any]) -> cl.Event:
-        """Run the kernels of a job; `pixels` are those of its band, and sums of their weights."""
+        """Run the kernels of a job; `pixels` are the pixel and weight buffers of its band."""
         p, layout = self.p, self.p.layout
         if isinstance(layout, Tiles):
             size, positions = self._expand(job, layout)
@@ -338,7 +338,7 @@ class _Run:
     def _expand(self, job: _Job, layout: Tiles) -> tuple[tuple[int, ...], dict[str, Any]]:
         """Expand ranges about the centres of a job's tiles.
 
-        Returns the global size of the backprojecting kernel, and its arguments for the tiles.
+        Returns the global size of the backprojection kernel, and its arguments for the tiles.
         """
         p, device = self.p, self.p.device
         count = job.parts.stop - job.parts.start
@@ -356,7 +356,7 @@ class _Run:
             expansions=expansions,
             wait_for=job.filled,
         )
-        size = (layout.part_pixels // (device.info.width * STACK), count)
+        size = (layout.part_pixels // item_pixels(device.info.width), count)
         return size, {
             "expansions": expansions,
             "columns": layout.across * layout.side,

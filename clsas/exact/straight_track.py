@@ -1,4 +1,4 @@
-"""The scene of a wavenumber image: a straight track, the lines' band and the aspect angles."""
+"""The scene of a wavenumber image: straight track, band of the lines, and aspect angles."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from clsas.core import validate
 from clsas.core.fourier import smooth_edge
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import cycles_per_m_at, wavelength_m
 from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow
 
 _UNUSED = 1e-12  # share of the energy that may be left out
-_STEEPEST_DEG = 85.0  # ranges are then ten times those at broadside
-_MOST_TURN_DEG = 5.0
+_STEEPEST_DEG = 85.0  # largest aspect angle, at which ranges are about ten times those at broadside
+_MOST_TURN_DEG = 5.0  # largest angle between the rows of the grid and the track
 _EDGE_ZONES = 6.0  # Fresnel zones over which an aperture without a beam fades out
-_ANGLES = 8192  # in tables of weights
+_ANGLES = 8192  # angles in a table of weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,15 +31,15 @@ class StraightTrack:
     Attributes
     ----------
     along_m : float64 [channels]
-        Phase centres along the line, from the middle of them all.
+        Phase centres along the line, relative to their mean.
     shift_m : float64 [channels]
-        Difference of the true range to that from the line.
+        True range minus the range from the line.
     off_m : float
         Largest distance of a phase centre from the line.
     row_range_m : float64 [rows]
-        Distance of the grid's rows from the line.
+        Distance of the rows of the grid from the line.
     pixel_along_m : float64 [rows, columns]
-        Pixels along the line.
+        Positions of the pixels along the line.
     """
 
     along_m: NDArray[np.float64]
@@ -49,11 +50,11 @@ class StraightTrack:
 
     @property
     def ranges_m(self) -> tuple[float, float]:
-        """Ranges of the nearest and the farthest row."""
+        """Distance of the nearest and the farthest row from the line, metres."""
         return float(self.row_range_m.min()), float(self.row_range_m.max())
 
     def reach_m(self, low: float, high: float) -> tuple[float, float]:
-        """First and last position along the line that sees a pixel at an angle from low to high."""
+        """Return the first and last position with a pixel at an aspect angle from low to high."""
         ahead_m = np.multiply.outer(np.tan([low, high]), self.ranges_m)
         corners_m = self.pixel_along_m[:: max(len(self.pixel_along_m) - 1, 1), [0, -1]]
         return corners_m.min() - ahead_m[1].max(), corners_m.max() - ahead_m[0].min()
@@ -61,15 +62,16 @@ class StraightTrack:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """The band in which the lines have energy.
+    """Band in which the lines have energy.
 
     Attributes
     ----------
     carrier : float
-        Wavenumber of the carrier, two-way, rad/m.
+        Two-way wavenumber of the carrier, rad/m.
     centre_cycles, half_cycles : float
-        Centre and half width of the band about the carrier, cycles per sample.
+        Centre of the band relative to the carrier, and half its width, cycles per sample.
     wavelength_m : float
+        Wavelength in the middle of the band.
     """
 
     carrier: float
@@ -78,7 +80,7 @@ class Band:
     wavelength_m: float
 
     def zone_m(self, range_m: float) -> float:
-        """Return the length of a Fresnel zone."""
+        """Return the length of a Fresnel zone at a range, metres."""
         return math.sqrt(self.wavelength_m * range_m / 2)
 
 
@@ -91,9 +93,9 @@ class Aspects:
     low, high : float
         Aspect angles beyond which the weights are 0, radians.
     sine : float64 [angles]
-        Sines of angles between them.
+        Sines of angles between `low` and `high`.
     terms : tuple of float64 [angles]
-        Weights at these: the factor of 1, and with a beam that of j/(K R).
+        Weights at these angles: the factor of 1 and, with a beam, the factor of j/(K R).
     """
 
     low: float
@@ -107,7 +109,7 @@ def band_of(lines: RangeLines) -> Band:
     spectrum = measure_spectrum(lines)
     used = np.flatnonzero(np.cumsum(spectrum.power[::-1])[::-1] > _UNUSED)[-1]
     half = float(spectrum.frequency[used] + spectrum.frequency[0])
-    cycles_per_m = lines.carrier_cycles_per_m + spectrum.centre / lines.range_step_m
+    cycles_per_m = cycles_per_m_at(lines, spectrum.centre)
     validate.positive("the middle frequency of lines", cycles_per_m, "cycles/m")
     return Band(2 * lines.wavenumber_rad_m, spectrum.centre, half, 2 / cycles_per_m)
 
@@ -121,7 +123,7 @@ def straighten(
     origin_m, row_step_m, column_step_m = grid.vectors_m
     row_m = origin_m - lines.tx_m[0] + np.arange(rows)[:, None] * row_step_m
     centres_m = (tx_m + rx_m) / 2
-    if lines.rx_velocity_m_s is not None:  # receivers move on during the two-way path
+    if lines.rx_velocity_m_s is not None:  # receivers move while the sound travels
         range_m = np.linalg.norm(row_m[rows // 2] - centres_m.mean(axis=0))
         centres_m = centres_m + lines.rx_velocity_m_s * range_m / lines.sound_speed_m_s
     middle_m = centres_m.mean(axis=0)
@@ -152,9 +154,9 @@ def straighten(
 def _row_direction(
     lines: RangeLines, grid: Grid, beam: BeamWindow | None, offset_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the unit direction of the grid's rows, which must be that of the track.
+    """Return the unit direction of the rows of the grid, after checking it against the track's.
 
-    `offset_m` holds the phase centres from the middle of them all, [channels, 3].
+    `offset_m` are the phase centres relative to their mean, [channels, 3].
     """
     course = np.linalg.svd(offset_m, full_matrices=False)[2][0]
     if not np.ptp(offset_m @ course) > 0:
@@ -167,7 +169,7 @@ def _row_direction(
         direction = direction * np.copysign(1, direction @ courses["beam's along"])
     for name, other in courses.items():
         turn = math.acos(min(abs(other @ direction) / np.linalg.norm(other), 1))
-        name = f"the angle of grid's rows to the {name}"
+        name = f"the angle between the grid's rows and the {name}"
         validate.number(name, math.degrees(turn), "degrees", most=_MOST_TURN_DEG)
     return direction
 
@@ -177,7 +179,7 @@ def aspects_of(
 ) -> Aspects | None:
     """Return the weights over the aspect angles that occur, or None if no pixel is visible.
 
-    Beyond the angles of all pixels, weights fall off smoothly, where they do not matter.
+    Weights fall to zero smoothly beyond the angles of all pixels, where they do not matter.
     """
     near_m, far_m = track.ranges_m
     validate.number("the distance of grid from the track", near_m, "m", least=band.wavelength_m)
@@ -185,7 +187,7 @@ def aspects_of(
     ahead_m = begin_m - track.along_m.max(), end_m - track.along_m.min()
     low = math.atan2(ahead_m[0], near_m if ahead_m[0] < 0 else far_m)
     high = math.atan2(ahead_m[1], near_m if ahead_m[1] > 0 else far_m)
-    # A line holds no echoes from beyond its end.
+    # A line has no echoes from beyond its end.
     first_m = float((lines.first_range_m - track.shift_m).min())
     last_m = max(float((lines.last_range_m - track.shift_m).max()), 1e-30)
     widest = math.acos(min(near_m / last_m, 1))
@@ -201,7 +203,7 @@ def aspects_of(
     steepest = math.degrees(max(-ends[0], ends[1]))
     name = "the aspect angle of grid, unless beam limits it,"
     validate.number(name, steepest, "degrees", most=_STEEPEST_DEG)
-    # At the middles of intervals, so that jumps at the ends of a beam stay outside.
+    # Angles are the middles of intervals, so that jumps at the ends of a beam stay outside.
     step = (ends[1] - ends[0]) / _ANGLES
     angle = ends[0] + step * (np.arange(_ANGLES) + 0.5)
     fade = smooth_edge(((angle - high) / zone - 1) / _EDGE_ZONES)

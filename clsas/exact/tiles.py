@@ -1,7 +1,7 @@
 """Tiles: square parts of a plane, whose pixels share one centre.
 
-Ranges and phases of the centre are computed in float64; the device computes the pixels' differences
-from it in float32.
+Ranges and phases of the centre are computed in float64. The device computes the differences of the
+pixels from it in float32.
 """
 
 from __future__ import annotations
@@ -19,33 +19,39 @@ from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Boxes
 
 STACK = 4
-"""Blocks per work-item, one below the other (cl/pixels.h)."""
+"""Number of blocks of a work-item, which lie one below the other (cl/pixels.h)."""
 
 BLOCKS = {16: (4, 4), 8: (2, 4), 4: (2, 2), 1: (1, 1)}
-"""Rows and columns of a block, by float lanes."""
+"""Rows and columns of a block by number of float lanes, with one pixel per lane."""
+
+
+def item_pixels(width: int) -> int:
+    """Return the number of pixels of a work-item: `STACK` blocks of one pixel per float lane."""
+    return STACK * width
+
 
 HELD = 16
-"""Lanes of vectors whose windows registers hold, so that blocks may share them (cl/lookup.h).
-Samples of narrower vectors are loaded tap by tap."""
+"""Number of lanes with which windows stay in registers, so that blocks may share them
+(cl/lookup.h). With fewer lanes, samples are loaded tap by tap."""
 
-_LARGEST_ANGLE = 2.0  # of a block at its distance; error bounds of weights saturate beyond it
+_LARGEST_ANGLE = 2.0  # largest ratio of a block's radius to its distance in bounds on weight errors
 
 
 @dataclass(frozen=True, eq=False)
 class Tiles:
-    """A plane cut into tiles of side x side pixels, padded to whole tiles.
+    """Plane that is divided into tiles of side x side pixels, and padded to whole tiles.
 
     Attributes
     ----------
     grid : Grid
         The plane.
     side : int
-        Pixels along a tile's side.
+        Pixels along the side of a tile.
     width : int
         Float lanes per work-item.
     cosines : (float, float)
-        Bounds of the cosines between ways to antennas and the steps from row to row, and from
-        column to column; see `cosines_of`.
+        Upper bounds on the cosines between lines of sight and the grid axes, from row to row and
+        from column to column; see `cosines_of`.
     """
 
     grid: Grid
@@ -55,12 +61,12 @@ class Tiles:
 
     @property
     def down(self) -> int:
-        """Rows of tiles."""
+        """Number of rows of tiles."""
         return -(-self.grid.shape[0] // self.side)
 
     @property
     def across(self) -> int:
-        """Columns of tiles. Bands of the image are whole rows of tiles."""
+        """Number of columns of tiles. Bands of the image are whole rows of tiles."""
         return -(-self.grid.shape[1] // self.side)
 
     @property
@@ -70,19 +76,19 @@ class Tiles:
 
     @property
     def part_pixels(self) -> int:
-        """Pixels of a tile."""
+        """Number of pixels of a tile."""
         return self.side**2
 
     @property
     def radius_m(self) -> float:
-        """Largest distance of a pixel from its tile's centre."""
+        """Largest distance of a pixel from the centre of its tile, metres."""
         return _radius_m(self.grid, self.side, self.side)
 
     @property
     def eccentricity(self) -> float:
-        """Rms distance of the grid's pixels from their tiles' centres, relative to whole tiles.
+        """Rms distance of pixels from the centres of their tiles, relative to that of whole tiles.
 
-        A grid smaller than a tile lies in the tile's corner, where float32 rounds most.
+        A grid smaller than a tile lies in a corner of the tile, where float32 rounds most.
         """
         found_m2 = whole_m2 = 0.0
         for count, step_m in zip(self.grid.shape, self.grid.vectors_m[1:], strict=True):
@@ -93,13 +99,13 @@ class Tiles:
 
     @property
     def block_radius_m(self) -> float:
-        """Largest distance of a pixel from the centre of its work-item's block."""
+        """Largest distance of a pixel from the centre of its block, metres."""
         return _radius_m(self.grid, *BLOCKS[self.width])
 
     def one_cubic_error(self, beam: BeamWindow, nearest_m: float, wavelength_m: float) -> float:
-        """Return the rms error of a beam's weights if one cubic serves a whole work-item.
+        """Return the rms error of beam weights if one cubic is used for a whole work-item.
 
-        The sine of the aspect angle is then taken as bilinear over the work-item, too.
+        The sine of the aspect angle is then also interpolated bilinearly over the work-item.
 
         Parameters
         ----------
@@ -113,19 +119,21 @@ class Tiles:
         return math.hypot(beam.block_error(angle), beam.plane_error(angle, wavelength_m))
 
     def windows(self, most_m: float) -> int:
-        """Return how many windows a work-item looks samples up in; 0 if even blocks are too large.
+        """Return the number of windows in which a work-item looks up samples; 0 if none suffices.
 
-        No pixel's range differs by more than `most_m` from that of the middle of its blocks.
+        With this number, the range of no pixel differs by more than `most_m` from that of the
+        middle of the blocks that share its window.
         """
         counts = (1, 2, STACK) if self.width == HELD else (STACK,)
         return next((n for n in counts if self._range_change_m(STACK // n) <= most_m), 0)
 
     def _range_change_m(self, blocks: int) -> float:
-        """Return the largest change of a range from the middle of some blocks to their pixels.
+        """Return the largest change of range from the middle of some blocks to their pixels.
 
-        A range changes by the product of the way and a unit vector u towards an antenna, or by the
-        mean of two such products. The farthest pixel lies at c along columns and r along rows: the
-        largest c |u_c| + r |u_r| is sought, with u_c and u_r within their bounds.
+        Range changes by the scalar product of the displacement and a unit vector u towards an
+        antenna, or by the mean of two such products. The farthest pixel is displaced by c from
+        column to column and by r from row to row. The largest c |u_c| + r |u_r| is found for u_c
+        and u_r within their bounds.
         """
         rows, columns = BLOCKS[self.width]
         farthest_m = _radius_m(self.grid, blocks * rows, columns)
@@ -141,9 +149,10 @@ class Tiles:
         return farthest_m
 
     def cosines_of(self, antennas_m: NDArray[np.float64]) -> tuple[float, float]:
-        """Return bounds of the cosines between a way to an antenna and the grid's rows, columns.
+        """Return upper bounds on the cosine between lines of sight and the two grid axes.
 
-        The first is for steps from row to row. Where steps are not at right angles it is (1, 1).
+        The first bound is for the axis from row to row, the second for that from column to column.
+        If the axes are not perpendicular, both are 1.
         """
         axes = self._axes()
         if axes is None:
@@ -162,28 +171,31 @@ class Tiles:
         return float(down), float(across)
 
     def cosines_in_beam(self, beam: BeamWindow, along: NDArray[np.float64]) -> tuple[float, float]:
-        """Return the bounds of `cosines_of` for ways on which a beam's weights are not 0.
+        """Return the bounds of `cosines_of` for lines of sight within a beam.
 
         Parameters
         ----------
         beam : BeamWindow
         along : float64 [n, 3]
-            The track's unit directions, in its order. Between two of them it turns directly.
+            Unit directions of the track in order. Between two of them the track is assumed to turn
+            on the shortest path.
         """
         axes = self._axes()
         if axes is None:
             return 1.0, 1.0
         step = float(np.linalg.norm(np.diff(along, axis=0), axis=1).max(initial=0.0))
-        from_nearer = math.asin(min(step / 2, 1.0))  # of two directions, to those between them
+        # Largest angle between a direction of the track and the nearer of its two neighbours.
+        from_nearer = math.asin(min(step / 2, 1.0))
         aspect = math.asin(min(float(np.abs(beam.limits).max()), 1.0)) + from_nearer
-        # From an axis to the track's direction, then from there to the nearest way in the beam.
+        # Angle from an axis to the direction of the track, then from there to the nearest line of
+        # sight in the beam.
         angle = np.arccos(np.clip(np.abs(along @ axes.T), 0.0, 1.0))
         off = np.maximum(math.pi / 2 - aspect - angle, 0.0).min(axis=0)
         down, across = np.cos(off)
         return float(down), float(across)
 
     def _axes(self) -> NDArray[np.float64] | None:
-        """Return unit vectors from row to row and from column to column, if at right angles."""
+        """Return unit vectors from row to row and column to column; None unless perpendicular."""
         steps_m = np.stack(self.grid.vectors_m[1:])
         lengths_m = np.linalg.norm(steps_m, axis=1)
         if abs(steps_m[0] @ steps_m[1]) > 1e-9 * lengths_m.prod() or not lengths_m.all():
@@ -191,7 +203,7 @@ class Tiles:
         return steps_m / lengths_m[:, None]
 
     def nearest_m(self, antennas_m: NDArray[np.float64]) -> float:
-        """Return a lower bound of the distance between antennas [n, 3] and tile centres."""
+        """Return a lower bound on the distance between antennas [n, 3] and tile centres, metres."""
         counts = (self.down - 1, self.across - 1)
         sides_m = [
             n * self.side * step_m
@@ -200,7 +212,7 @@ class Tiles:
         lengths_m = [float(np.linalg.norm(side)) for side in sides_m]
         if abs(sides_m[0] @ sides_m[1]) > 1e-9 * lengths_m[0] * lengths_m[1]:
             return float(KDTree(antennas_m).query(self.centres_m(slice(None)))[0].min())
-        # The distance of the rectangle around the centres is a lower bound, and quickly found.
+        # The distance of the rectangle around the centres is a lower bound and quickly computed.
         offset_m = antennas_m - self.centres_m(slice(0, 1))
         for side, length in zip(sides_m, lengths_m, strict=True):
             along = np.clip(offset_m @ side / max(length, 1e-150) ** 2, 0, 1)
@@ -224,7 +236,7 @@ class Tiles:
         return Boxes.equal(self.centres_m(parts), half_m)
 
     def collect(self, pixels: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        """Return the image from rows of the padded plane, [parts * part_pixels]."""
+        """Return the image from the pixels of the padded plane, [parts * part_pixels]."""
         padded = pixels.reshape(self.down * self.side, self.across * self.side)
         rows, columns = self.grid.shape
         return np.ascontiguousarray(padded[:rows, :columns])

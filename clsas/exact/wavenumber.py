@@ -1,4 +1,4 @@
-"""Wavenumber imaging: the exact image of a straight track, formed in the frequency domain."""
+"""Wavenumber imaging: exact images of straight tracks, formed in the frequency domain."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from clsas.exact.straight_track import Aspects, Band, StraightTrack, aspects_of,
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches, warn_unreached
 
-_STRAIGHT = 1e-3  # wavelengths: smaller errors cause no warning
+_STRAIGHT = 1e-3  # wavelengths, up to which errors of range cause no warning
 
 
 def wavenumber(
@@ -30,7 +30,7 @@ def wavenumber(
     motion_compensation: bool = True,
     workers: int | None = None,
 ) -> Image:
-    """Form the image of a straight track in the wavenumber domain.
+    """Return the image of a straight track, formed in the wavenumber domain.
 
     Parameters
     ----------
@@ -38,54 +38,59 @@ def wavenumber(
         Channels in any order, at any spacing along a straight line. Tracks that are not straight,
         bistatic channels and moving receivers are approximated; see `motion_compensation`.
     grid : Grid
-        A plane, horizontal or tilted, whose rows of pixels run along the track.
+        Plane, horizontal or tilted, whose rows of pixels run along the track.
     beam : BeamWindow, optional
-        As for `clsas.backproject`, but aspect angles are always measured from the straight line.
-        Without a beam every channel weighs 1.
+        As for `backproject`, but aspect angles are always measured from the straight line. Without
+        a beam every channel has the weight 1.
     motion_compensation : bool
         If True, shift every range line as if its phase centre were moved onto a straight line
-        along the grid's rows. The shift is exact for the middle of the grid's ranges and of the
-        beam only. If False, phase centres are treated as if they lay on the straight line.
+        along the rows of the grid. The shift is exact only for the middle of the grid's ranges and
+        of the beam. If False, phase centres are treated as if they lay on the straight line.
     workers : int, optional
-        Threads; one for each processor by default.
+        Number of threads; by default as many as there are processors.
 
     Returns
     -------
     Image
-        complex64, with the amplitudes and phases of `clsas.backproject`.
+        Complex image with the amplitudes and phases of `backproject`.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is of a wrong kind or out of range; the grid is not a plane, is turned from
-        the track by more than 5 degrees, or is nearer than a wavelength; all phase centres
-        coincide; aspect angles exceed 85 degrees; the beam normalises; or arrays do not fit into
-        memory.
+        If an argument has the wrong type or is out of range, the grid is not a plane, its rows are
+        at an angle of more than 5 degrees to the track, it is closer than a wavelength, all phase
+        centres coincide, aspect angles exceed 85 degrees, the beam normalises, or arrays do not fit
+        into memory.
 
     Warns
     -----
     ClsasWarning
-        If the track is not straight and monostatic: the warning names the remaining range errors.
-        If the lines add nothing to the image.
+        If the track is not straight and monostatic. The warning names the remaining range errors.
+        If the lines do not contribute to the image.
+
+    See Also
+    --------
+    backproject : Exact images of any track.
 
     Notes
     -----
-    For every two-way wavenumber K the exact image is a convolution along the track with
-    w(theta) exp(j K rho), whose transform is, at sin(theta) = k_x/K and the distance R from the
-    track, by stationary phase
+    For every two-way wavenumber K, the exact image is a convolution along the track with
+    w(theta) exp(j K rho). By stationary phase, its Fourier transform at sin(theta) = k_x/K and the
+    distance R from the track is
 
         sqrt(2 pi R) K k_y^(-3/2) [w + j D/(K R)] exp(j k_y R + j pi/4),   k_y^2 = K^2 - k_x^2,
         D = (w'' cos(theta) + w' sin(theta))/2 + 3 w/(8 cos(theta)).
 
-    The image is this transform times the lines' spectrum, summed over K and k_x [1]_ [2]_ [3]_. In
-    every term R is a factor of its own, so that amplitudes are those of backprojection. The
-    remaining difference is diffraction at the edges of the weights, which stationary phase leaves
-    out. It grows with their steepness; for a Hann beam it is of the order
-    (K R width^2)^(-5/4). Without a beam D, which is 3/(8 cos(theta)), is left out.
+    The image is the product of this transform and the spectrum of the lines, summed over K and k_x
+    [1]_ [2]_ [3]_. In every term R is a separate factor, so that amplitudes are those of
+    backprojection. The remaining difference is diffraction at the edges of the weights, which
+    stationary phase neglects. It grows with the steepness of the edges, and is of the order
+    (K R width^2)^(-5/4) for a Hann beam. Without a beam the term D, which is then 3/(8 cos(theta)),
+    is left out.
 
-    The sums over channels, K and k_x are non-uniform FFTs [4]_. One of type 3 leads from the k_y of
-    the spectrum directly to the R of the rows, to 1e-7. It does Stolt's interpolation and the one
-    from slant to ground range in one step.
+    The sums over channels, K and k_x are non-uniform FFTs [4]_. An FFT of type 3 leads directly
+    from the k_y of the spectrum to the R of the rows, with an error of 1e-7. It replaces Stolt's
+    interpolation and the interpolation from slant range to ground range.
 
     References
     ----------
@@ -95,6 +100,20 @@ def wavenumber(
     .. [3] Soumekh, "Synthetic Aperture Radar Signal Processing", Wiley, 1999.
     .. [4] Barnett, Magland, af Klinteberg, "A parallel nonuniform fast Fourier transform library",
        SIAM J. Scientific Computing 41, 2019.
+
+    Examples
+    --------
+    The image of a point, from a track of 4 m:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> tx_m = np.stack([np.linspace(-2, 2, 41), np.zeros(41), np.zeros(41)], axis=1)
+    >>> point = clsas.PointTargets([[0, 40, 0]])
+    >>> lines = clsas.simulate_lines(tx_m, tx_m, point, carrier_hz=100e3, bandwidth_hz=30e3)
+    >>> grid = clsas.Grid.plane(x=(-1, 1, 41), y=(39.8, 40.2, 41))
+    >>> image = clsas.wavenumber(lines, grid)
+    >>> print(*np.unravel_index(np.abs(image.pixels).argmax(), image.shape))  # row, column
+    20 20
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
@@ -106,7 +125,7 @@ def wavenumber(
         raise ValueError(f"grid must be a plane with rows along the track, got {kind}")
     check_numbers(lines, beam)
     if beam is not None and beam.normalise:
-        raise ValueError("beam must not normalise: sums of weights are clsas.backproject's")
+        raise ValueError("beam must not normalise here; use clsas.backproject for that")
     band = band_of(lines)
     track = straighten(lines, grid, beam, motion_compensation)
     aspects = aspects_of(lines, track, beam, band)
@@ -131,7 +150,7 @@ def _warn_bent(
     band: Band,
     compensated: bool,
 ) -> None:
-    """Warn of tracks that are not a straight line, by the range errors at the grid's corners."""
+    """Warn if the track is not a straight line, with the range errors at the grid's corners."""
     corners = [slice(None, None, max(count - 1, 1)) for count in grid.shape]
     ahead_m = track.pixel_along_m[tuple(corners)][..., None] - track.along_m
     nominal_m = np.hypot(ahead_m, track.row_range_m[corners[0], None, None])
@@ -145,8 +164,8 @@ def _warn_bent(
         return
     treated = "moved onto it for the middle range of the grid" if compensated else "left there"
     validate.warn(
-        f"a wavenumber image is that of a straight monostatic track: phase centres up to "
+        f"a wavenumber image assumes a straight monostatic track: phase centres up to "
         f"{track.off_m:.3g} m off a line along the grid's rows are {treated}, which leaves range "
         f"errors of up to {error_m:.3g} m ({error_m / band.wavelength_m:.2g} wavelengths) at the "
-        f"grid's corners; the image's error is not controlled"
+        f"grid's corners; the error of the image is not controlled"
     )

@@ -15,10 +15,10 @@ from clsas.aperture.mean_track import MeanTrack
 from clsas.aperture.phase_rates import drift, own_drift
 from clsas.aperture.predicted_channels import BEAM_MARGIN
 from clsas.core.lines import RangeLines, some_channels
+from clsas.core.wavelengths import band_wavelength_m
 from clsas.factorized.surface import Surface
 from clsas.factorized.tree import Division
 from clsas.plans.factorization import Factorization
-from clsas.signal.spectrum import band_wavelength_m
 from clsas.sonar.beam import BeamWindow
 
 _ON_TRACK = 1e-4  # wavelengths; closer, channels lie on the mean track

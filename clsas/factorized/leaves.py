@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from clsas.aperture.mean_track import MeanTrack
 from clsas.core.decibels import power
-from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import wavelength_m
 from clsas.exact.groups import Groups
 from clsas.exact.lookup import lookup_options
 from clsas.exact.tiles import Tiles

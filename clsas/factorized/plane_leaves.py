@@ -10,7 +10,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from clsas.core.geometry import bistatic_range_m
-from clsas.exact.tiles import STACK, Tiles
+from clsas.exact.tiles import Tiles, item_pixels
 from clsas.factorized.buffers import tile_buffers
 from clsas.factorized.leaves import Finish, LeafStage
 from clsas.factorized.sectors import Sector
@@ -75,7 +75,7 @@ class PlaneLeaves:
         count = len(parts) * self.per_root
         event = self.device.run(
             self.backproject,
-            (tile[0] * tile[1] // (self.device.info.width * STACK), count),
+            (tile[0] * tile[1] // item_pixels(self.device.info.width), count),
             lines=samples,
             **tiles,
             **self.stage.arguments,

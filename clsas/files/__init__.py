@@ -1,1 +1,1 @@
-"""Files: HDF5, scene files and tracks."""
+"""Files: HDF5, scene files, tracks, and recordings in other formats."""

@@ -1,7 +1,8 @@
 """Recordings of AirSAS, an in-air sonar on a rail, in HDF5 and CSV files.
 
-The schema is that of the public data set (https://doi.org/10.6084/m9.figshare.26961892): a scene's
-samples lie in `scenes/NAME.h5`, what all scenes share in `characterization data/*.csv` beside it.
+The schema is that of the public data set (https://doi.org/10.6084/m9.figshare.26961892). The
+samples of a scene are in `scenes/NAME.h5`, and what all scenes share is in `characterization
+data/*.csv` beside that folder.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from clsas.core import reading, validate
+from clsas.core.extras import needed
 from clsas.core.lines import RangeLines
 from clsas.files import hdf5
 from clsas.files.hdf5 import FileFormatError
@@ -27,13 +29,13 @@ from clsas.signal.echoes import Echoes
 from clsas.sonar.system import Pulse
 
 SHARED = "characterization data"
-ACQUISITION, SENSORS = "acquistionParams.csv", "sensorCoordinates.csv"  # spelt so
-# Rows of the acquisition parameters, from 0; each has a name, a number, and more.
+ACQUISITION, SENSORS = "acquistionParams.csv", "sensorCoordinates.csv"  # the data set's spelling
+# Rows of the acquisition parameters, from 0. Each has a name, a number, and further columns.
 _RATE, _GROUP_DELAY, _START_HZ, _STOP_HZ, _DURATION, _TAPER = 0, 1, 7, 8, 9, 12
 
 
 def is_airsas(file: h5py.File) -> bool:
-    """Return whether an HDF5 file has the parts of an AirSAS scene."""
+    """Return whether an HDF5 file has the groups of an AirSAS scene."""
     return "na" in file and any(name.startswith("ch") for name in file)
 
 
@@ -45,34 +47,34 @@ def read_airsas(
     window: Window = "none",
     oversampling: float = 2.0,
 ) -> RangeLines:
-    """Read and compress the microphones' samples of an AirSAS scene.
+    """Return range lines from the microphones' samples of an AirSAS scene.
 
-    The constant and the group delay of the recorder are removed, the transmission is blanked, and
-    samples are compressed with the chirp that the acquisition parameters describe.
+    The constant offset and the group delay of the recorder are removed, the direct transmission is
+    blanked, and the samples are compressed with the chirp that the acquisition parameters describe.
 
     Parameters
     ----------
     path : path-like
-        The scene, an HDF5 file with `/chN/ts` [pings, time] per microphone, and the position on
-        the rail (m) and temperature (degrees Celsius) of every ping in `/na`.
+        The scene: an HDF5 file with samples `/chN/ts` [pings, time] for every microphone N, and the
+        position on the rail (m) and the temperature (degrees Celsius) of every ping in `/na`.
     channels : sequence of int, optional
-        Microphones, from 1; by default all in the file.
+        Numbers of microphones, from 1; by default all in the file.
     shared : path-like, optional
         Folder of the CSV files; by default `characterization data` beside the scene's folder.
     window, oversampling
-        As in `compress`.
+        As for `compress`.
 
     Returns
     -------
     RangeLines
-        One line per ping and microphone, in the rail's coordinates. The speed of sound is 331.6 +
-        0.61 T m/s, T in degrees Celsius. Lines of pings with another speed than the mean are
-        resampled to the mean speed.
+        One line per ping and microphone, in the coordinates of the rail. The speed of sound is
+        331.6 + 0.61 T m/s, with T in degrees Celsius. Lines of pings whose speed differs from the
+        mean are resampled to the mean speed.
 
     Raises
     ------
     FileFormatError
-        If a file is damaged, lacks a part, or parts disagree.
+        If a file is damaged or incomplete, or its parts disagree.
     TypeError, ValueError
         If an option is outside its limits, or a microphone does not exist.
     OSError
@@ -81,15 +83,21 @@ def read_airsas(
     Warns
     -----
     ClsasWarning
-        If all pings have one position, or the track turns back, so that pings may be out of order.
+        If all pings have the same position, or the track turns back, so that pings may be out of
+        order.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> lines = clsas.read_airsas("scenes/arrow.h5", channels=[1, 2])  # doctest: +SKIP
     """
     path = validate.path("path", path)
     check_options(window=window, oversampling=oversampling)
     with hdf5.opened(path) as file:
         if not is_airsas(file):
             raise FileFormatError(
-                "is an HDF5 file, but no scene of AirSAS: it must hold /na and microphones as "
-                f"/ch1, /ch2, got {validate.shown(sorted(file))}"
+                "is an HDF5 file, but not an AirSAS scene: it must contain /na and microphones "
+                f"/ch1, /ch2, ..., got {validate.shown(sorted(file))}"
             )
     folder = (
         path.absolute().parent.parent / SHARED
@@ -109,7 +117,7 @@ def read_airsas(
         for each in recorded:
             if each.shape != (pings, recorded[0].shape[-1]):
                 raise FileFormatError(
-                    f"must hold {each.name} of shape [pings, time], {pings} by "
+                    f"must contain {each.name} of shape [pings, time], {pings} by "
                     f"{recorded[0].shape[-1]}, got {each.shape}"
                 )
         speed_m_s = _speeds_m_s(_numbers(_dataset(file, "na", "temperature"), budget), pings)
@@ -138,22 +146,29 @@ def read_airsas(
 
 
 def at_one_speed(lines: RangeLines, speed_m_s: NDArray[np.float64]) -> RangeLines:
-    """Return lines whose channels had speeds of sound of their own at the speed of `lines`.
+    """Return lines with one speed of sound, from channels whose speeds of sound differed.
 
     Parameters
     ----------
     lines : RangeLines
-        Lines as if all channels had their one speed c: sample times are 2 r/c.
+        Lines whose ranges r assume the one speed c = `lines.sound_speed_m_s`, so that samples are
+        at the times 2 r/c.
     speed_m_s : float64 array, [channels]
-        Speed of sound of every channel.
+        True speed of sound of every channel.
+
+    Returns
+    -------
+    RangeLines
+        Lines in which a point at range rho has its echo at rho in every channel.
 
     Notes
     -----
-    Channel i has sample times t = 2 r/c_i in truth. Its line is interpolated at 2 r/c_i, by a
-    Fourier series, and turned by the phase 4 pi fc r (1/c_i - 1/c): a point at rho then has the
-    phase exp(-j 4 pi fc rho/c).
+    In channel i the echo of a point at range r arrives at the time 2 r/c_i. The line is therefore
+    interpolated at these times, by a Fourier series, and multiplied by a phasor of phase
+    4 pi fc r (1/c_i - 1/c). A point at rho then has the phase exp(-j 4 pi fc rho/c).
     """
-    import finufft  # slow to import
+    with needed("channels that differ in the speed of sound"):
+        import finufft  # slow to import
 
     validate.memory("lines at one speed of sound", lines.samples.nbytes)
     speed = lines.sound_speed_m_s
@@ -203,7 +218,7 @@ class _Parameters:
 
 
 def _rows(path: Path, first: int, last: int) -> list[list[str]]:
-    """Return the rows of a CSV file, without a header: a first row lacking numbers in columns."""
+    """Return the rows of a CSV file. The first is skipped if columns first to last lack numbers."""
     try:
         text = reading.read_bytes(path).decode("utf-8-sig")
         rows = [row for row in csv.reader(text.splitlines()) if row]
@@ -229,22 +244,26 @@ def _number(path: Path, row: list[str], column: int) -> float:
 
 
 def _sensors_m(path: Path) -> NDArray[np.float64]:
-    """Return positions of the loudspeaker and the microphones in its home position, [n, 3]."""
+    """Return the loudspeaker's and microphones' positions at the array's home, metres [n, 3]."""
     rows = _rows(path, 1, 3)
     if len(rows) < 2:
-        raise FileFormatError(f"{path} must have a loudspeaker and microphones, got {len(rows)}")
+        raise FileFormatError(
+            f"{path} must have rows for a loudspeaker and microphones, got {len(rows)} rows"
+        )
     return np.array([[_number(path, row, column) for column in (1, 2, 3)] for row in rows])
 
 
 def _microphones(path: Path, there: list[int], channels: Sequence[int] | None) -> list[int]:
     if not there:
-        raise FileFormatError(f"{path} must hold microphones of {SENSORS} as /ch1, /ch2, got none")
+        raise FileFormatError(
+            f"{path} must contain microphones of {SENSORS} as /ch1, /ch2, ..., got none"
+        )
     if channels is None:
         return there
     given = validate.entries("channels", channels, "whole numbers of microphones")
     numbers = [validate.count("every entry of channels", number) for number in given]
     if not numbers or not set(numbers) <= set(there):
-        raise ValueError(f"channels must be of {there}, got {validate.shown(channels)}")
+        raise ValueError(f"channels must be among {there}, got {validate.shown(channels)}")
     return numbers
 
 
@@ -252,17 +271,17 @@ def _dataset(file: h5py.File, group: str, name: str) -> h5py.Dataset:
     item = hdf5.find_item(file, group)
     item = hdf5.find_item(item, name) if isinstance(item, h5py.Group) else None
     if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "iuf" or not item.size:
-        raise FileFormatError(f"must hold numbers as /{group}/{name}")
+        raise FileFormatError(f"must contain numbers in /{group}/{name}")
     return item
 
 
 def _numbers(dataset: h5py.Dataset, budget: validate.Budget) -> NDArray[np.float64]:
-    """Return the values of a dataset, which must be finite."""
+    """Return the values of a dataset; values that are not finite raise FileFormatError."""
     with hdf5.too_large():
         budget.take(f"reading {dataset.name}", 8 * dataset.size)
     values = hdf5.read_values(dataset, budget).astype(np.float64)
     if not np.isfinite(values).all():
-        raise FileFormatError(f"must hold finite numbers as {dataset.name}")
+        raise FileFormatError(f"must contain finite numbers in {dataset.name}")
     return values
 
 
@@ -271,8 +290,8 @@ def _together(
 ) -> NDArray[np.float32]:
     """Return the samples of all microphones, [pings, microphones, time].
 
-    Before any are read, there must be memory for all of them, for reading the largest, and for the
-    lines that they become, `lines_bytes` per sample.
+    Before any are read, the memory is checked: for all samples, for reading the largest dataset,
+    and for the lines that are made of them, `lines_bytes` per sample.
     """
     for each in recorded:
         hdf5.check_whole(each)
@@ -290,22 +309,22 @@ def _together(
     for number, each in enumerate(recorded):
         together[:, number] = each[()]
         if not np.isfinite(together[:, number]).all():
-            raise FileFormatError(f"must hold finite numbers as {each.name}")
+            raise FileFormatError(f"must contain finite numbers in {each.name}")
     return together
 
 
 def _speeds_m_s(temperature: NDArray, pings: int) -> NDArray[np.float64]:
-    """Speed of sound at every ping, from the mean of its thermometers."""
+    """Return the speed of sound at every ping, from the mean of the thermometers, m/s."""
     if temperature.ndim == 1:
         temperature = temperature[None]
     if temperature.ndim != 2 or temperature.shape[1] != pings:
         raise FileFormatError(
-            f"must hold /na/temperature of {pings} pings, got shape {temperature.shape}"
+            f"must contain /na/temperature for {pings} pings, got shape {temperature.shape}"
         )
     speed: NDArray[np.float64] = 331.6 + 0.61 * temperature.mean(axis=0)
     if not (speed.min() > 200 and speed.max() < 600):
         raise FileFormatError(
-            "must hold /na/temperature in degrees Celsius, got "
+            "must contain /na/temperature in degrees Celsius, got "
             f"{temperature.min():g} to {temperature.max():g}"
         )
     return speed
@@ -314,10 +333,10 @@ def _speeds_m_s(temperature: NDArray, pings: int) -> NDArray[np.float64]:
 def _conditioned(
     together: NDArray[np.float32], time_s: NDArray, duration_s: float
 ) -> NDArray[np.float32]:
-    """Remove constant and transmission from samples [..., time], in place; return them.
+    """Remove the constant offset and the transmission from samples [..., time], in place.
 
-    Until the pulse has been transmitted the microphones record it directly. They are silenced, and
-    faded in over another pulse length.
+    While the pulse is transmitted, the microphones record it directly. The samples are zero for
+    that time, and fade in over another pulse length.
     """
     ramp = np.clip(time_s / duration_s - 1, 0, 1)
     blanking = np.sin(np.pi / 2 * ramp).astype(np.float32) ** 2

@@ -1,8 +1,8 @@
 """Compensated phase history data (CPHD, NGA.STND.0068) of radar, read by sarkit.
 
-A vector of a CPHD channel is one line. Its signal is relative to the stabilization reference point:
-a target whose delay exceeds that of the point by dt has the phase SGN f dt in cycles, at the
-frequency f in the FX domain, and at the middle of the band in the TOA domain.
+A vector of a CPHD channel becomes one line. Its signal is relative to the stabilization reference
+point: a target whose delay exceeds that of the point by dt has a phase of SGN f dt cycles. In the
+FX domain f is the frequency of the sample; in the TOA domain it is the middle of the band.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
 from clsas.core import reading, validate
-from clsas.core.extras import install_command
+from clsas.core.extras import needed
 from clsas.core.lines import RangeLines
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked_positions
@@ -29,19 +29,17 @@ from clsas.signal.compression import Window, check_options
 from clsas.signal.phase_history import from_phase_history
 
 SPEED, ORIGIN = "clsas.sound_speed_m_s", "clsas.origin_m"
-"""Names of parameters of the collection that say what a CPHD file of a sonar stands for."""
+"""Names of the collection parameters with which a CPHD file describes sonar data."""
 
 START = b"CPHD/"
-_LONGEST_XML = 64 << 20  # bytes; files with thousands of parameters have less than one MiB
-_BYTES = 24  # memory per sample while a signal becomes lines: as read, as complex64, and in work
+_LONGEST_XML = 64 << 20  # bytes; arbitrary, since even thousands of parameters take less than 1 MiB
+_BYTES = 24  # per sample while a signal becomes lines: as read, as complex64, and a working copy
 
 
 def sarkit_cphd() -> ModuleType:
     """Import `sarkit.cphd`, or raise ImportError with the command that installs it."""
-    try:
+    with needed("CPHD files"):
         import sarkit.cphd
-    except ImportError as error:
-        raise ImportError(f"CPHD files need sarkit: {install_command('radar')}") from error
     return sarkit.cphd
 
 
@@ -52,7 +50,9 @@ def read_cphd(
     window: Window = "none",
     oversampling: float = 2.0,
 ) -> RangeLines:
-    """Read a channel of a CPHD file of the FX or TOA domain, monostatic or bistatic.
+    """Return range lines from a channel of a CPHD file in the FX or TOA domain.
+
+    The collection may be monostatic or bistatic.
 
     Parameters
     ----------
@@ -61,22 +61,22 @@ def read_cphd(
     channel : str, optional
         Identifier of the channel; by default the file's reference channel.
     window : str, float or tuple
-        Window over the frequencies of FX data, as in `from_phase_history`. TOA data are compressed
-        already and take none.
+        Window over the frequencies of FX data, as for `from_phase_history`. It has no effect on TOA
+        data, which are compressed already.
     oversampling : float
-        Sample rate of FX data's lines over the bandwidth, at least 1.
+        Sample rate of lines from FX data over the bandwidth, at least 1.
 
     Returns
     -------
     RangeLines
-        One line per vector with a signal. Positions are relative to the image area's reference
-        point (IARP): x and y along the image area's axes, z normal to them. Where the reference
-        surface is not a plane, x is east, y is north and z is up at the IARP.
+        One line per vector with a signal. Positions are relative to the reference point of the
+        image area (IARP), with x and y along the axes of the image area and z normal to them. If
+        the reference surface is not a plane, x points east, y north and z up at the IARP.
 
     Raises
     ------
     FileFormatError
-        If the file is damaged, incomplete or compressed, or claims more than it holds.
+        If the file is damaged, incomplete or compressed, or claims more data than it contains.
     ValueError
         If the file has no such channel, or an option is outside its limits.
     ImportError
@@ -87,15 +87,25 @@ def read_cphd(
     Warns
     -----
     ClsasWarning
-        If vectors lack positions, and are left out; if times of transmission do not ascend, the
-        track turns back, or all vectors have one position.
+        If vectors lack positions and are left out, if transmission times do not ascend, if the
+        track turns back, or if all vectors have the same position.
 
     Notes
     -----
-    Positions are those that the file gives for every vector, at the times of transmission and
-    reception, which is the standard's model. CPHD knows one speed of waves, that of light. A file
-    that clsas wrote of sonar lines says which speed it stands for, and frequencies are brought
+    Positions are those that the file contains for every vector at the times of transmission and
+    reception, as in the model of the standard [1]_. The standard assumes the speed of light. A file
+    of sonar lines that clsas wrote contains the true speed, to which the frequencies are converted
     back.
+
+    References
+    ----------
+    .. [1] National Geospatial-Intelligence Agency, "Compensated Phase History Data (CPHD)",
+       NGA.STND.0068.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> lines = clsas.read_cphd("collection.cphd", window="hann")  # doctest: +SKIP
     """
     sarkit = sarkit_cphd()
     path = validate.path("path", path)
@@ -123,7 +133,7 @@ def read_cphd(
             kept = _usable(path, vectors)
             if not kept.any():
                 raise FileFormatError(
-                    "must hold vectors with a signal and complete positions, got none"
+                    "must contain vectors with a signal and complete positions, got none"
                 )
             vectors, signal = vectors[kept], _complex(signal[kept])
             if "AmpSF" in (vectors.dtype.names or ()):
@@ -143,21 +153,21 @@ def read_cphd(
 
 @contextmanager
 def _defects(path: Path) -> Iterator[None]:
-    """Turn every exception of reading into FileFormatError with the file's name."""
+    """Convert every exception raised by reading into a FileFormatError with the file's name."""
     try:
         yield
     except FileFormatError as error:
         raise FileFormatError(f"{path} {error}") from None
-    except (MemoryError, OSError, validate.ClsasWarning):  # warnings may be made exceptions
+    except (MemoryError, OSError, validate.ClsasWarning):  # filters may raise warnings
         raise
-    # sarkit and lxml report damage by any exception.
+    # sarkit and lxml may raise any exception on damaged files.
     except Exception as error:
         text = validate.shown(str(error) or type(error).__name__)
         raise FileFormatError(f"{path} is damaged: {text}") from error
 
 
 def _header(file: Any, size: int) -> dict[str, int]:
-    """Return offset and size of the file's blocks; all lie within the file."""
+    """Return the offsets and sizes of the file's blocks after checking them against its size."""
     start = file.read(1 << 14)
     if not start.startswith(START) or b"\f\n" not in start:
         raise FileFormatError("is not a CPHD file")
@@ -181,7 +191,7 @@ def _header(file: Any, size: int) -> dict[str, int]:
 
 
 def _check_sizes(tree: Any, name: str, header: dict[str, int], size: int) -> None:
-    """Raise FileFormatError unless the arrays of a channel lie within the file and fit memory."""
+    """Raise FileFormatError unless a channel's arrays lie within the file and fit into memory."""
     data = tree["Data"]
     if "SignalCompressionID" in data:
         raise FileFormatError("must not have a compressed signal")
@@ -193,7 +203,7 @@ def _check_sizes(tree: Any, name: str, header: dict[str, int], size: int) -> Non
     if item is None:
         raise FileFormatError(f"has an unknown format {validate.shown(data['SignalArrayFormat'])}")
     if vectors < 1 or length < 2:
-        raise FileFormatError(f"must hold lines, got {vectors} of {length} samples")
+        raise FileFormatError(f"must contain vectors, got {vectors} of {length} samples")
     parts = {
         "SIGNAL": described["SignalArrayByteOffset"] + vectors * length * item,
         "PVP": described["PVPArrayByteOffset"] + vectors * data["NumBytesPVP"],
@@ -211,10 +221,10 @@ def _check_sizes(tree: Any, name: str, header: dict[str, int], size: int) -> Non
 
 @dataclass(frozen=True, eq=False)
 class _Collection:
-    """Properties that all vectors of a file share.
+    """Properties common to all vectors of a file.
 
-    Positions in Earth-centred coordinates become local: relative to `centre_m`, along `axes`
-    (rows), plus `origin_m`.
+    Positions in Earth-centred coordinates are converted to local ones: relative to `centre_m`,
+    along the rows of `axes`, plus `origin_m`.
     """
 
     domain: str
@@ -226,14 +236,14 @@ class _Collection:
 
     @classmethod
     def read(cls, tree: Any) -> _Collection:
-        """Return it from the root of the XML."""
+        """Return the collection that the XML describes, given its root."""
         whole, scene = tree["Global"], tree["SceneCoordinates"]
         if whole["SGN"] not in (-1, 1):
-            raise FileFormatError(f"must have the sign +1 or -1, got {whole['SGN']}")
+            raise FileFormatError(f"must have the phase sign (SGN) +1 or -1, got {whole['SGN']}")
         own = dict(tree["CollectionID"].findall("Parameter"))
         axes = _axes(scene)
         if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-5):
-            raise FileFormatError("must have orthogonal axes of length 1")
+            raise FileFormatError("must have orthogonal image area axes of length 1")
         return cls(
             domain=validate.one_of("its domain", whole["DomainType"], ("FX", "TOA")),
             sign=whole["SGN"],
@@ -245,7 +255,7 @@ class _Collection:
 
     @property
     def frequency_scale(self) -> float:
-        """Frequencies of the waves that the file stands for, over those that it gives."""
+        """Ratio of the true frequencies to those in the file."""
         return self.speed_m_s / speed_of_light
 
     def local_m(self, position_m: NDArray) -> NDArray[np.float64]:
@@ -254,7 +264,7 @@ class _Collection:
 
 
 def _axes(scene: Any) -> NDArray[np.float64]:
-    """Return unit vectors of local x, y and z: of a plane, else east, north and up."""
+    """Return unit vectors of local x, y and z: those of a plane, else east, north and up."""
     surface = scene["ReferenceSurface"]
     if "Planar" in surface:
         x, y = (_vector(surface["Planar"][name]) for name in ("uIAX", "uIAY"))
@@ -269,12 +279,12 @@ def _axes(scene: Any) -> NDArray[np.float64]:
 def _vector(value: Any) -> NDArray[np.float64]:
     vector = np.asarray(value, dtype=np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise FileFormatError(f"must have positions of three numbers, got {validate.shown(value)}")
+        raise FileFormatError(f"must have vectors of three numbers, got {validate.shown(value)}")
     return vector
 
 
 def _usable(path: Path, vectors: NDArray) -> NDArray[np.bool_]:
-    """Return which vectors hold a signal and are complete; warn of incomplete and repeated ones."""
+    """Return which vectors are complete and have a signal; warn of incomplete and repeated ones."""
     normal = np.ones(len(vectors), bool)
     if "SIGNAL" in (vectors.dtype.names or ()):
         normal = vectors["SIGNAL"] == 1
@@ -288,14 +298,14 @@ def _usable(path: Path, vectors: NDArray) -> NDArray[np.bool_]:
     if lost.size and usable.any():
         validate.warn(
             f"{path}: {lost.size} of {len(vectors)} vectors lack finite positions or frequencies "
-            f"(the first is vector {lost[0]}): they are left out"
+            f"(first: vector {lost[0]}) and are left out"
         )
     late = np.flatnonzero(~(np.diff(vectors["TxTime"][usable]) > 0))
     if late.size:
         validate.warn(
             f"{path}: TxTime does not ascend after {late.size} of {usable.sum()} vectors (first "
-            f"after vector {np.flatnonzero(usable)[late[0]]}): pulses are repeated or out of "
-            "order. They are read in the order of the file"
+            f"after vector {np.flatnonzero(usable)[late[0]]}), so pulses are repeated or out of "
+            "order. They are in the order of the file"
         )
     return usable
 
@@ -307,7 +317,7 @@ def _complex(signal: NDArray) -> NDArray[np.complex64]:
 
 
 def _geometry(vectors: NDArray, collection: _Collection) -> dict[str, Any]:
-    """Return positions, and the range to the reference point, of every vector."""
+    """Return the positions of every vector, and its range to the reference point."""
     tx_m, rx_m, point_m = (
         collection.local_m(vectors[name]) for name in ("TxPos", "RcvPos", "SRPPos")
     )
@@ -340,7 +350,7 @@ def _lines_of_fx(
 def _lines_of_toa(
     signal: NDArray[np.complex64], vectors: NDArray, collection: _Collection
 ) -> RangeLines:
-    """Bring signals, at the middle of each vector's band, to one carrier and absolute ranges."""
+    """Return lines with one carrier and absolute ranges, from signals at the bands' middles."""
     geometry = _geometry(vectors, collection)
     reference_m = geometry.pop("reference_range_m")
     step_s, start_s = (vectors[name].astype(np.float64) for name in ("SCSS", "SC0"))

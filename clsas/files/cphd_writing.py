@@ -1,4 +1,4 @@
-"""Range lines written as compensated phase history data (CPHD) of the TOA domain."""
+"""Writing of range lines as compensated phase history data (CPHD) in the TOA domain."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ SUFFIXES = (".cphd",)
 
 _NAMESPACE = "http://api.nsgreg.nga.mil/schema/cphd/1.1.0"
 _CHANNEL = "1"
-_EQUATOR_M = np.array([6378137.0, 0.0, 0.0])  # latitude and longitude 0: on the WGS 84 ellipsoid
+_EQUATOR_M = np.array([6378137.0, 0.0, 0.0])  # latitude and longitude 0 on the WGS 84 ellipsoid
 _AXES = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # east, north, up there
-_NEAR_M = 1e4  # positions closer to the origin stay where they are relative to it
-_NEAREST_M = 10.0  # of the reference point: angles at the Earth's centre must differ in float64
-_GRID = 1024  # lines and samples of the image grid that is proposed
-_DEPRESSION = np.radians(30)  # of the reference point as seen from the track
+_NEAR_M = 1e4  # positions closer to the origin than this are not shifted
+# Least distance of the reference point: angles at the Earth's centre must differ in float64.
+_NEAREST_M = 10.0
+_GRID = 1024  # lines and samples of the proposed image grid: a plain choice
+_DEPRESSION = np.radians(30)  # of the reference point from the track: a plain choice
 _PULSE_INTERVAL_S = 1e-3
-_OVERSAMPLING = 1.25  # sample rate over the band that is declared; the standard asks for 1.1
+_OVERSAMPLING = 1.25  # sample rate over the declared bandwidth; the standard requires 1.1
 _POSITION = ("f8", (3,))
 _VECTOR = np.dtype(
     [("TxTime", "f8"), ("TxPos", *_POSITION), ("TxVel", *_POSITION)]
@@ -39,21 +40,21 @@ _VECTOR = np.dtype(
 
 
 def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
-    """Write range lines as a CPHD file, version 1.1.0, of the TOA domain.
+    """Write range lines to a CPHD file, version 1.1.0, in the TOA domain.
 
-    `read_cphd` returns the lines in the same coordinates, with the samples' precision.
+    `read_cphd` returns the lines in the same coordinates, to the precision of the samples.
 
     Parameters
     ----------
     path : path-like
-        The file; an existing one is replaced in one step. Its name ends in .cphd.
+        The file, whose name must end in .cphd. An existing file is replaced in one step.
     lines : RangeLines
-        Lines without receiver velocities: the standard's model has no motion during flight.
+        Lines without receiver velocities, since the standard does not model motion during flight.
 
     Raises
     ------
     TypeError
-        If `lines` are no range lines.
+        If `lines` are not range lines.
     ValueError
         If the lines have receiver velocities, or the file's name has another suffix.
     ImportError
@@ -63,12 +64,22 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
 
     Notes
     -----
-    CPHD knows one speed of waves, that of light. Lines of another speed c are written with the same
-    wavelengths and geometry: frequencies are multiplied by 299 792 458 m/s over c, so that any
-    processor of CPHD forms the same image. A parameter of the collection keeps c. The origin lies
-    at latitude and longitude 0, with x east, y north and z up. Times, velocities, polarization and
-    the date are not known to range lines: they are placeholders. Lines on their carrier
-    (`carrier_hz` 0) are written, and read back, on half of their sample rate.
+    The standard assumes the speed of light. Lines with another speed c are written with the same
+    wavelengths and geometry: frequencies are multiplied by 299 792 458 m/s over c, so that any CPHD
+    processor forms the same image. A parameter of the collection stores c. The origin is at
+    latitude and longitude 0, with x pointing east, y north and z up. Times, velocities,
+    polarization and the date are placeholders, since range lines lack them. Lines that still have
+    their carrier (`carrier_hz` 0) are written with half their sample rate as the carrier, and read
+    back with it.
+
+    See Also
+    --------
+    read_cphd : Read a CPHD file.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> clsas.write_cphd("collection.cphd", clsas.load("lines.h5"))  # doctest: +SKIP
     """
     sarkit = sarkit_cphd()
     path = validate.path("path", path)
@@ -76,7 +87,7 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
     validate.instance("lines", lines, RangeLines)
     if lines.rx_velocity_m_s is not None:
         raise ValueError(
-            "lines must not have rx_velocity_m_s: CPHD has no motion of receivers during flight"
+            "lines must not have rx_velocity_m_s: CPHD cannot describe motion during flight"
         )
     origin_m = np.rint(lines.phase_centres_m.mean(axis=0))
     origin_m *= np.abs(origin_m).max() > _NEAR_M
@@ -87,14 +98,14 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
 
 
 def write_vectors(sarkit: Any, file: Any, tree: Any, vectors: NDArray, signal: NDArray) -> None:
-    """Write a document with the vectors and the signal of its one channel."""
+    """Write a CPHD document with the vectors and the signal of its only channel."""
     with sarkit.Writer(file, sarkit.Metadata(xmltree=tree)) as writer:
         writer.write_pvp(_CHANNEL, vectors)
         writer.write_signal(_CHANNEL, signal)
 
 
 def _vectors(lines: RangeLines, origin_m: NDArray) -> tuple[NDArray, NDArray[np.complex64]]:
-    """Return parameters per vector, and the signal relative to the reference point."""
+    """Return the parameters of every vector, and the signal relative to the reference point."""
     scale = speed_of_light / lines.sound_speed_m_s
     rate_hz = speed_of_light / (2 * lines.range_step_m)
     carrier_hz = scale * lines.carrier_hz or rate_hz / 2
@@ -119,7 +130,7 @@ def _vectors(lines: RangeLines, origin_m: NDArray) -> tuple[NDArray, NDArray[np.
     vectors["TOA1"] = vectors["SC0"]
     vectors["TOA2"] = vectors["SC0"] + (lines.length - 1) / rate_hz
     vectors["SIGNAL"] = 1
-    # The phase of the reference range comes off, and that of a carrier that the lines still have.
+    # Remove the phase of the reference range and, if the lines still have it, the carrier.
     moved_hz = carrier_hz - scale * lines.carrier_hz
     signal = np.empty_like(lines.samples)
     for row, line in enumerate(lines.samples):
@@ -132,9 +143,10 @@ def _vectors(lines: RangeLines, origin_m: NDArray) -> tuple[NDArray, NDArray[np.
 def _reference(
     tx_m: NDArray, rx_m: NDArray, lines: RangeLines
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the track's direction, and a reference point to its left in the middle of the lines.
+    """Return the track's direction, and a reference point on its left at the middle range.
 
-    Where the scene lies is not known. Any point serves: phases and ranges are relative to it.
+    The position of the scene is unknown. Any point serves, since phases and ranges are relative to
+    it.
     """
     centres_m = (tx_m + rx_m) / 2
     middle_m = centres_m.mean(axis=0)
@@ -255,7 +267,7 @@ def _scene(vectors: NDArray) -> dict[str, Any]:
     spacing_m = 2 * half_m / _GRID
     corners_m = np.array(
         [[first[0], last[1], 0], [last[0], last[1], 0], [last[0], first[1], 0], [*first, 0]]
-    )  # clockwise
+    )  # in clockwise order
     corners = sarkit.wgs84.cartesian_to_geodetic(_EQUATOR_M + corners_m @ _AXES)
     return {
         "EarthModel": "WGS_84",
@@ -273,7 +285,7 @@ def _scene(vectors: NDArray) -> dict[str, Any]:
 
 
 def _layout() -> dict[str, dict[str, Any]]:
-    """Return the position of every parameter in a vector, in 64-bit words."""
+    """Return the place of every parameter within a vector, in 64-bit words."""
     fields = _VECTOR.fields
     assert fields is not None  # the type has names
     return {

@@ -1,4 +1,4 @@
-"""Files of every kind that clsas reads and writes, told apart by their contents."""
+"""Reading and writing of files of all kinds, which are distinguished by their contents."""
 
 from __future__ import annotations
 
@@ -21,31 +21,46 @@ SUFFIXES = (*hdf5.SUFFIXES, *cphd_writing.SUFFIXES)
 
 
 def load(path: str | os.PathLike) -> Saved:
-    """Read a file that `save` wrote, or a recording of another kind as range lines.
+    """Return the object in a file that `save` wrote, or the range lines of another recording.
 
-    The content decides, not the name. Recordings are read with the defaults of `read_cphd`,
-    `read_phase_history`, `read_full_matrix` or `read_airsas`, which take options.
+    The kind of file is determined by its contents, not its name. Recordings are read with the
+    defaults of `read_cphd`, `read_phase_history`, `read_full_matrix` or `read_airsas`; call these
+    functions to set their options.
 
     Parameters
     ----------
     path : path-like
-        The file: HDF5 of clsas or of AirSAS, CPHD, or MATLAB's with a phase history or a full
+        The file: HDF5 from clsas or AirSAS, CPHD, or a MATLAB file with a phase history or a full
         matrix capture.
 
     Returns
     -------
     Grid, RangeLines, Image or Echoes
-        What was saved, bit for bit; for CPHD files and recordings RangeLines.
+        The object that was saved, bit for bit; RangeLines for CPHD files and recordings.
 
     Raises
     ------
     FileFormatError
-        If the file is of no such kind, was written by a newer version, is incomplete or damaged, is
+        If the file is of another kind, was written by a newer version, is incomplete or damaged, is
         larger than memory when unpacked, or contains links.
     ImportError
-        If it is a CPHD file and sarkit is not installed (extra `radar`).
+        If the file is CPHD and sarkit is not installed (extra `radar`).
     OSError
         If the file does not exist (FileNotFoundError) or cannot be read.
+
+    See Also
+    --------
+    save : Write a file.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import clsas
+    >>> grid = clsas.Grid.plane((-5, 5, 101), (20, 40, 201))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     clsas.save(f"{folder}/grid.h5", grid)
+    ...     clsas.load(f"{folder}/grid.h5").shape
+    (201, 101)
     """
     path = validate.path("path", path)
     try:
@@ -67,7 +82,7 @@ def load(path: str | os.PathLike) -> Saved:
             if found := matlab.groups(variables, *fields):
                 return lines_of(path, matlab.only(path, found, *fields))
         raise FileFormatError(
-            f"{path} must hold one structure with the fields {', '.join(PHASE_HISTORY)} or "
+            f"{path} must contain one structure with the fields {', '.join(PHASE_HISTORY)} or "
             f"{', '.join(FULL_MATRIX)}"
         )
     if h5py.is_hdf5(path):
@@ -75,35 +90,39 @@ def load(path: str | os.PathLike) -> Saved:
             foreign = "format" not in content.attrs and is_airsas(content)
         return read_airsas(path) if foreign else hdf5.load(path)
     raise FileFormatError(
-        f"{path} is not an HDF5 file, nor one of CPHD or of MATLAB's version 5 to 7"
+        f"{path} is neither an HDF5 file, nor CPHD, nor a MATLAB file of version 5 to 7"
     )
 
 
 def save(path: str | os.PathLike, obj: Saved) -> None:
     """Write an object to an HDF5 file, or range lines to a CPHD file.
 
-    An existing file is replaced in one step and keeps its mode. A symbolic link stays: the file it
-    leads to is replaced.
+    An existing file is replaced in one step and keeps its mode. If `path` is a symbolic link, the
+    file that it leads to is replaced.
 
     Parameters
     ----------
     path : path-like
-        The file. Its name ends in .h5, .hdf5, .he5 or nothing for HDF5, and in .cphd for CPHD,
-        which `write_cphd` describes. Its folder must exist.
+        The file, whose folder must exist. A name that ends in .h5, .hdf5, .he5 or has no suffix
+        selects HDF5, and .cphd selects CPHD (see `write_cphd`).
     obj : Grid, RangeLines, Image or Echoes
-        The object; `load` returns it from HDF5 bit for bit.
+        The object. `load` returns it from HDF5 bit for bit.
 
     Raises
     ------
     TypeError
         If `obj` is of another type.
     ValueError
-        If the file's name has the suffix of another format, such as .tif, CPHD cannot represent the
-        lines, or `path` is a device, a pipe or a socket.
+        If the file name has the suffix of another format, such as .tif, if CPHD cannot represent
+        the lines, or if `path` is a device, a pipe or a socket.
     ImportError
-        If a CPHD file is wanted and sarkit is not installed (extra `radar`).
+        If a CPHD file is requested and sarkit is not installed (extra `radar`).
     OSError
-        If the folder does not exist or the file cannot be written, as on a full disk.
+        If the folder does not exist or the file cannot be written, for example on a full disk.
+
+    See Also
+    --------
+    load : Read the file, with an example.
 
     Notes
     -----

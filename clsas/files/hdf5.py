@@ -44,7 +44,7 @@ Saved = Grid | RangeLines | Image | Echoes
 
 
 class FileFormatError(ValueError):
-    """The file is not a complete clsas file of a version that this library reads."""
+    """The file is damaged, incomplete, or of a format or version that clsas does not read."""
 
 
 def save(path: str | os.PathLike, obj: Saved) -> None:
@@ -53,7 +53,7 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     Parameters
     ----------
     path : path-like
-        The file. Its name has one of the `SUFFIXES` or none. Its folder must exist.
+        The file, whose folder must exist. Its name must have one of the `SUFFIXES` or none.
     obj : Grid, RangeLines, Image or Echoes
         The object; `load` returns it bit for bit.
 
@@ -62,10 +62,10 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     TypeError
         If `obj` is of another type.
     ValueError
-        If the file's name has the suffix of another format, such as .tif, or `path` is a device, a
+        If the file name has the suffix of another format, such as .tif, or `path` is a device, a
         pipe or a socket.
     OSError
-        If the folder does not exist or the file cannot be written, as on a full disk.
+        If the folder does not exist or the file cannot be written, for example on a full disk.
 
     Notes
     -----
@@ -77,7 +77,7 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     validate.instance("obj", obj, *_SAVED)
     with replacing(path) as temporary:
         memory = BytesIO()
-        # From format 1.10 on, all of HDF5's metadata have checksums.
+        # HDF5 protects all of its metadata with checksums only from format 1.10 on.
         with h5py.File(memory, "w", libver=("v110", "v110")) as content:
             _set(content, "format", FORMAT)
             content.attrs["version"] = VERSION
@@ -86,7 +86,7 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
 
 
 def load(path: str | os.PathLike) -> Saved:
-    """Read what `save` wrote.
+    """Return the object in a file that `save` wrote.
 
     Parameters
     ----------
@@ -109,24 +109,24 @@ def load(path: str | os.PathLike) -> Saved:
     with _opened(validate.path("path", path)) as file:
         obj = _read(file, validate.Budget())
         if not isinstance(obj, _SAVED):
-            raise FileFormatError(f"holds only a {type(obj).__name__}")
+            raise FileFormatError(f"contains only a {type(obj).__name__}")
         return obj
 
 
 def read_geometry(path: str | os.PathLike) -> tuple[RangeLines, int]:
-    """Read range lines without their samples.
+    """Return the range lines in a file, without their samples.
 
     Returns
     -------
     lines : RangeLines
-        Lines with one sample per channel, which is zero.
+        Lines with one sample per channel, whose value is zero.
     length : int
         Samples per channel in the file.
 
     Raises
     ------
     FileFormatError, OSError
-        As `load` does, and if the file holds another kind of object.
+        As for `load`, or if the file contains another kind of object.
     """
     with _opened(path) as file:
         dataset = _samples_of(file)
@@ -135,12 +135,12 @@ def read_geometry(path: str | os.PathLike) -> tuple[RangeLines, int]:
 
 
 def read_samples(path: str | os.PathLike, rows: slice, columns: slice) -> np.ndarray:
-    """Read some samples of range lines, [channels, samples].
+    """Return a part of the samples of range lines in a file, [channels, samples].
 
     Raises
     ------
     FileFormatError, OSError
-        As `read_geometry` does.
+        As for `read_geometry`.
     """
     with _opened(path) as file:
         samples = _samples_of(file)
@@ -153,7 +153,7 @@ def read_samples(path: str | os.PathLike, rows: slice, columns: slice) -> np.nda
 
 @contextmanager
 def _opened(path: str | os.PathLike) -> Iterator[h5py.File]:
-    """Open a clsas file for reading; every defect raises FileFormatError."""
+    """Open a clsas file for reading; any defect raises FileFormatError."""
     with opened(path) as file:
         _check_header(file)
         yield file
@@ -161,9 +161,9 @@ def _opened(path: str | os.PathLike) -> Iterator[h5py.File]:
 
 @contextmanager
 def opened(path: str | os.PathLike) -> Iterator[h5py.File]:
-    """Open any HDF5 file for reading; every defect raises FileFormatError.
+    """Open any HDF5 file for reading; any defect raises FileFormatError.
 
-    FileFormatErrors and others of the reading code gain the file's name.
+    The file's name is put in front of the messages that the code reading the file raises.
     """
     path = Path(path)
     try:
@@ -171,7 +171,7 @@ def opened(path: str | os.PathLike) -> Iterator[h5py.File]:
     except ValueError as error:
         raise FileFormatError(str(error)) from None
     with path.open("rb"):
-        pass  # Python's messages about files that cannot be opened are clearer than HDF5's.
+        pass  # raises if the file cannot be opened, with a clearer message than that of HDF5
     if not h5py.is_hdf5(path):
         raise FileFormatError(f"{path} is not an HDF5 file")
     try:
@@ -179,7 +179,7 @@ def opened(path: str | os.PathLike) -> Iterator[h5py.File]:
             yield file
     except FileFormatError as error:
         raise FileFormatError(f"{path} {error}") from None
-    # HDF5 reports damage by any of these exceptions.
+    # h5py raises any of these exceptions on damaged files.
     except (OSError, RuntimeError, LookupError, ValueError, TypeError) as error:
         raise FileFormatError(f"{path} is damaged: {error}") from error
 
@@ -191,7 +191,7 @@ def _write(group: h5py.Group, obj: Any) -> None:
         if value is None:
             continue
         if isinstance(value, np.ndarray):
-            # With a checksum, so that damage is found.
+            # A checksum, so that damage is detected.
             group.create_dataset(field.name, data=value, fletcher32=True)
         elif type(value) in _KINDS.values():
             _write(group.create_group(field.name), value)
@@ -202,24 +202,24 @@ def _write(group: h5py.Group, obj: Any) -> None:
 def _samples_of(file: h5py.File) -> h5py.Dataset:
     kind = _attribute(file, "kind")
     if kind != "range_lines":
-        raise FileFormatError(f"must hold range lines, got {validate.shown(kind)}")
+        raise FileFormatError(f"must contain range lines, got {validate.shown(kind)}")
     samples = find_item(file, "samples")
     if not isinstance(samples, h5py.Dataset):
         raise FileFormatError("lacks samples of the range_lines at /")
     if samples.dtype.kind != "c" or len(samples.shape or ()) != 2 or not samples.size:
         raise FileFormatError(
-            "must hold samples that are complex numbers, [channels, samples], got "
+            "must contain samples as complex numbers, [channels, samples], got "
             f"{samples.dtype} of shape {samples.shape}"
         )
     return samples
 
 
 def _read(group: h5py.Group, budget: validate.Budget, **instead: Any) -> Any:
-    """Return the object in a group. Fields in `instead` are not read."""
+    """Return the object in a group. Fields in `instead` are taken from there, not read."""
     name = _attribute(group, "kind")
     if not isinstance(name, str) or name not in _KINDS:
         where = f"{validate.shown(name)} at {validate.shown(group.name)}"
-        raise FileFormatError(f"holds an object of unknown kind {where}")
+        raise FileFormatError(f"contains an object of unknown kind {where}")
     kind = _KINDS[name]
     values = {}
     for field in fields(kind):
@@ -229,9 +229,9 @@ def _read(group: h5py.Group, budget: validate.Budget, **instead: Any) -> Any:
             values[field.name] = _attribute(group, field.name)
         elif (item := find_item(group, field.name)) is not None:
             is_group = isinstance(item, h5py.Group)
-            # A group may contain a link to itself.
+            # Check the kind before reading, since a group may contain a link to itself.
             if is_group and _kind_of_field(field.type) != _attribute(item, "kind"):
-                raise FileFormatError(f"holds another object as {field.name} of the {name}")
+                raise FileFormatError(f"contains another object as {field.name} of the {name}")
             values[field.name] = _read(item, budget) if is_group else read_values(item, budget)
         elif "None" in str(field.type):
             values[field.name] = None
@@ -247,36 +247,37 @@ def _kind_of_field(annotation: object) -> str | None:
 
 
 def find_item(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
-    """Return a group or dataset of this file, or None if there is none of that name.
+    """Return a group or dataset of the file, or None if none has that name.
 
-    Links are refused: a file must not decide which other files are read.
+    Links are refused, so that a file cannot determine which other files are read.
     """
     link = group.get(name, getlink=True)
     if link is None:
         return None
     if not isinstance(link, h5py.HardLink):
-        raise FileFormatError(f"must hold {name} itself, got a link to another place")
+        raise FileFormatError(f"must contain {name} itself, got a link to another place")
     item = group[name]
     if isinstance(item, h5py.Dataset):
         if item.is_virtual or item.external:
-            raise FileFormatError(f"must hold {name} itself, got a dataset kept in other files")
+            raise FileFormatError(
+                f"must contain {name} itself, got a dataset stored in other files"
+            )
         if item.dtype.kind not in "iufc":
-            raise FileFormatError(f"must hold {name} as numbers, got {item.dtype}")
+            raise FileFormatError(f"must contain {name} as numbers, got {item.dtype}")
     elif not isinstance(item, h5py.Group):
-        raise FileFormatError(f"must hold {name} as a dataset, got a type")
+        raise FileFormatError(f"must contain {name} as a dataset, got a named datatype")
     return item
 
 
 def read_values(dataset: h5py.Dataset, budget: validate.Budget) -> np.ndarray:
-    """Return a whole dataset that fits into memory; one with missing parts is refused."""
+    """Return the values of a dataset; raise FileFormatError if it is incomplete or too large."""
     check_whole(dataset)
     _take(budget, dataset, dataset.nbytes)
     return dataset[()]
 
 
 def check_whole(dataset: h5py.Dataset) -> None:
-    """Raise FileFormatError if parts of a dataset are missing."""
-    # HDF5 returns zeros for chunks that were never written.
+    """Raise FileFormatError if parts of a dataset are missing, for which HDF5 returns zeros."""
     if dataset.chunks is None:
         whole = dataset.id.get_storage_size() >= dataset.nbytes
     else:
@@ -287,7 +288,7 @@ def check_whole(dataset: h5py.Dataset) -> None:
 
 
 def unpacking_bytes(dataset: h5py.Dataset) -> int:
-    """Return the memory in work while a dataset is read: two buffers, each of a whole chunk."""
+    """Return the bytes that reading a dataset takes temporarily: two buffers, each of a chunk."""
     return 2 * math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
 
 
@@ -300,7 +301,7 @@ def _take(budget: validate.Budget, dataset: h5py.Dataset, size_bytes: int) -> No
 
 @contextmanager
 def too_large() -> Iterator[None]:
-    """Raise what a budget refuses as a FileFormatError, which says that the file is too large."""
+    """Convert the error of a memory budget into a FileFormatError: the file is too large."""
     try:
         yield
     except ValueError as error:
@@ -308,7 +309,7 @@ def too_large() -> Iterator[None]:
 
 
 def _set(group: h5py.Group, name: str, value: Any) -> None:
-    # Checksums cover strings of fixed length, not those of variable length.
+    # HDF5's checksums cover strings of fixed length, but not those of variable length.
     group.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
 
 
@@ -321,13 +322,18 @@ def _attribute(group: h5py.Group, name: str) -> Any:
 
 def _check_header(file: h5py.File) -> None:
     if _attribute(file, "format") != FORMAT:
-        raise FileFormatError("is an HDF5 file, but not one of clsas (attribute format)")
+        raise FileFormatError(
+            "is an HDF5 file, but was not written by clsas: it lacks the attribute format"
+        )
     version = _attribute(file, "version")
     if not isinstance(version, int):
-        raise FileFormatError(f"is damaged: attribute version is {version!r}, not a number")
+        raise FileFormatError(
+            f"is damaged: its attribute version must be a number, got {version!r}"
+        )
     if version > VERSION:
         raise FileFormatError(
-            f"is of format version {version}, newer than this clsas, which reads up to {VERSION}"
+            f"is of format version {version}, but this clsas reads versions up to {VERSION}: "
+            "update clsas"
         )
     if version < 1:
         raise FileFormatError(f"is of format version {version}, but the first one is 1")

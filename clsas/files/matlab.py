@@ -1,8 +1,9 @@
-"""MATLAB files of version 5 to 7: their numbers and structures.
+"""Numbers and structures from MATLAB files of version 5 to 7.
 
-Files are untrusted. SciPy's reader ends the process (a segmentation fault) on some damaged ones,
-and allocates what cells claim to hold. This reader takes the part of the format that recordings
-use. Every size is compared with what is there, or with the memory, before anything is allocated.
+The files are not trusted. SciPy's reader crashes with a segmentation fault on some damaged files,
+and allocates as much memory as cells claim to contain. This reader supports the part of the format
+that recordings use. It compares every size with the file's contents, or with the available memory,
+before it allocates anything.
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ import numpy as np
 from clsas.core import reading, validate
 from clsas.files.hdf5 import FileFormatError, too_large
 
-_HEADER = 128  # bytes: text, and at their end version and byte order
+_HEADER = 128  # bytes: a text, followed by the version and the byte order
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
 _STRUCTURE, _COMPLEX = 2, 0x800  # class and flag of a matrix
-_DEEPEST = 32  # structures within structures
-_PARTS, _PART_BYTES = 1000, 256  # elements that are checked at once; memory of one without numbers
-# Types of numbers as stored, and by the class of a matrix; a double may be stored as a byte.
+_DEEPEST = 32  # levels of nested structures: arbitrary, more than any recording has
+_PARTS, _PART_BYTES = 1000, 256  # elements per check of memory; bytes of one without its numbers
+# Types of numbers in the file, and those of every class of matrix. They may differ: a double whose
+# value is small may be stored as a byte.
 _STORED = {
     1: "i1",
     2: "u1",
@@ -40,19 +42,20 @@ _CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8",
 
 
 def is_matlab(start: bytes) -> bool:
-    """Return whether the first bytes of a file are those of a MATLAB file, version 5 to 7."""
+    """Return whether a file that begins with these bytes is a MATLAB file of version 5 to 7."""
     return len(start) >= _HEADER and start[126:128] in (b"IM", b"MI") and start[:6] == b"MATLAB"
 
 
 def read_matlab(path: str | os.PathLike) -> dict[str, Any]:
-    """Read numbers and structures of a MATLAB file: arrays without axes of length 1, and dicts.
+    """Return the variables of a MATLAB file by name: numbers as arrays, structures as dicts.
 
-    Variables of other kinds, and arrays of structures, become None.
+    Arrays lose their axes of length 1. Variables of other kinds, and arrays of structures, become
+    None.
 
     Raises
     ------
     FileFormatError
-        If the file is not one of version 5 to 7, is damaged, claims more than it holds, or is
+        If the file is not of version 5 to 7, is damaged, claims more data than it contains, or is
         larger than memory when unpacked.
     OSError
         If the file cannot be read.
@@ -78,18 +81,18 @@ def read_matlab(path: str | os.PathLike) -> dict[str, Any]:
 
 
 def fields_of(path: str | os.PathLike, *names: str) -> dict[str, Any]:
-    """Read the structure of a MATLAB file, or its variables, that has all these fields.
+    """Return the structure of a MATLAB file, or its variables, with all the given fields.
 
     Raises
     ------
     FileFormatError, OSError
-        As `read_matlab` does, and if there is none, or more than one.
+        As for `read_matlab`, or if no structure or more than one has the fields.
     """
     return only(path, groups(read_matlab(path), *names), *names)
 
 
 def groups(variables: dict[str, Any], *names: str) -> list[dict[str, Any]]:
-    """Return the sets of variables that have all these names: those of the file, or structures."""
+    """Return the groups, the file's variables or its structures, that have all given names."""
     return [
         group
         for group in (variables, *variables.values())
@@ -98,10 +101,10 @@ def groups(variables: dict[str, Any], *names: str) -> list[dict[str, Any]]:
 
 
 def only(path: str | os.PathLike, found: list[dict[str, Any]], *names: str) -> dict[str, Any]:
-    """Return the one structure that was found; raise FileFormatError for none or several."""
+    """Return the only structure that was found; raise FileFormatError for none or several."""
     if len(found) != 1:
         raise FileFormatError(
-            f"{os.fspath(path)} must hold one structure with the fields {', '.join(names)}, got "
+            f"{os.fspath(path)} must contain one structure with the fields {', '.join(names)}, got "
             f"{len(found)}"
         )
     return found[0]
@@ -110,12 +113,12 @@ def only(path: str | os.PathLike, found: list[dict[str, Any]], *names: str) -> d
 def numbers(
     path: str | os.PathLike, group: dict[str, Any], name: str, ndim: int, kinds: str = "iuf"
 ) -> np.ndarray:
-    """Return a field of real numbers, with `ndim` axes; those of length 1 may be missing."""
+    """Return a field of numbers with `ndim` axes, adding missing axes of length 1 at the end."""
     value = np.asarray(group.get(name))
     if value.dtype.kind not in kinds or value.ndim > ndim or not value.size:
-        wanted = "complex" if kinds == "c" else "real"
+        expected = "complex" if kinds == "c" else "real"
         raise FileFormatError(
-            f"{os.fspath(path)} must hold {name} as {wanted} numbers with {ndim} axes, got "
+            f"{os.fspath(path)} must contain {name} as {expected} numbers with {ndim} axes, got "
             f"{value.dtype} of shape {value.shape}"
         )
     return value.reshape(value.shape + (1,) * (ndim - value.ndim))
@@ -137,26 +140,27 @@ def _variables(content: bytes, budget: validate.Budget) -> dict[str, Any]:
 
 
 def _variable(kind: int, body: memoryview, order: str, budget: validate.Budget) -> tuple[str, Any]:
-    """Return name and value of a variable."""
+    """Return the name and value of a variable, which may be compressed."""
     unpacked_bytes = 0
     if kind == _COMPRESSED:
         kind, body = _unpacked(body, order, budget)
         unpacked_bytes = len(body)
     if kind != _MATRIX:
-        raise FileFormatError(f"is damaged: it holds an element of type {kind}")
+        raise FileFormatError(f"is damaged: it contains an element of type {kind}")
     found = _matrix(body, order, 0, budget)
     budget.give_back(unpacked_bytes)
     return found
 
 
 def _unpacked(packed: memoryview, order: str, budget: validate.Budget) -> tuple[int, memoryview]:
-    """Unpack a variable, whose first 8 bytes tell its type and size, if that fits into memory."""
+    """Return the type and contents of a compressed variable, if it fits into memory."""
+    # The first 8 bytes give the type and the size.
     unpacker = zlib.decompressobj()
     kind, size = struct.unpack(f"{order}II", unpacker.decompress(packed, 8))
     with too_large():
         budget.take("unpacking it", size, passing_bytes=size)
     content = unpacker.decompress(unpacker.unconsumed_tail, size) if size else b""
-    # The rest is the checksum.
+    # Only the checksum follows, which the unpacker verifies.
     if unpacker.decompress(unpacker.unconsumed_tail, 1) or not unpacker.eof or len(content) < size:
         raise FileFormatError("is damaged: a variable does not unpack to its size")
     return kind, memoryview(content)
@@ -165,15 +169,15 @@ def _unpacked(packed: memoryview, order: str, budget: validate.Budget) -> tuple[
 def _elements(
     body: memoryview, order: str, budget: validate.Budget
 ) -> list[tuple[int, memoryview]]:
-    """Return type and content of the elements of a matrix."""
+    """Return the type and contents of every element of a matrix."""
     found, place = [], 0
     while place + 8 <= len(body):
         kind, size = struct.unpack_from(f"{order}II", body, place)
         start, place = place + 8, place + 8 + size + -size % 8
-        if kind >> 16:  # a size of up to 4 bytes, which follow within the tag
+        if kind >> 16:  # a short element, whose up to 4 bytes are in the tag
             size, kind, start, place = kind >> 16, kind & 0xFFFF, start - 4, start
         if start + size > min(len(body), place):
-            raise FileFormatError("is damaged: a variable holds less than it claims")
+            raise FileFormatError("is damaged: a variable contains less than it claims")
         found.append((kind, body[start : start + size]))
         if not len(found) % _PARTS:
             with too_large():
@@ -182,9 +186,9 @@ def _elements(
 
 
 def _matrix(body: memoryview, order: str, depth: int, budget: validate.Budget) -> tuple[str, Any]:
-    """Return name and value of a matrix."""
+    """Return the name and value of a matrix."""
     if depth > _DEEPEST:
-        raise FileFormatError(f"must hold at most {_DEEPEST} structures within each other")
+        raise FileFormatError(f"must have at most {_DEEPEST} levels of nested structures")
     parts = _elements(body, order, budget)
     if not parts:
         return "", np.zeros(0)
@@ -222,7 +226,7 @@ def _array(
         )
     with too_large():
         budget.take("reading numbers", count * np.dtype(_CLASSES[kind]).itemsize)
-    # MATLAB's arrays are stored by columns.
+    # MATLAB stores arrays column by column.
     return np.frombuffer(part[1], stored).astype(_CLASSES[kind]).reshape(shape, order="F")
 
 
@@ -232,7 +236,7 @@ def _structure(
     length = struct.unpack_from(f"{order}i", parts[0][1])[0]
     names = bytes(parts[1][1])
     if length < 1 or len(names) // length != len(parts) - 2:
-        raise FileFormatError("is damaged: a structure lacks names or values of its fields")
+        raise FileFormatError("is damaged: a structure lacks names or values of fields")
     fields = [
         names[n : n + length].split(b"\0")[0].decode("latin-1")
         for n in range(0, len(names) // length * length, length)

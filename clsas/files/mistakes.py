@@ -1,4 +1,4 @@
-"""Messages about mistakes in TOML files: each names the table and the key."""
+"""Messages about mistakes in TOML files, each of which names the table and the key."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from clsas.core import validate
 
 _BARE_KEY = re.compile(r"[\w-]{1,100}", re.ASCII)
-# The required kind of value for each of pydantic's error types. Others keep pydantic's words.
+# Required kind of value for pydantic's types of errors. Other errors keep pydantic's message.
 _MUST_BE = {
     "bool_type": "true or false",
     "float_type": "a number",
@@ -24,7 +24,7 @@ _MUST_BE = {
 
 
 def explain(error: ValidationError, tables: dict[str, Any], model: type[BaseModel]) -> list[str]:
-    """Return one line for every key that pydantic refuses.
+    """Return one line of text for every key that pydantic refuses.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def explain(error: ValidationError, tables: dict[str, Any], model: type[BaseMode
         The pydantic model of the whole file.
     """
     lines: dict[tuple, str] = {}
-    musts: dict[tuple, dict[str, None]] = {}  # as ordered sets
+    musts: dict[tuple, dict[str, None]] = {}  # dicts that serve as ordered sets
     mistyped: set[tuple] = set()
     for problem in error.errors(include_url=False):
         kind, path = problem["type"], _path_in(tables, problem["loc"])
@@ -53,7 +53,7 @@ def explain(error: ValidationError, tables: dict[str, Any], model: type[BaseMode
                 else f"table [{table}]"
             )
             lines[path] = f"unknown {unknown}{suggestion(name, allowed)}"
-        else:  # every member of a union of types reports a mistake of its own
+        else:  # for a union of types, pydantic reports one error per member
             musts.setdefault(path, {})[_must_be(problem, path)] = None
             expected = " or ".join(musts[path])
             lines[path] = f"{_key(path)} must be {expected}, got {validate.shown(problem['input'])}"
@@ -69,7 +69,7 @@ def _must_be(problem: Any, path: tuple) -> str:
 
 
 def _path_in(tables: Any, location: Sequence[str | int]) -> tuple[str | int, ...]:
-    """Return the part of pydantic's location that is in the file, without members of unions."""
+    """Return the part of pydantic's location that the file has, without members of unions."""
     for depth, part in enumerate(location):
         try:
             tables = tables[part]
@@ -79,7 +79,7 @@ def _path_in(tables: Any, location: Sequence[str | int]) -> tuple[str | int, ...
 
 
 def _table(path: Sequence[str | int]) -> str:
-    """Return a table's name as the file writes it; repeated tables are counted from 1."""
+    """Return the name of a table as in the file; repeated tables are counted from 1."""
     name = ".".join(str(part) for part in path if isinstance(part, str))
     return f"[[{name}]] number {path[-1] + 1}" if isinstance(path[-1], int) else f"[{name}]"
 
@@ -111,7 +111,7 @@ def _close(name: str, allowed: Sequence[str]) -> list[str]:
 
 
 def suggestion(name: str, allowed: Sequence[str]) -> str:
-    """Return the end of a message about an unknown name: the closest one, or all allowed ones."""
+    """Return the end of a message about an unknown name: the closest or all allowed names."""
     if close := _close(name, allowed):
         return f": did you mean {close[0]!r}?"
     return f"; allowed are {', '.join(allowed)}"

@@ -1,4 +1,4 @@
-"""Phase histories of radar in MATLAB files, as the GOTCHA data set has them."""
+"""Phase histories of radar from MATLAB files, in the layout of the GOTCHA data set."""
 
 from __future__ import annotations
 
@@ -22,26 +22,27 @@ FIELDS = ("fp", "freq", "x", "y", "z", "r0")
 def read_phase_history(
     path: str | os.PathLike, *, window: Window = "none", oversampling: float = 2.0
 ) -> RangeLines:
-    """Read a MATLAB file of motion-compensated radar pulses over frequency.
+    """Return range lines from a MATLAB file of motion-compensated radar pulses over frequency.
 
-    The file holds variables, or one structure, with the fields `fp` [frequencies, pulses], `freq`
-    (Hz), the antenna's positions `x`, `y`, `z` (m) and `r0` (m), the range that each pulse is
-    referenced to: a point at range R gives exp(-j 4 pi freq (R - r0)/c). Autofocus terms (`af`) are
-    not applied.
+    The file contains, as variables or in one structure, the fields `fp` [frequencies, pulses],
+    `freq` (Hz), the positions of the antenna `x`, `y`, `z` (m), and `r0` (m), the range to which
+    each pulse is referenced: a point at range R gives exp(-j 4 pi freq (R - r0)/c). Autofocus terms
+    (`af`) are not applied.
 
     Parameters
     ----------
     path : path-like
-        The file, of MATLAB's version 5 to 7.
+        The file, of MATLAB version 5 to 7.
     window : str, float or tuple
-        Window over the frequencies, as in `from_phase_history`.
+        Window over the frequencies, as for `from_phase_history`.
     oversampling : float
-        Samples per line over frequencies, at least 1.
+        Number of samples per line over the number of frequencies, at least 1.
 
     Returns
     -------
     RangeLines
-        Monostatic lines in the file's coordinates, one period c/(2 step) of range long.
+        Monostatic lines in the coordinates of the file. Their length is one period of range,
+        c/(2 df) for frequency steps of df.
 
     Raises
     ------
@@ -55,13 +56,24 @@ def read_phase_history(
     Warns
     -----
     ClsasWarning
-        If all pings have one position, or the track turns back, so that pings may be out of order.
+        If all pings have the same position, or the track turns back, so that pings may be out of
+        order.
 
     Notes
     -----
-    Reference ranges in float32 are rounded to about 1 mm, or 0.4 rad of phase at 10 GHz. Where they
-    equal the antenna's distance from the origin to that precision, that distance is used: positions
-    are rounded too, but this moves ranges and reference ranges alike and cancels.
+    Reference ranges in float32 are rounded to about 1 mm, or 0.4 rad of phase at 10 GHz. If they
+    equal the distance of the antenna from the origin to that precision, this distance is used
+    instead. It is rounded too, since the positions are, but ranges and reference ranges then have
+    the same error, which cancels.
+
+    See Also
+    --------
+    from_phase_history : Make range lines from arrays.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> lines = clsas.read_phase_history("pass.mat", window="hann")  # doctest: +SKIP
     """
     return phase_history_lines(path, matlab.fields_of(path, *FIELDS), window, oversampling)
 
@@ -72,7 +84,7 @@ def phase_history_lines(
     window: Window = "none",
     oversampling: float = 2.0,
 ) -> RangeLines:
-    """Return range lines of the fields that `read_phase_history` describes."""
+    """Return range lines from the fields that `read_phase_history` describes."""
     samples = matlab.numbers(path, data, "fp", 2, kinds="c").T
     antenna = [matlab.numbers(path, data, axis, 1) for axis in "xyz"]
     frequency = matlab.numbers(path, data, "freq", 1)
@@ -80,9 +92,9 @@ def phase_history_lines(
     pulses, count = samples.shape
     if {len(axis) for axis in (*antenna, reference)} != {pulses} or len(frequency) != count:
         raise FileFormatError(
-            f"{os.fspath(path)} must hold x, y, z and r0 of every pulse and freq of every "
+            f"{os.fspath(path)} must contain x, y, z and r0 for every pulse and freq for every "
             f"frequency, got {len(antenna[0])}, {len(antenna[1])}, {len(antenna[2])}, "
-            f"{len(reference)} and {len(frequency)} for fp of {count} frequencies, {pulses} pulses"
+            f"{len(reference)} and {len(frequency)} for fp [{count} frequencies, {pulses} pulses]"
         )
     antenna_m = np.stack(antenna, axis=-1).astype(np.float64)
     try:
@@ -104,12 +116,12 @@ def phase_history_lines(
 
 
 def _equal_steps(frequency: NDArray) -> tuple[float, float]:
-    """Return first frequency and step of frequencies that are equally spaced but for rounding."""
+    """Return the first of the frequencies and their step, which are equal except for rounding."""
     exact = np.linspace(float(frequency[0]), float(frequency[-1]), len(frequency))
     step = float(exact[-1] - exact[0]) / max(len(exact) - 1, 1)
     rounding = 2 * _rounding(frequency) + 1e-3 * abs(step)
     if not step > 0 or not np.abs(exact - frequency).max() <= rounding:
-        raise FileFormatError("must hold freq in equal, ascending steps")
+        raise FileFormatError("must contain freq in equal, ascending steps")
     return float(exact[0]), step
 
 
@@ -121,7 +133,7 @@ def _reference_m(reference: NDArray, antenna_m: NDArray[np.float64]) -> NDArray[
 
 
 def _rounding(values: NDArray) -> float:
-    """Largest distance between neighbouring numbers of an array's type."""
+    """Return the spacing of numbers in an array's type, at its largest value."""
     if values.dtype.kind != "f":
         return 0.5
     return float(np.spacing(np.abs(values).max()))

@@ -1,4 +1,4 @@
-"""The table `[process]` of scene files: steps from a recording to a focused image."""
+"""Table `[process]` of scene files: steps from a recording to a focused image."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STEPS = ("inspect", "calibrate", "navigate", "focus", "image", "mosaic")
 """Steps of `clsas process`, in the order in which they run."""
 
 CORRECTIONS = ("calibrate", "navigate", "focus")
-"""Steps that correct the lines. They run if their table is there."""
+"""Steps that correct the lines. By default they run if their table exists."""
 
 _USUAL = ("inspect", "image")
 _Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
@@ -84,7 +84,7 @@ class _Focus(Table):
 
 
 class ProcessTable(Table):
-    """The whole table."""
+    """`[process]`."""
 
     lines: str | None = None
     output: str | None = None
@@ -94,7 +94,7 @@ class ProcessTable(Table):
     focus: _Focus | None = None
 
     def build(self, folder: Path) -> dict[str, Any]:
-        """Return paths, steps, and the options of every step."""
+        """Return paths, steps and the options of every step. Paths are relative to `folder`."""
         options: dict[str, Any] = {}
         with located("[process]"):
             for name in ("lines", "output"):
@@ -112,21 +112,21 @@ class ProcessTable(Table):
 
 
 def checked_steps(steps: Sequence[str] | None, options: dict[str, Any]) -> tuple[str, ...]:
-    """Return steps in their order; by default the usual ones, and those with options.
+    """Return steps in order; by default the usual ones and corrections that have options.
 
     Raises
     ------
     TypeError, ValueError
-        If there is no such step, or "calibrate" has no points.
+        If a step is unknown, none is given, or "calibrate" lacks its points.
     """
     if steps is None:
         chosen = {*_USUAL, *(name for name in CORRECTIONS if name in options)}
     else:
         chosen = set(validate.named("steps", steps, STEPS))
     if not chosen:
-        raise ValueError(f"steps must name one or several of {STEPS}, got none")
+        raise ValueError(f"steps must name at least one of {STEPS}, got none")
     if "calibrate" in chosen and "calibrate" not in options:
-        raise ValueError("steps: calibrate needs [process.calibrate] with points_m")
+        raise ValueError("steps may include calibrate only with points_m in [process.calibrate]")
     return tuple(name for name in STEPS if name in chosen)
 
 

@@ -1,7 +1,7 @@
-"""Scene files: sonar, track, targets, seabed, grid and processing from one TOML file.
+"""Scene files: sonar, track, targets, seabed, grid and processing, described in one TOML file.
 
-docs/scene-files.md lists every key. A file is checked as a whole before anything is computed.
-Every message names the file, the table and the key.
+docs/scene-files.md lists all keys. The whole file is checked before anything is computed. Every
+message names the file, the table and the key.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from clsas.simulation.scenes import Scene
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Track
 
-_MOST_MISTAKES = 20  # listed in one message
-_IMAGING = ("grid", "image", "mosaic", "process")  # tables without influence on range lines
+_MOST_MISTAKES = 20  # listed in one message: a plain choice, which fits on a screen
+_IMAGING = ("grid", "image", "mosaic", "process")  # tables that do not affect range lines
 
 
 @dataclass(frozen=True, eq=False)
 class SceneFile:
-    """Contents of a scene file. Tables that the file leaves out are None.
+    """Contents of a scene file. Attributes of missing tables are None or empty.
 
     Attributes
     ----------
@@ -42,14 +42,14 @@ class SceneFile:
     targets : PointTargets, Seabed, or a tuple of both
         From the tables `targets` and `seabed`.
     simulate, compress, image : dict
-        Keyword arguments for `clsas.simulate` and `clsas.compress`, and for `clsas.plan` (one of
-        `PLAN_KEYS`) or `clsas.backproject` (some of `EXACT_KEYS`), either with a `beam`.
+        Keyword arguments for `clsas.simulate`, for `clsas.compress`, and for `clsas.plan` (one of
+        `PLAN_KEYS`) or `clsas.backproject` (any of `EXACT_KEYS`); the latter may include a `beam`.
     mosaic : dict
         Paths that `clsas mosaic` reads (`lines`) and writes (`store`), and its `patches` and
         `memory_mib`.
     process : dict
-        Paths that `clsas process` reads (`lines`) and writes (`output`), its `steps`, and keyword
-        arguments of its steps: `calibrate`, `navigate` and `focus`.
+        Paths that `clsas process` reads (`lines`) and writes (`output`), its `steps`, and the
+        keyword arguments of the steps `calibrate`, `navigate` and `focus`.
     files : dict
         Paths of the files that the scene refers to, by key: "track.file", "grid.height_file",
         "mosaic.lines", "process.lines".
@@ -69,12 +69,12 @@ class SceneFile:
 
     @property
     def request(self) -> dict[str, Any]:
-        """How `[image]` wants an image: one of `PLAN_KEYS`, some of `EXACT_KEYS`, or nothing."""
+        """Request of `[image]`: one of `PLAN_KEYS` or any of `EXACT_KEYS`, or an empty dict."""
         planned = {key: value for key, value in self.image.items() if key in PLAN_KEYS}
         return planned or {key: value for key, value in self.image.items() if key in EXACT_KEYS}
 
     def need(self, *tables: str) -> tuple[Any, ...]:
-        """Return the attributes of these names; raises ValueError if one is missing."""
+        """Return the attributes with the given names; raise ValueError if one is missing."""
         for table in tables:
             if getattr(self, table) is None:
                 missing = "[[targets]] or [seabed]" if table == "targets" else f"[{table}]"
@@ -83,19 +83,19 @@ class SceneFile:
 
 
 def read_scene(path: str | os.PathLike) -> SceneFile:
-    """Read a scene file.
+    """Return the contents of a scene file.
 
     Parameters
     ----------
     path : path-like
-        The TOML file. Relative paths in it begin at its folder.
+        The TOML file. Relative paths in it start from its folder.
 
     Raises
     ------
     ValueError
-        If the file is not TOML; if a key is unknown or missing, has the wrong type or is outside
-        its limits; or if a file that it refers to cannot be read. The message has one line for
-        each of the first 20 mistakes, with the key's path, its value and what is allowed.
+        If the file is not TOML, if a key is unknown, missing, of the wrong type or outside its
+        limits, or if a file that the scene refers to cannot be read. The message has one line for
+        each of the first 20 mistakes, with the key, its value and the allowed values.
     OSError
         If the file cannot be read.
     """
@@ -107,9 +107,10 @@ def parse_scene(text: bytes, *, name: str, folder: Path) -> SceneFile:
     """Return the scene that a TOML text describes; see `read_scene`."""
     try:
         tables = reading.parse_toml(text)
-    except ValueError as error:  # TOML's and UTF-8's
-        kind = "an HDF5 file, not a scene" if text.startswith(b"\x89HDF") else f"not TOML: {error}"
-        raise ValueError(f"{name}: is {kind}") from None
+    except ValueError as error:  # from TOML or UTF-8
+        if text.startswith(b"\x89HDF"):
+            raise ValueError(f"{name}: an HDF5 file, not a scene file") from None
+        raise ValueError(f"{name}: not a TOML file: {error}") from None
     try:
         return SceneFile(name=name, **SceneTables.model_validate(tables).build(folder))
     except ValidationError as error:
@@ -119,13 +120,13 @@ def parse_scene(text: bytes, *, name: str, folder: Path) -> SceneFile:
             lines.append(f"{name}: and {len(mistakes) - _MOST_MISTAKES} more mistakes")
         raise ValueError("\n  ".join(lines)) from None
     except RecursionError:
-        raise ValueError(f"{name}: nested too deep") from None
+        raise ValueError(f"{name}: tables or lists are nested too deeply") from None
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: {error}") from None
 
 
 def simulation_digest(text: bytes, folder: Path) -> str:
-    """Return a digest of everything that a scene's range lines depend on, with clsas's version."""
+    """Return a digest of all that a scene's range lines depend on, including clsas's version."""
     tables = reading.parse_toml(text)
     used = {name: table for name, table in tables.items() if name not in _IMAGING}
     digest = hashlib.sha256(json.dumps([__version__, used], sort_keys=True, default=str).encode())
@@ -135,7 +136,7 @@ def simulation_digest(text: bytes, folder: Path) -> str:
 
 
 def built_in_scene(name: str) -> bytes:
-    """Return the text of a scene file that comes with clsas, such as "thesis_wide_beam"."""
+    """Return the text of a scene file that is part of clsas, such as "thesis_wide_beam"."""
     folder = files("clsas") / "scenes"
     names = sorted(Path(item.name).stem for item in folder.iterdir())
     return (folder / f"{validate.one_of('name', name, names)}.toml").read_bytes()

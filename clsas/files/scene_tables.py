@@ -1,7 +1,7 @@
-"""Tables of scene files: one pydantic model per table, which checks its keys.
+"""Tables of scene files: one pydantic model per table, which checks the keys of the table.
 
-`build` turns a table into an object of the library. The library's own checks then apply; their
-messages get the table's name.
+The method `build` converts a table into an object of the library. Checks of the library then apply,
+and the name of the table is put in front of their messages.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from clsas.sonar.track import Pointing
 
 SEABEDS: dict[str, Callable[..., Seabed]] = {"wreck": wreck, "pipeline": pipeline, "rocks": rocks}
 PLAN_KEYS = ("tolerance_db", "tolerance_wavelengths", "stages")
-"""Keys of `[image]` for `clsas.plan`, which takes one of them."""
+"""Keys of `[image]` for `clsas.plan`, of which one may be given."""
 EXACT_KEYS = ("accuracy_db", "taps", "upsampling")
 """Keys of `[image]` for `clsas.backproject`."""
 
@@ -81,7 +81,9 @@ class _Pointing(Table):
                 depression = validate.number("depression_deg", self.depression_deg, "degrees")
                 return Pointing.scan(np.radians(squint), depression_rad=np.radians(depression))
             if len(self.model_fields_set) > 1:
-                raise ValueError("spot_m must stand alone: it sets the angles")
+                raise ValueError(
+                    "spot_m must be the only key of its table, since it sets the angles"
+                )
             return Pointing.spot(self.spot_m)
 
 
@@ -150,7 +152,9 @@ class _Image(Table):
                     for name in (*PLAN_KEYS, *EXACT_KEYS)
                     if name in options and name != requests[0]
                 ]
-                raise ValueError(f"{requests[0]} must stand alone, got also {', '.join(others)}")
+                raise ValueError(
+                    f"{requests[0]} must be the only request, got also {', '.join(others)}"
+                )
             tolerance_in_db(self.tolerance_db, self.tolerance_wavelengths)
             checked_pairs([(beams, divisions) for beams, divisions in self.stages or ()])
             if self.accuracy_db is not None:
@@ -183,7 +187,9 @@ class _Mosaic(Table):
                         raise ValueError(f"{name} must be a path, got an empty one")
                     options[name] = folder / options[name]
             if "lines" in options and not options["lines"].exists():
-                raise ValueError(f"lines must be a file or folder, there is no {options['lines']}")
+                raise ValueError(
+                    f"lines must be a file or folder, but {options['lines']} does not exist"
+                )
             if self.patches is not None:
                 rows, columns = (validate.count("every entry of patches", n) for n in self.patches)
                 options["patches"] = rows, columns
@@ -193,7 +199,7 @@ class _Mosaic(Table):
 
 
 class SceneTables(Table):
-    """A whole scene file."""
+    """All tables of a scene file."""
 
     sonar: SonarTable | None = None
     track: TrackTable | None = None
@@ -207,12 +213,12 @@ class SceneTables(Table):
     process: ProcessTable = ProcessTable()
 
     def build(self, folder: Path) -> dict[str, Any]:
-        """Return the fields of `clsas.files.scene_files.SceneFile`, without its name.
+        """Return the fields of `clsas.files.scene_files.SceneFile` except the name.
 
         Parameters
         ----------
         folder : Path
-            Where relative paths in the file begin.
+            Folder from which relative paths in the file start.
         """
         parts: list[PointTargets | Seabed] = []
         if self.targets is not None:

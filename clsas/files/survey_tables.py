@@ -27,12 +27,12 @@ class PulseTable(Table):
     taper: float = 0.0
 
     def build(self) -> Pulse:
-        """Return the pulse; raises ValueError if a value is outside its limits."""
+        """Return the pulse; raise ValueError if a value is outside its limits."""
         if self.bandwidth_hz is not None:
             code = self.code if isinstance(self.code, str) else tuple(self.code)
             return Pulse(self.carrier_hz, self.bandwidth_hz, self.duration_s, code, self.taper)
         if isinstance(self.code, str):
-            raise ValueError("missing key 'bandwidth_hz' (only a phase code sets its own)")
+            raise ValueError("missing key 'bandwidth_hz' (only a phase code determines it)")
         return Pulse.phase_code(
             self.carrier_hz, self.duration_s, tuple(self.code), taper=self.taper
         )
@@ -55,12 +55,12 @@ class SonarTable(Table):
     rx_height_m: float | None = None
 
     def build(self) -> Sonar:
-        """Return the sonar; raises ValueError if a value is outside its limits."""
+        """Return the sonar; raise ValueError if a value is outside its limits."""
         with located("[sonar]"):
             if self.preset is not None:
                 others = sorted(self.model_fields_set - {"preset"})
                 if others:
-                    raise ValueError(f"preset must stand alone, got also {', '.join(others)}")
+                    raise ValueError(f"preset must be the only key, got also {', '.join(others)}")
                 validate.one_of("preset", self.preset, PRESETS)
                 return getattr(Sonar, self.preset)()
             if self.pulse is None:
@@ -71,7 +71,9 @@ class SonarTable(Table):
                 case None, int(count), float(spacing):
                     rx = line_array(count, spacing)
                 case _:
-                    raise ValueError("receivers must be given by receivers and spacing_m, or rx_m")
+                    raise ValueError(
+                        "give the receivers by either receivers and spacing_m, or rx_m"
+                    )
         with located("[sonar.pulse]"):
             pulse = self.pulse.build()
         skipped = {"preset", "pulse", "receivers", "spacing_m", "rx_m"}
@@ -80,7 +82,7 @@ class SonarTable(Table):
 
 
 class MotionTable(Table):
-    """Sinusoid in time, or with `random_seed` random motion of the same power."""
+    """Sinusoidal motion, or random motion of the same power if `random_seed` is given."""
 
     period_s: float
     phase_deg: float = 0.0
@@ -94,7 +96,7 @@ class MotionTable(Table):
         if self.random_seed is not None:
             if "phase_deg" in self.model_fields_set:
                 raise ValueError("phase_deg must be left out with random_seed")
-            # Sinusoids of random frequency and phase, none with a shorter period than given.
+            # Sum of sinusoids of random frequency and phase, with periods from period_s upward.
             random = np.random.default_rng(validate.count("random_seed", self.random_seed, least=0))
             frequencies = random.uniform(0.1, 1.0, 32) / period
             phases = random.uniform(0, 2 * np.pi, 32)
@@ -113,7 +115,7 @@ class DisplacementTable(MotionTable):
     amplitude_m: float
 
     def build(self) -> Motion:
-        """Return the displacement as a function of time, metres."""
+        """Return the displacement (m) as a function of time (s)."""
         return self._motion("amplitude_m", "m")
 
 
@@ -123,7 +125,7 @@ class RotationTable(MotionTable):
     amplitude_deg: float
 
     def build(self) -> Motion:
-        """Return the angle as a function of time, radians."""
+        """Return the angle (rad) as a function of time (s)."""
         return self._motion("amplitude_deg", "degrees", np.pi / 180)
 
 
@@ -143,7 +145,7 @@ class TrackTable(Table):
     roll: RotationTable | None = None
 
     def build(self, folder: Path) -> Track:
-        """Return the track; a relative `file` begins at `folder`.
+        """Return the track; a relative path of a `file` starts from `folder`.
 
         Raises
         ------
@@ -153,7 +155,7 @@ class TrackTable(Table):
         if self.file is not None:
             others = sorted(self.model_fields_set - {"file"})
             if others:
-                raise ValueError(f"[track] file must stand alone, got also {', '.join(others)}")
+                raise ValueError(f"[track] file must be the only key, got also {', '.join(others)}")
             with located("[track] file"):
                 try:
                     return read_track(folder / self.file)

@@ -23,7 +23,7 @@ class Table(BaseModel):
 
 @contextmanager
 def located(where: str) -> Iterator[None]:
-    """Prefix the library's own messages with the table of the file, such as "[sonar]"."""
+    """Put the table of the file, such as "[sonar]", in front of the library's messages."""
     try:
         yield
     except (TypeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Tracks from CSV files."""
+"""Reading of tracks from CSV files."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ _ATTITUDE = ("yaw_deg", "pitch_deg", "roll_deg")
 
 
 def read_track(path: str | os.PathLike) -> Track:
-    """Read a track from a CSV file with one line per ping under a line of column names.
+    """Return the track in a CSV file, which has a line of column names and one line per ping.
 
-    The columns, in any order, are time_s, x_m, y_m and z_m. Optional are yaw_deg, pitch_deg and
-    roll_deg (zero by default) and, all three together, vx_m_s, vy_m_s and vz_m_s (by default the
-    derivative of the positions).
+    The columns may be in any order. Required are time_s, x_m, y_m and z_m. Optional are yaw_deg,
+    pitch_deg and roll_deg (0 by default), and all of vx_m_s, vy_m_s and vz_m_s together (by default
+    the derivative of the positions).
 
     Raises
     ------
     ValueError
-        If a column is unknown, missing or repeated, there is no ping, a value is not a finite
-        number, or time does not ascend.
+        If a column is unknown, missing or repeated, if there is no ping, if a value is not a finite
+        number, or if time does not ascend.
     OSError
         If the file cannot be read.
     """
@@ -50,9 +50,9 @@ def read_track(path: str | os.PathLike) -> Track:
     velocity = _VELOCITY if set(names) & set(_VELOCITY) else ()
     for name in (*_POSITION, *velocity, *names):
         if names.count(name) != 1:
-            raise ValueError(f"{path}: column {name!r} must be there once")
+            raise ValueError(f"{path}: column {name!r} must be present once")
     if not rows:
-        raise ValueError(f"{path} must hold at least one ping under the names of columns")
+        raise ValueError(f"{path} must have at least one ping below the names of the columns")
     values = np.empty((len(rows), len(names)))
     for index, (line, row) in enumerate(rows):
         try:

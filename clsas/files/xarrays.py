@@ -1,4 +1,4 @@
-"""Grids, images, range lines and echoes as xarray's arrays: with coordinates, names and units."""
+"""Conversion of grids, images, range lines and echoes to xarray, with coordinates and units."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from clsas.core import validate
 from clsas.core.decibels import largest_amplitude
+from clsas.core.extras import needed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -40,27 +41,28 @@ def to_xarray(obj: Image) -> xarray.DataArray: ...
 @overload
 def to_xarray(obj: Grid | RangeLines | Echoes) -> xarray.Dataset: ...
 def to_xarray(obj: Grid | RangeLines | Image | Echoes) -> xarray.DataArray | xarray.Dataset:
-    """Return an object as an xarray one, with coordinates in metres.
+    """Return an object as an xarray DataArray or Dataset, with coordinates in metres.
 
-    An image becomes a DataArray of its level in dB, relative to its largest amplitude. The complex
-    pixels come along as the coordinates `pixels_real` and `pixels_imag`, since neither pictures
-    nor netCDF take complex numbers: `.plot()` and `.to_netcdf()` work as they are, and
-    `a["pixels_real"] + 1j * a["pixels_imag"]` are the pixels. The amplitude of 0 dB is
+    An image becomes a DataArray of its level in dB, relative to its largest amplitude. Neither
+    pictures nor netCDF accept complex numbers. The complex pixels are therefore split into the
+    coordinates `pixels_real` and `pixels_imag`, so that `.plot()` and `.to_netcdf()` work;
+    `a["pixels_real"] + 1j * a["pixels_imag"]` restores them. The amplitude at 0 dB is
     `attrs["reference"]`.
 
-    A grid becomes a Dataset of coordinates only. Range lines and echoes become Datasets over
-    (channel, sample), whose `samples` are complex as they are.
+    A grid becomes a Dataset that consists of coordinates. Range lines and echoes become Datasets
+    over (channel, sample) with complex `samples`.
 
     Parameters
     ----------
     obj : Grid, RangeLines, Image or Echoes
-        What to convert. Its arrays are shared, not copied.
+        The object. Its arrays are shared, not copied.
 
     Returns
     -------
-    xarray.DataArray of an image, xarray.Dataset of anything else
-        Names and units stand in the attributes `long_name` and `units` after the CF conventions.
-        Numbers that belong to no axis are attributes, with the unit in their name.
+    xarray.DataArray or xarray.Dataset
+        A DataArray for an image, a Dataset for any other object. The attributes `long_name` and
+        `units` follow the CF conventions. Numbers that belong to no axis are attributes, with the
+        unit in their name.
 
     Raises
     ------
@@ -68,11 +70,19 @@ def to_xarray(obj: Grid | RangeLines | Image | Echoes) -> xarray.DataArray | xar
         If xarray is not installed.
     TypeError
         If `obj` is of another type.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> grid = clsas.Grid.plane((-5, 5, 101), (20, 40, 201))
+    >>> data = clsas.to_xarray(grid)
+    >>> dict(data.sizes)
+    {'x': 101, 'y': 201}
+    >>> float(data.y.max()), data.y.units
+    (40.0, 'm')
     """
-    try:
+    with needed("to_xarray"):
         import xarray
-    except ImportError:
-        raise ImportError("to_xarray needs xarray: pip install xarray") from None
     validate.instance("obj", obj, *_KINDS)
     match obj:
         case Grid():
@@ -90,7 +100,7 @@ def _image_to_xarray(xarray: ModuleType, image: Image) -> xarray.DataArray:
         attributes = {"units": "1", "long_name": f"{words} part of the pixels"}
         coordinates[f"pixels_{name}"] = (dims, part, attributes)
     reference = largest_amplitude(image.pixels)
-    told = {
+    of_level = {
         "long_name": "Amplitude re max",
         "units": "dB",
         "reference": reference,
@@ -98,7 +108,7 @@ def _image_to_xarray(xarray: ModuleType, image: Image) -> xarray.DataArray:
         "Conventions": "CF-1.11",
     }
     # DataArray would copy the coordinates; Dataset shares them.
-    level = {"amplitude_db": (dims, image.db(), told)}
+    level = {"amplitude_db": (dims, image.db(), of_level)}
     return xarray.Dataset(level, coordinates)["amplitude_db"]
 
 

@@ -17,7 +17,7 @@ from clsas.signal.echoes import Echoes
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.sampling import Finding
 
-_FARTHEST_M = 1e12
+_FARTHEST_M = 1e3 * validate.FARTHEST_M  # coordinates in mm are reported, not refused
 _SLOWEST_M_S = 1.0  # accepts a sound speed in km/s, so that the checks can report the slip
 
 

@@ -14,6 +14,7 @@ from clsas.core import decibels
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.pings import Transmissions
+from clsas.core.wavelengths import wavelength_between_m
 from clsas.inspection.phase_sign import phase_sign
 from clsas.inspection.result import PhaseSign
 from clsas.opencl.device import Device
@@ -113,11 +114,7 @@ class Recording:
         That is the middle of the band unless it reaches below 0 Hz. The middle of such a band is
         arbitrary: it may be 0 Hz, where the wavelength is infinite.
         """
-        low_hz, high_hz = self.band_hz
-        mean_hz = abs(low_hz + high_hz) / 2
-        if low_hz * high_hz < 0:
-            mean_hz = (low_hz**2 + high_hz**2) / (2 * (high_hz - low_hz))
-        return self.lines.sound_speed_m_s / mean_hz
+        return wavelength_between_m(self.lines, *self.band_hz)
 
     @cached_property
     def levels(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -16,6 +16,7 @@ from clsas.core.decibels import in_db, power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import band_wavelength_m
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
 from clsas.measures.assessment_result import Assessment, Effect
@@ -39,7 +40,7 @@ from clsas.plans.factorization import Factorization
 from clsas.plans.plan import Plan
 from clsas.signal.compression import Window
 from clsas.signal.compression import check_options as check_compression
-from clsas.signal.spectrum import band_wavelength_m, measure_spectrum
+from clsas.signal.spectrum import measure_spectrum
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow

@@ -11,10 +11,11 @@ from clsas.core import validate
 from clsas.core.decibels import in_db
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, some_channels, wavelength_m
+from clsas.core.lines import RangeLines, some_channels
+from clsas.core.wavelengths import band_wavelength_m, cycles_per_m_at, wavelength_m
 from clsas.factorized.surface import surface_of
 from clsas.signal.ambiguity import ends_error
-from clsas.signal.spectrum import band_wavelength_m, cycles_per_m_at, measure_spectrum
+from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import APART, MOTION, RELIEF
 from clsas.sonar.system import Sonar, element_pattern

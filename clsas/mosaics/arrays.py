@@ -1,4 +1,4 @@
-"""Arrays of a store: created, opened after a check of their metadata, compared, and mended."""
+"""Arrays of a store: create, open after a check of the metadata, compare and repair them."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ from clsas.mosaics.metadata import (
     has_height,
 )
 
-_COPIES = 3  # of values in memory: Zarr's, the grid's, and one for its digest
+_COPIES = 3  # copies of coordinates or heights in memory: Zarr's, the grid's, one for the digest
 
 
 def create_store(
     path: Path, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]
 ) -> None:
-    """Create the store of a mosaic in one step, so that a killed process leaves no part of it.
+    """Create the store of a mosaic in one step, so that a killed process leaves no partial store.
 
     Raises
     ------
     OSError
-        If the folder around it cannot be written.
+        If the parent folder cannot be written.
     """
     plane = None
     if grid.points_m is None:
@@ -75,7 +75,7 @@ def open_array(path: Path, attributes: dict[str, Any], name: str) -> zarr.Array:
     Raises
     ------
     DamageError
-        If its metadata are not those of a mosaic, or not those that were written.
+        If the metadata are not those of a mosaic, or differ from those that were written.
     """
     return _opened(path, attributes, name, read_only=True)
 
@@ -92,7 +92,7 @@ def write_pixels(
 
 
 def check_metadata(path: Path, attributes: dict[str, Any]) -> None:
-    """Raise DamageError, which names the array, if the metadata of any array are damaged."""
+    """Raise a DamageError that names the array if the metadata of any array are damaged."""
     for name in forms(attributes, has_height(path, attributes)):
         try:
             _checked(path, attributes, name)
@@ -108,9 +108,9 @@ def compared(
     Returns
     -------
     grid : Grid or None
-        The store's grid, with its heights if they are intact; None if it has arbitrary points.
+        The store's grid, with its heights if they are intact; None for arbitrary points.
     damage : dict of str to str
-        Reasons by the name of the array or group.
+        Reason for each damaged array or group, by its name.
     """
     grid, found = plane_of(attributes), {}
     axes_m = dict(zip("xy", grid.axes_m, strict=True)) if grid and grid.has_axes else {}
@@ -118,7 +118,7 @@ def compared(
         try:
             _checked(path, attributes, name)
             if name in axes_m and not np.array_equal(_values(path, attributes, name), axes_m[name]):
-                raise DamageError("its values are not those of the grid")
+                raise DamageError("its values differ from those of the grid")
             if name == "height" and grid is not None:
                 grid = _raised(grid, _values(path, attributes, name), attributes)
         except DamageError as error:
@@ -130,20 +130,20 @@ def compared(
     return grid, found
 
 
-def mend(path: Path, grid: Grid) -> dict[str, str]:
-    """Write damaged metadata, coordinates and heights anew; add digests where there are none.
+def repair(path: Path, grid: Grid) -> dict[str, str]:
+    """Rewrite damaged metadata, coordinates and heights, and add digests if there are none.
 
     Parameters
     ----------
     path : Path
         The store.
     grid : Grid
-        The grid that it was made with.
+        The grid that the store was made with.
 
     Returns
     -------
     dict of str to str
-        What was damaged, by name.
+        Reason for each array or group that was damaged, by its name.
     """
     attributes = read_document(path)
     with_height = grid.height_m is not None
@@ -157,7 +157,7 @@ def mend(path: Path, grid: Grid) -> dict[str, str]:
             _create_arrays(new, grid, (rows, columns))
             write_attributes(new / GROUP, {})
             for name in found:
-                # Chunks of pixels and records of patches stay.
+                # Replace the metadata alone, since the chunks of pixels and the records must stay.
                 keeps = name in ("pixels", GROUP)
                 _exchange(path, f"{name}/zarr.json" if keeps else name, new, old)
     if found or DIGESTS not in attributes:
@@ -167,7 +167,7 @@ def mend(path: Path, grid: Grid) -> dict[str, str]:
 
 
 def _exchange(path: Path, name: str, new: Path, old: Path) -> None:
-    """Move a file or folder of a store into a folder `old`, and that of `new` to its place."""
+    """Move a part of a store into `old`, and its replacement from `new` to its place."""
     target = path / name
     check_own(path, target.parent)
     make_folders(target.parent)
@@ -198,7 +198,7 @@ def _opened(path: Path, attributes: dict[str, Any], name: str, *, read_only: boo
 
 
 def _values(path: Path, attributes: dict[str, Any], name: str) -> NDArray[np.float64]:
-    """Return coordinates or heights; raise DamageError if they cannot be read."""
+    """Return the values of coordinates or heights; raise DamageError if they cannot be read."""
     array = open_array(path, attributes, name)
     validate.memory(f"{name} in {path}", _COPIES * 8 * math.prod(array.shape))
     try:
@@ -208,20 +208,20 @@ def _values(path: Path, attributes: dict[str, Any], name: str) -> NDArray[np.flo
 
 
 def _raised(plane: Grid, height_m: NDArray[np.float64], attributes: dict[str, Any]) -> Grid:
-    """Return a grid with heights; raise DamageError if they are not those that were written."""
+    """Return a grid with heights; raise DamageError if they differ from what was written."""
     try:
         grid = plane.with_height(height_m)
     except ValueError as error:
-        raise DamageError(f"its values are no heights: {error}") from error
+        raise DamageError(f"its values are not heights: {error}") from error
     if grid_digest(grid) != attributes["inputs"].get("grid"):
-        raise DamageError("its values are not those that were written")
+        raise DamageError("its values differ from those that were written")
     return grid
 
 
 def _create_arrays(path: Path, grid: Grid, patch_shape: tuple[int, int]) -> None:
-    """Create the arrays of a mosaic: pixels, all zero, and coordinates."""
+    """Create the arrays of a mosaic: pixels, all zero, coordinates and heights."""
     files = DurableStore(path)
-    # No compression, since noise does not compress; only a checksum behind every chunk.
+    # Noise does not compress, so the only codec is a checksum behind every chunk.
     checksum = Crc32cCodec()
     names = ("y", "x") if grid.has_axes else ("row", "column")
     zarr.create_array(

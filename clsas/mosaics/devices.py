@@ -22,13 +22,13 @@ from clsas.opencl.device import (
     open_device,
 )
 
-_MOST_WORKERS = 1024  # of one machine, that share its devices evenly
-_THREAD = threading.local()  # holds each thread's `device`
+_MOST_WORKERS = 1024  # on one machine: arbitrary, and more than any machine runs
+_THREAD = threading.local()  # its `device` is that of the thread
 _CLAIMING = threading.Lock()
 
 
 def open_devices(request: Any) -> tuple[Device, ...]:
-    """Return the devices that work side by side.
+    """Return the devices that form patches side by side.
 
     Parameters
     ----------
@@ -58,14 +58,14 @@ def open_devices(request: Any) -> tuple[Device, ...]:
 
 
 def default_devices() -> list[DeviceInfo]:
-    """Return all GPUs if there are several and none is chosen, else the chosen device."""
+    """Return all GPUs if there are several and the user chose none, else the chosen device."""
     first, _ = choose()
     alike = [info for info in list_devices() if info.kind == first.kind == "gpu"]
     return [first] if len(alike) < 2 or os.environ.get(ENVIRONMENT_VARIABLE) else alike
 
 
 def device_threads(workers: int, devices: Sequence[Device]) -> ThreadPoolExecutor:
-    """Return a pool of threads, each of which takes one of the devices."""
+    """Return a pool of threads, each of which takes a device of its own."""
     free: queue.SimpleQueue[Device] = queue.SimpleQueue()
     for device in devices:
         free.put(device)
@@ -85,17 +85,17 @@ def process_device() -> Device:
 
 @lru_cache(maxsize=1)
 def claim_device() -> tuple[DeviceInfo, int | None]:
-    """Claim a device for this process; return it and a locked file that marks the claim.
+    """Claim a device for this process; return it and the descriptor of the file that is locked.
 
-    Each worker process on this machine takes the next of the devices. If there are more workers
-    than devices, they share.
+    Each worker process on this machine takes the next device. If there are more workers than
+    devices, they share them evenly.
     """
     import fcntl
 
     devices = default_devices()
     for slot in range(_MOST_WORKERS):
         path = Path(tempfile.gettempdir()) / f"clsas-{os.getuid()}-worker-{slot}"
-        with contextlib.suppress(OSError):  # another worker's, or another user's
+        with contextlib.suppress(OSError):  # it is another worker's or another user's
             lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,7 +1,7 @@
 """Documents of a store: JSON attributes of Zarr groups, with checksums.
 
-The store's own document describes the mosaic and what it was made with. Every finished patch has
-one more (`clsas.mosaics.record`).
+The store's own document describes the mosaic and the inputs that it was made with. Every finished
+patch has a document too, its record (`clsas.mosaics.record`).
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ import json
 import os
 import tempfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from clsas.core import validate
 from clsas.core.atomic import make_folders, replacing
 from clsas.core.grid import Grid
 from clsas.core.reading import parse_json, read_bytes
@@ -21,15 +22,14 @@ from clsas.core.reading import parse_json, read_bytes
 CHECKSUM = "crc32"
 """Attribute with the checksum of all others."""
 
-
 FORMAT = "clsas mosaic"
 VERSION = 2  # version 1 had no checksums
 
 DIGESTS = "metadata"
-"""Attribute with a digest of every array's metadata. Early stores do not have it."""
+"""Attribute with a digest of every array's metadata. Stores of early versions lack it."""
 
 VECTORS = "origin_m", "row_step_m", "column_step_m"
-"""Vectors that make the plane of a grid."""
+"""Vectors that define the plane of a grid."""
 
 
 class DamageError(ValueError):
@@ -58,19 +58,19 @@ def read_attributes(folder: Path) -> dict[str, Any]:
 
 
 def is_there(path: Path) -> bool:
-    """Return whether there is anything at the path of a store."""
+    """Return whether the path of a store exists and is not an empty folder."""
     return path.exists() and not (path.is_dir() and not any(path.iterdir()))
 
 
 def check_place(path: Path) -> None:
-    """Raise an error unless a mosaic is at a path, or nothing yet and one can be created.
+    """Check that a path contains a mosaic, or nothing yet and a mosaic can be created there.
 
     Raises
     ------
     ValueError
-        If the path holds something else, or a damaged mosaic.
+        If the path contains something else, or a damaged mosaic.
     OSError
-        If it cannot be written.
+        If the path cannot be written.
     """
     if is_there(path):
         read_document(path)
@@ -81,15 +81,15 @@ def check_place(path: Path) -> None:
 
 
 def check_own(store: Path, folder: Path) -> None:
-    """Raise ValueError if a folder of a store, to be written, is elsewhere by a symbolic link.
+    """Raise ValueError if a symbolic link leads a folder of a store to another place.
 
-    A stranger's store could otherwise let a run write into any folder of its user.
+    Otherwise a store that comes from a stranger could make a run write into any folder of the user.
     """
     own = Path(os.path.realpath(store)) / folder.relative_to(store)
     if Path(os.path.realpath(folder)) != own:
         raise ValueError(
-            f"{folder} must be a folder of its own to be written, and not lead elsewhere by a "
-            "symbolic link"
+            f"{folder} must be a real folder of the store, but a symbolic link leads elsewhere: "
+            "nothing is written through it"
         )
 
 
@@ -108,7 +108,7 @@ def with_checksum(attributes: dict[str, Any]) -> dict[str, Any]:
 
 
 def canonical(values: Mapping[str, Any]) -> bytes:
-    """Return values as JSON that is the same whatever their order, for checksums and digests."""
+    """Return values as JSON that does not depend on their order, for checksums and digests."""
     return json.dumps(values, sort_keys=True, separators=(",", ":")).encode()
 
 
@@ -123,7 +123,7 @@ def read_document(path: Path) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        If the path holds something else, a mosaic of another version, or a damaged one.
+        If the path contains something else, a mosaic of another version, or a damaged one.
     """
     try:
         attributes = read_attributes(path)
@@ -133,12 +133,12 @@ def read_document(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} exists and is not a mosaic of clsas")
     if attributes.get("version") != VERSION:
         raise ValueError(
-            f"{path} is a mosaic of version {attributes.get('version')}, this clsas works "
-            f"with version {VERSION}: give it another path"
+            f"{path} is a mosaic of version {attributes.get('version')}, but this clsas works "
+            f"with version {VERSION}: choose another path"
         )
     if not is_intact(attributes):
         raise ValueError(f"{path} is damaged: its attributes do not match their checksum")
-    if not is_complete(attributes):
+    if not _is_complete(attributes):
         raise ValueError(f"{path} is damaged: its attributes are not those of a mosaic")
     return attributes
 
@@ -151,14 +151,41 @@ def plane_of(attributes: Mapping[str, Any]) -> Grid | None:
     return Grid.oriented(**stored, shape=tuple(attributes["inputs"]["pixels"]))
 
 
-def is_complete(attributes: dict[str, Any]) -> bool:
-    """Return whether attributes are those of a mosaic, and of the right types."""
-    inputs, grid = attributes.get("inputs"), attributes.get("grid", ())
+def check_inputs(inputs: Any, shape: Sequence[int] | None) -> None:
+    """Check the inputs of a mosaic.
+
+    Parameters
+    ----------
+    inputs : dict
+        The inputs, as `clsas.mosaics.provenance.inputs_of` returns them.
+    shape : (rows, columns) or None
+        Shape of the grid, which the number of pixels must equal; None for any shape.
+
+    Raises
+    ------
+    TypeError
+        If `inputs` are not a dict.
+    ValueError
+        If the list of parts or the number of pixels is missing or wrong.
+    """
+    validate.instance("inputs", inputs, dict)
+    parts, pixels = inputs.get("parts"), inputs.get("pixels")
+    if not isinstance(parts, list):
+        raise ValueError(f"inputs must have a list 'parts', got {validate.shown(parts)}")
+    if not _is_shape(pixels) or (shape is not None and pixels != list(shape)):
+        expected = "of two numbers" if shape is None else f"{list(shape)}, the shape of the grid"
+        raise ValueError(f"inputs must have 'pixels' {expected}, got {validate.shown(pixels)}")
+
+
+def _is_complete(attributes: dict[str, Any]) -> bool:
+    """Return whether attributes have all entries of a mosaic, of the required types."""
+    grid = attributes.get("grid", ())
+    try:
+        check_inputs(attributes.get("inputs"), None)
+    except (TypeError, ValueError):
+        return False
     if not (
-        isinstance(inputs, dict)
-        and isinstance(inputs.get("parts"), list)
-        and _is_shape(inputs.get("pixels"))
-        and _is_shape(attributes.get("patch_shape"))
+        _is_shape(attributes.get("patch_shape"))
         and isinstance(attributes.get(DIGESTS, {}), dict)
         and (grid is None or (isinstance(grid, dict) and grid.keys() == set(VECTORS)))
     ):

@@ -27,7 +27,8 @@ class DurableStore(LocalStore):
     Attributes
     ----------
     known : dict of str to bytes
-        Documents that Zarr is given as they are here, whatever the folder holds by now.
+        Contents of documents that Zarr receives from here instead of reading them from the folder,
+        which may have changed since they were checked.
     chunk_bytes : int or None
         Size of every chunk's file; None while arrays are created.
     """
@@ -50,7 +51,7 @@ class DurableStore(LocalStore):
         await asyncio.to_thread(self.set_sync, key, value)
 
     def set_sync(self, key: str, value: Buffer) -> None:
-        """Write a chunk or document. Some versions of Zarr call this method directly."""
+        """Write a chunk or document. Some versions of Zarr call this method instead of `set`."""
         self._check_writable()
         path = Path(self.root) / key
         check_own(Path(self.root), path.parent)
@@ -61,7 +62,7 @@ class DurableStore(LocalStore):
     async def get(
         self, key: str, prototype: BufferPrototype | None = None, *options: Any, **named: Any
     ) -> Buffer | None:
-        """Read a chunk or document; raise ValueError if it is a pipe or a device, or too large."""
+        """Read a chunk or document; raise ValueError if it is not an ordinary file of its size."""
         if key in self.known:
             return _buffer(prototype, self.known[key])
         self._check(key)
@@ -70,7 +71,7 @@ class DurableStore(LocalStore):
     def get_sync(
         self, key: str, *options: Any, prototype: BufferPrototype | None = None, **named: Any
     ) -> Buffer | None:
-        """Read a chunk or document. Some versions of Zarr call this method directly."""
+        """Read a chunk or document. Some versions of Zarr call this method instead of `get`."""
         if key in self.known:
             return _buffer(prototype, self.known[key])
         self._check(key)
@@ -78,13 +79,13 @@ class DurableStore(LocalStore):
 
     def _check(self, key: str) -> None:
         path = Path(self.root) / key
-        with suppress(OSError):  # no file: a chunk of zeros
+        with suppress(OSError):  # a missing file is a chunk of zeros
             check_ordinary(path)
             size = path.stat().st_size
             if self.chunk_bytes is not None and size != self.chunk_bytes:
                 raise ValueError(f"{path} must have {self.chunk_bytes} bytes, got {size}")
 
-    # Zarr's base class implements this with `set`.
+    # LocalStore writes the file itself; the method of the base class calls `set`.
     set_if_not_exists = Store.set_if_not_exists
 
 

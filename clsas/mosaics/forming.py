@@ -32,26 +32,27 @@ from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches
 
-_WORTH_A_PLAN = 5e7  # pixels times channels; smaller patches are backprojected in less time
+# Pixels times channels. Backprojecting a smaller patch takes less time than planning it.
+_WORTH_A_PLAN = 5e7
 _OPENING = threading.Lock()
-_LATEST: list[Survey] = []  # the survey that this process opened last
+_LATEST: list[Survey] = []  # at most one entry: the survey that this process opened last
 
 StampedFiles = tuple[tuple[Path, tuple[int, int]], ...]
-"""Files of a survey, with their sizes and times of change."""
+"""Files of a survey, each with its size in bytes and time of change in ns."""
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """Settings shared by all patches. Pickled with every task, so it holds no samples.
+    """Settings shared by all patches. They are pickled with every task and include no samples.
 
     Attributes
     ----------
     files : tuple of (Path, (int, int))
         Files from which a worker process opens the survey.
     local : SurveyVisibility or None
-        The survey, where patches are formed in this process.
+        The survey if patches are formed in this process, else None.
     request : dict
-        One of `REQUESTS`.
+        One of `REQUESTS` with its value.
     beam : BeamWindow or None
     memory_bytes : int
         Memory of one patch.
@@ -66,9 +67,12 @@ class Job:
     store: Path | None
 
     def accuracy_db(self, pairs: int) -> float | None:
-        """Accuracy of exact imaging, dB, or None if the patch is to be planned.
+        """Return the accuracy of exact imaging, dB, or None if the patch needs a plan.
 
-        `pairs` is the number of pixels times the number of channels.
+        Parameters
+        ----------
+        pairs : int
+            Number of pixels times number of channels.
         """
         if "accuracy_db" in self.request:
             return self.request["accuracy_db"]
@@ -77,7 +81,7 @@ class Job:
         return tolerance_in_db(*(self.request.get(name) for name in REQUESTS[:2]))
 
     def visibility(self) -> SurveyVisibility:
-        """Return the survey. A worker process opens its files when their number changes.
+        """Return the survey. A worker process opens the files again if their number has changed.
 
         Raises
         ------
@@ -90,7 +94,9 @@ class Job:
             beam = None if self.beam is None else beam_json(self.beam)
             found = open_visibility(self.files, beam)
         if found.survey.stamps != tuple(stamp for _, stamp in self.files):
-            raise ValueError("source must not change while a mosaic is formed: a file of it did")
+            raise ValueError(
+                "source must not change while a mosaic is formed, but a file of it did"
+            )
         return found
 
     def opened_store(self) -> Store | None:
@@ -99,15 +105,15 @@ class Job:
 
 
 def stamped_files(survey: Survey) -> StampedFiles:
-    """Return the files of a survey for `Job.files`."""
+    """Return the files of a survey with their stamps, for `Job.files`."""
     pairs = zip(survey.parts, survey.stamps, strict=True)
     return tuple((part, stamp) for part, stamp in pairs if isinstance(part, Path))
 
 
 @lru_cache(maxsize=2)
 def open_visibility(files: StampedFiles, beam: str | None) -> SurveyVisibility:
-    """Open a survey's files in a worker process; `beam` is JSON."""
-    # If the survey has grown, only the new files are opened.
+    """Return a survey that a worker process opens; `beam` is JSON, which can be hashed."""
+    # If files have been added to the survey, open only these.
     before = next((s for s in _LATEST if files[: len(s.parts)] == stamped_files(s)), None)
     survey = open_files(tuple(path for path, _ in files), before)
     _LATEST[:] = [survey]
@@ -121,12 +127,12 @@ def form_patch(job: Job, window: PatchWindow) -> tuple[Record, Image | None]:
     -------
     record : Record
     image : Image or None
-        None if another process runs this: it reads the pixels from the store.
+        None in a worker process: the main process then reads the pixels from the store.
 
     Raises
     ------
     ValueError
-        As imaging does, with the patch's row and column.
+        If the patch cannot be imaged; the message begins with its row and column.
     """
     try:
         device = process_device() if job.local is None else thread_device()
@@ -143,7 +149,7 @@ def form_patch(job: Job, window: PatchWindow) -> tuple[Record, Image | None]:
 def _image(
     job: Job, visibility: SurveyVisibility, grid: Grid, device: Device
 ) -> tuple[Record, Image]:
-    """Image one patch, and record how."""
+    """Return the image of one patch and the record of how it was formed."""
     start = time.perf_counter()
     survey, visible = visibility.survey, visibility.channels(grid)
     known: dict[str, Any] = {
@@ -172,7 +178,7 @@ def _image(
     _check_memory(job, lines, grid)
     image, how = _formed(job, lines, grid, beam, device)
     if beam is not None and beam.normalise:
-        # The beam normalised by the channels of this patch instead of all.
+        # The beam was normalised by the number of channels of this patch instead of all channels.
         scale = np.float32(survey.channels / lines.channels)
         image = Image(scale * image.pixels, grid) if scale != 1 else image
     known |= how | {
@@ -185,7 +191,7 @@ def _image(
 def _formed(
     job: Job, lines: RangeLines, grid: Grid, beam: BeamWindow | None, device: Device
 ) -> tuple[Image, dict[str, Any]]:
-    """Return the image of some lines, and what its record says about the method."""
+    """Return the image of some lines, and the fields of its record that describe the method."""
     patch_bytes = host_bytes(lines.channels, lines.length, grid.size)
     accuracy_db = job.accuracy_db(lines.channels * grid.size)
     if accuracy_db is not None:
@@ -193,7 +199,7 @@ def _formed(
         preparation.warn_of_ambiguity()
         error_db = max(accuracy_db, preparation.predicted_error_db)
         how = {"predicted_error_db": error_db, "memory_bytes": patch_bytes}
-        return execute(preparation, warned=True), how  # records say which patches are zero
+        return execute(preparation, warned=True), how  # the record reports if the patch is zero
     before = time.perf_counter()
     available = min(job.memory_bytes - patch_bytes, device.info.memory_bytes // 2)
     found = planned(lines, grid, **job.request, beam=beam, device=device, memory_bytes=available)
@@ -212,7 +218,7 @@ def _formed(
 
 
 def _check_memory(job: Job, lines: RangeLines, grid: Grid) -> None:
-    """Raise ValueError if lines and pixels of a patch alone take all of its memory."""
+    """Raise ValueError if the lines and pixels of a patch alone exceed its memory."""
     patch_bytes = host_bytes(lines.channels, lines.length, grid.size)
     if patch_bytes >= job.memory_bytes:
         raise ValueError(
@@ -228,7 +234,7 @@ def _empty(grid: Grid) -> Image:
 
 
 def _without_directions(chosen: Plan) -> Plan:
-    """Return a plan without the beam's directions, which would take most of a record."""
+    """Return a plan without the beam's directions, which would be most of a record."""
     if chosen.beam is None:
         return chosen
     return replace(chosen, beam=replace(chosen.beam, along=None))

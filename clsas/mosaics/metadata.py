@@ -1,8 +1,8 @@
-"""Metadata of a store's arrays: what they may say, and digests of them.
+"""Metadata of a store's arrays: which are accepted, and their digests.
 
-Zarr decodes an array as its metadata say, and some decoders run code that the array holds. Stores
-come from strangers too. So metadata are read and checked here, and Zarr is given only those that
-describe an array as clsas writes it.
+Zarr decodes an array as its metadata specify, and some decoders run code contained in the array.
+Since a store may come from a stranger, its metadata are read and checked here, and passed on to
+Zarr only if they describe an array as clsas writes it.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from clsas.core.reading import parse_json, read_bytes
 from clsas.mosaics.documents import DIGESTS, DamageError, canonical, plane_of, read_attributes
 
 GROUP = "patches"
-"""Group of the records, which has no attributes of its own."""
+"""Name of the group that contains the records; the group has no attributes of its own."""
 
 _ITEM_BYTES = {"complex64": 8, "float64": 8}
 CHECKSUM_BYTES = 4
-"""Size of the checksum behind every chunk."""
+"""Size in bytes of the checksum behind every chunk."""
 
 _CODECS = [("bytes", {"endian": "little"}), ("crc32c", {})]
 _KEYS = {
@@ -33,7 +33,7 @@ _KEYS = {
 
 @dataclass(frozen=True)
 class Form:
-    """What an array has to be.
+    """Required type and shape of an array.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Form:
         "complex64" or "float64".
     shape : tuple of int
     chunk_shape : tuple of int or None
-        None if Zarr has chosen it.
+        Shape of a chunk, or None if Zarr chose it.
     """
 
     data_type: str
@@ -51,16 +51,16 @@ class Form:
 
 @dataclass(frozen=True)
 class Checked:
-    """Metadata of an array that is as it has to be.
+    """Metadata of an array that have passed the check.
 
     Attributes
     ----------
     text : bytes
-        What was read and checked.
+        Contents of the metadata file that was checked.
     chunk_bytes : int
         Size of the file of every chunk.
     digest : str
-        Digest of what the text says, whatever its layout.
+        Digest of the metadata, which does not depend on the layout of the text.
     """
 
     text: bytes
@@ -69,7 +69,7 @@ class Checked:
 
 
 def forms(attributes: Mapping[str, Any], has_height: bool) -> dict[str, Form]:
-    """Return what the arrays of a store have to be, by name."""
+    """Return the required form of every array of a store, by its name."""
     rows, columns = attributes["inputs"]["pixels"]
     found = {"pixels": Form("complex64", (rows, columns), tuple(attributes["patch_shape"]))}
     plane = plane_of(attributes)
@@ -87,18 +87,18 @@ def has_height(path: Path, attributes: Mapping[str, Any]) -> bool:
 
 
 def checked(path: Path, name: str, form: Form, digest: str | None) -> Checked:
-    """Read the metadata of an array of a store, and check them.
+    """Return the metadata of an array of a store after checking them.
 
     Parameters
     ----------
     path : Path
         The store.
     name : str
-        The array.
+        Name of the array.
     form : Form
-        What the array has to be.
+        Required type and shape of the array.
     digest : str or None
-        Expected digest, where there is one.
+        Expected digest, or None if the store has none.
 
     Raises
     ------
@@ -109,14 +109,14 @@ def checked(path: Path, name: str, form: Form, digest: str | None) -> Checked:
         text = read_bytes(path / name / "zarr.json")
         metadata = parse_json(text)
     except FileNotFoundError as error:
-        raise DamageError("its metadata are gone") from error
+        raise DamageError("its metadata are missing") from error
     except PermissionError:
         raise
     except (OSError, ValueError) as error:
         raise DamageError(f"its metadata cannot be read: {error}") from error
-    wrong = _difference(metadata, form)
-    if wrong:
-        raise DamageError(f"its metadata are not those of a mosaic: {wrong}")
+    difference = _difference(metadata, form)
+    if difference:
+        raise DamageError(f"its metadata are not those of a mosaic: {difference}")
     found = digest_of(metadata)
     if digest is not None and found != digest:
         raise DamageError("its metadata do not match their digest")
@@ -125,7 +125,7 @@ def checked(path: Path, name: str, form: Form, digest: str | None) -> Checked:
 
 
 def check_group(path: Path) -> None:
-    """Raise DamageError unless the group of the records is as it was written."""
+    """Raise DamageError if the group of the records differs from what was written."""
     try:
         attributes = read_attributes(path / GROUP)
     except PermissionError:
@@ -142,9 +142,9 @@ def digest_of(metadata: Mapping[str, Any]) -> str:
 
 
 def _difference(metadata: Any, form: Form) -> str | None:
-    """Return what in an array's metadata is not as clsas writes it, or None."""
+    """Return the first difference of metadata from what clsas writes, in words, or None."""
     if not isinstance(metadata, dict):
-        return "they are no table"
+        return "they are not a table"
     if metadata.keys() - _KEYS:
         return f"{sorted(metadata.keys() - _KEYS)[0]!r} is unknown"
     chunks = _named(metadata.get("chunk_grid"))
@@ -152,7 +152,7 @@ def _difference(metadata: Any, form: Form) -> str | None:
     codecs = metadata.get("codecs")
     codecs = [_named(codec) for codec in codecs] if isinstance(codecs, list) else None
     zero = [0.0, 0.0] if form.data_type == "complex64" else 0.0
-    right = {
+    matches = {
         "zarr_format": metadata.get("zarr_format") == 3,
         "node_type": metadata.get("node_type") == "array",
         "data_type": metadata.get("data_type") == form.data_type,
@@ -165,11 +165,11 @@ def _difference(metadata: Any, form: Form) -> str | None:
         "attributes": isinstance(metadata.get("attributes", {}), dict),
         "dimension_names": _are_names(metadata.get("dimension_names"), len(form.shape)),
     }
-    return next((f"{name} is another" for name, is_right in right.items() if not is_right), None)
+    return next((f"{name} differs" for name, is_same in matches.items() if not is_same), None)
 
 
 def _named(part: Any) -> tuple[str, Any] | None:
-    """Return name and configuration of a part of metadata, or None if it has none."""
+    """Return the name and configuration of a part of metadata, or None if it has no name."""
     if isinstance(part, str):
         return part, {}
     if isinstance(part, dict) and part.keys() <= {"name", "configuration"} and "name" in part:
@@ -178,7 +178,7 @@ def _named(part: Any) -> tuple[str, Any] | None:
 
 
 def _fits(configuration: Any, form: Form) -> bool:
-    """Return whether chunks are those of a form."""
+    """Return whether the chunks agree with a form."""
     if not isinstance(configuration, dict) or configuration.keys() != {"chunk_shape"}:
         return False
     shape = configuration["chunk_shape"]

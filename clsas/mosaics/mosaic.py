@@ -2,7 +2,7 @@
 
 Every patch is planned and imaged by itself, from the channels and samples that it needs. A patch in
 a store (`clsas.mosaics.store`) is finished once it has a record, which is written after its pixels.
-A mosaic that was interrupted continues with the patches that are not finished.
+If a mosaic is interrupted, the next run forms only the patches that are not finished.
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,27 +21,25 @@ from clsas.core import reprs, validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.exact.backprojection import BEST_ACCURACY_DB
+from clsas.mosaics.arguments import beam_of_growing, check_client, checked_growth, checked_request
 from clsas.mosaics.devices import open_devices
 from clsas.mosaics.forming import Job
 from clsas.mosaics.patches import Layout, choose_patch_shape, patch_shape_of
-from clsas.mosaics.provenance import REQUESTS, inputs_of
+from clsas.mosaics.provenance import inputs_of
 from clsas.mosaics.record import PatchIndex, Record, describe_damage
-from clsas.mosaics.scheduling import Growth, Run, form_patches, wait_for_first_file
+from clsas.mosaics.scheduling import Run, form_patches, wait_for_first_file
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import open_survey
 from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import Device
-from clsas.planning.planner import TOLERANCE_DB, checked_pairs, tolerance_in_db
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import warn_unreached
-from clsas.sonar.directions import MOST_TRACK_PINGS
 
 if TYPE_CHECKING:
     from distributed import Client
 
 MEMORY_BYTES = 1 << 30
-"""Default memory of one patch."""
+"""Default memory of one patch: a plain choice, which suits laptops and small GPUs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +51,7 @@ class Patch:
     row, column : int
         Index of the patch.
     rows, columns : slice
-        Pixels of the mosaic's grid that the patch has.
+        Pixels of the mosaic's grid that belong to the patch.
     grid : Grid
         Grid of these pixels.
     record : Record
@@ -82,11 +79,19 @@ class Patch:
 
     @property
     def image(self) -> Image:
-        """The pixels. They are read from the store if another process formed them."""
+        """Image of the patch. It is read from the store if another process formed it.
+
+        Raises
+        ------
+        ValueError
+            If the patch in the store is damaged.
+        OSError
+            If the store cannot be read.
+        """
         if self._formed is not None:
             return self._formed
         if self._store is None:
-            raise RuntimeError("a patch without its pixels belongs to a store")
+            raise RuntimeError("the patch has neither pixels nor a store to read them from")
         return Image(self._store.read(self.rows, self.columns), self.grid)
 
 
@@ -94,23 +99,28 @@ class Patch:
 class Mosaic:
     """An image of any size, to be formed patch by patch or, with `image`, as a whole.
 
-    Iteration yields every `Patch` as soon as it is finished. A second iteration forms only the
-    patches that the store does not have.
+    Iterating over the mosaic yields every `Patch` as soon as it is finished. A second iteration
+    forms only the patches that the store lacks.
 
-    A mosaic pickles, with its lines unless they are in files. The process that reads it opens
-    devices of the same names. A mosaic with a client does not pickle, since the connection belongs
-    to this process.
+    A mosaic can be pickled, together with its lines unless they are in files. The process that
+    unpickles it opens devices of the same names. A mosaic with a client cannot be pickled, since
+    the connection belongs to this process.
 
     Attributes
     ----------
     grid : Grid
         Grid of the whole mosaic.
     patch_shape : (rows, columns)
-        Pixels of a patch; patches at the end may be smaller.
+        Number of pixels of a patch; the last patches along each axis may be smaller.
     shape : (rows, columns)
         Number of patches.
     finished : dict of (row, column) to Record
-        Patches in the store.
+        Records of the finished patches in the store.
+
+    See Also
+    --------
+    mosaic : Prepare a mosaic.
+    Store : Read a mosaic from its store.
     """
 
     grid: Grid
@@ -119,7 +129,7 @@ class Mosaic:
     _run: Run
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the fields to pickle; devices are opened anew by the process that reads them.
+        """Return the fields to pickle; the process that unpickles them opens the devices again.
 
         Raises
         ------
@@ -128,13 +138,13 @@ class Mosaic:
         """
         if self._run.client is not None:
             raise TypeError(
-                "a mosaic with a client cannot be pickled, since its connection belongs to this "
-                "process: make the mosaic where it is needed, with the same source and store"
+                "a mosaic with a client cannot be pickled, since the connection belongs to this "
+                "process: call clsas.mosaic where it is needed, with the same source and store"
             )
         return self.__dict__
 
     def __repr__(self) -> str:
-        """Return the patches, how many of them are finished, the store and the extents."""
+        """Return the number of patches and of finished ones, the store and the extents."""
         store = self._run.job.store
         return reprs.summary(
             self,
@@ -150,7 +160,7 @@ class Mosaic:
         return self._run.layout.shape
 
     def __len__(self) -> int:
-        """Return the number of all patches."""
+        """Return the number of patches, finished or not."""
         return len(self._run.layout)
 
     def __iter__(self) -> Iterator[Patch]:
@@ -159,7 +169,7 @@ class Mosaic:
         Raises
         ------
         OSError
-            If the store cannot be written, as on a full disk. Finished patches remain.
+            If the store cannot be written, for example on a full disk. Finished patches remain.
         ValueError
             If a patch cannot be imaged; the message names the patch.
         """
@@ -170,27 +180,28 @@ class Mosaic:
     def image(self, tell: Callable[[Patch], object] | None = None) -> Image:
         """Form the patches that are not finished, and return the whole image.
 
-        Finished patches are read from the store. Patches that no channel receives from are zero.
+        Finished patches are read from the store. Patches from which no channel receives are zero.
 
         Parameters
         ----------
         tell : callable, optional
-            Called with every patch once its pixels are in the image: first those of the store,
-            then the others as they are finished. A patch that is formed again is told again.
+            Called with every patch once its pixels are in the image: first with those of the store,
+            then with the others as they are finished. If a patch is formed again, the function is
+            called with it again.
 
         Returns
         -------
         Image
             Image on all of `grid`. It takes 8 bytes of memory per pixel, in addition to the memory
-            of the patches in work.
+            of the patches that are being formed.
 
         Raises
         ------
         OSError
             If the store cannot be read or written. Finished patches remain.
         ValueError
-            If the image does not fit into this machine's memory, or a patch cannot be imaged; the
-            message names the patch.
+            If the image does not fit into the memory of this machine, or a patch cannot be imaged;
+            the message names the patch.
         """
         validate.function("tell", tell)
         validate.memory("the mosaic", 8 * self.grid.size)
@@ -199,7 +210,7 @@ class Mosaic:
         for patch in chain(stored, self):
             image = patch.image
             if image.pixels.shape == self.grid.shape:
-                whole = image  # copying its pixels would take as long as forming some images
+                whole = image  # copying the pixels can take as long as forming the image
             else:
                 if pixels is None:
                     pixels = np.empty(self.grid.shape, np.complex64)
@@ -229,9 +240,9 @@ def mosaic(
     client: Client | None = None,
     follow_s: float | None = None,
 ) -> Mosaic:
-    """Form an image of any size patch by patch.
+    """Return a mosaic, an image of any size that is formed patch by patch.
 
-    Iterating over the result forms the patches; nothing is formed before::
+    No patch is formed before you iterate over the result or call its `image`::
 
         for patch in clsas.mosaic("lines.h5", grid, "image.zarr", tolerance_db=-40):
             print(patch.row, patch.column, patch.record.predicted_error_db)
@@ -240,37 +251,38 @@ def mosaic(
     ----------
     source : RangeLines or path
         Range lines, a file of them, or a folder of such files (*.h5, in the order of their names).
-        Files are read in slices. Channels whose samples are not finite or all zero count as
-        missing.
+        Files are read in slices. A channel counts as missing if its samples are all zero, or if any
+        is not finite.
     grid : Grid
-        A plane, a height map, or points with two axes.
+        A plane, a height map, or arbitrary points with two axes.
     store : path, optional
         Zarr store to write, or to continue: its finished patches are not formed again. Required
         with a `client`. docs/mosaic.md describes the layout.
     tolerance_db, tolerance_wavelengths, stages
         See `clsas.plan`. The default is a tolerance of -50 dB.
     accuracy_db : float, optional
-        Backproject every patch exactly, see `clsas.backproject`.
+        Accuracy of exact backprojection of every patch, see `clsas.backproject`.
     beam : BeamWindow, optional
-        Weights of the channels. If its direction follows the track, then the whole track, not only
-        the part near a patch. In a folder, which may grow, `track_pings` is 101 by default.
+        Weights of the channels. If the beam's direction follows the track, it is computed from the
+        whole track, not only from the part near a patch. For a folder, which may grow,
+        `track_pings` is 101 by default.
     patches : (rows, columns), optional
         Number of patches along both axes; the last ones may be smaller. By default patches are as
         large as memory allows, up to 4096 x 4096 pixels.
     memory_bytes : int, optional
         Memory of one patch, on host and device together; 1 GiB by default. Exact backprojection
-        takes in addition the device's buffers, of up to 1024 upsampled lines.
+        needs the device's buffers in addition, of up to 1024 upsampled lines.
     device : Device, str or int, or a sequence of them, optional
-        Devices that work side by side. By default every GPU if there are several, else the device
-        that `clsas.opencl.device.choose` returns. Not with a `client`, whose workers each take a
-        device.
+        Devices that work side by side. By default all GPUs if there are several, else the device
+        that `clsas.opencl.device.choose` returns. Must be left out with a `client`, each of whose
+        workers takes a device of its machine.
     client : distributed.Client, optional
-        Let the workers of a Dask cluster form the patches. They must see `source` and `store`
-        under the same paths.
+        Client of a Dask cluster whose workers form the patches. They must be able to open `source`
+        and `store` under the same paths.
     follow_s : float, optional
-        Wait for files to be added to the folder `source`, until it holds a file named `end` or no
-        file came for this many seconds. A patch is formed once the beam of the latest channels has
-        passed it, and again if later channels contribute to it.
+        Wait for files to be added to the folder `source`, until it contains a file named `end` or
+        no file has been added for this many seconds. A patch is formed once the beam of the latest
+        channels has passed it, and again if later channels contribute to it.
 
     Returns
     -------
@@ -279,9 +291,9 @@ def mosaic(
     Raises
     ------
     TypeError, ValueError
-        If an argument has the wrong type or is outside its limits, files of a folder do not belong
-        together, memory does not hold the smallest patch, or `store` was made with other inputs
-        (the message names the differences).
+        If an argument has the wrong type or is outside its limits, if the files of a folder do not
+        belong together, if the smallest patch does not fit into memory, or if `store` was made with
+        other inputs (the message names the differences).
     FileFormatError, OSError
         If a file cannot be read or the store cannot be written.
     ImportError
@@ -289,15 +301,37 @@ def mosaic(
     DeviceError
         If there is no such device.
 
+    See Also
+    --------
+    Mosaic : The result.
+    Store : Read a mosaic from its store.
+    factorize : Form an image that fits into memory in one piece.
+
     Notes
     -----
-    Patches are formed independently. The error of each against the exact image stays within the
-    tolerance, and so does the difference of neighbours along their border.
+    Patches are formed independently of each other. The error of each patch against the exact image
+    stays within the tolerance, and so does the difference of neighbours along their border.
+
+    Examples
+    --------
+    Image a point at (0, 20) m from a track of 4 m, in 2 x 2 patches:
+
+    >>> import numpy as np
+    >>> import clsas
+    >>> track_m = np.stack([np.linspace(-2, 2, 161), np.zeros(161), np.zeros(161)], axis=1)
+    >>> target = clsas.PointTargets([[0.0, 20.0, 0.0]])
+    >>> lines = clsas.simulate_lines(
+    ...     track_m, track_m, target, carrier_hz=30e3, bandwidth_hz=10e3, oversampling=1.5
+    ... )
+    >>> grid = clsas.Grid.plane((-1, 1, 41), (19, 21, 41))
+    >>> image = clsas.mosaic(lines, grid, patches=(2, 2), accuracy_db=-60).image()
+    >>> [int(index) for index in np.unravel_index(np.abs(image.pixels).argmax(), image.shape)]
+    [20, 20]
     """
     validate.instance("grid", grid, Grid)
     if len(grid.shape) != 2:
         raise ValueError(f"grid must have two axes for a mosaic, got shape {grid.shape}")
-    request = _checked_request(tolerance_db, tolerance_wavelengths, stages, accuracy_db)
+    request = checked_request(tolerance_db, tolerance_wavelengths, stages, accuracy_db)
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
     patch_shape = None if patches is None else patch_shape_of(patches, grid)
@@ -307,10 +341,10 @@ def mosaic(
     if not isinstance(source, RangeLines):
         source = validate.path("source", source)
     if client is not None:
-        _check_client(client, source, store, device)
-    growth = _checked_growth(source, follow_s)
+        check_client(client, source, store, device)
+    growth = checked_growth(source, follow_s)
     if beam is not None and not isinstance(source, RangeLines) and source.is_dir():
-        beam = _beam_of_growing(beam)
+        beam = beam_of_growing(beam)
     devices = () if client is not None else open_devices(device)
     if growth is not None:
         wait_for_first_file(growth)
@@ -340,70 +374,10 @@ def mosaic(
     return Mosaic(grid, patch_shape, finished, run)
 
 
-def _checked_request(
-    tolerance_db: float | None,
-    tolerance_wavelengths: float | None,
-    stages: Sequence[tuple[int, int]] | None,
-    accuracy_db: float | None,
-) -> dict[str, Any]:
-    """Return the one of `REQUESTS` that is given, checked, or the default tolerance."""
-    given = (tolerance_db, tolerance_wavelengths, stages, accuracy_db)
-    request: dict[str, Any] = {
-        name: value for name, value in zip(REQUESTS, given, strict=True) if value is not None
-    }
-    if len(request) > 1:
-        raise ValueError(f"at most one of {', '.join(REQUESTS)} must be given, got {request}")
-    tolerance_in_db(tolerance_db, tolerance_wavelengths)
-    if accuracy_db is not None:
-        validate.number("accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0)
-    # Plain numbers, which records hold as JSON.
-    for name, value in request.items():
-        if name == "stages":
-            request[name] = checked_pairs(value)
-        elif not isinstance(value, (int, float)):
-            request[name] = float(value)
-    return request or {"tolerance_db": TOLERANCE_DB}
-
-
-def _checked_growth(source: RangeLines | Path, follow_s: float | None) -> Growth | None:
-    """Return how a survey grows, or None if it does not; raise unless its source is a folder."""
-    if follow_s is None:
-        return None
-    idle_s = validate.positive("follow_s", follow_s, "s")
-    if isinstance(source, RangeLines) or not source.is_dir():
-        got = "lines in memory" if isinstance(source, RangeLines) else repr(str(source))
-        raise ValueError(f"source must be a folder where follow_s is given, got {got}")
-    return Growth(source.resolve(), idle_s)
-
-
-def _beam_of_growing(beam: BeamWindow) -> BeamWindow:
-    """Return a beam that pings which come later do not change, or raise ValueError."""
-    if beam.normalise:
-        raise ValueError(
-            "beam must not normalise with a folder, which may grow: its scale is that of all "
-            "channels"
-        )
-    if beam.along is None and beam.track_pings is None:
-        return replace(beam, track_pings=MOST_TRACK_PINGS)
-    return beam
-
-
-def _check_client(client: object, source: object, store: object, device: object) -> None:
-    """Raise TypeError or ValueError unless the other arguments go with a client."""
-    if not hasattr(client, "get_executor"):
-        raise TypeError(f"client must be a distributed.Client, got {client!r}")
-    if store is None:
-        raise ValueError("store must be given with a client")
-    if isinstance(source, RangeLines):
-        raise ValueError("source must be a path with a client, whose workers read it")
-    if device is not None:
-        raise ValueError("device must be left out with a client: every worker takes one")
-
-
 def _still_finished(
     store: Store, visibility: SurveyVisibility, layout: Layout
 ) -> dict[PatchIndex, Record]:
-    """Return the intact patches of a store to which no channel has been added since."""
+    """Return the records of intact patches to which no channel added since then contributes."""
     return {
         index: record
         for index, record in _undamaged(store).items()
@@ -416,6 +390,6 @@ def _undamaged(store: Store) -> dict[PatchIndex, Record]:
     damage = store.damage()
     if damage:
         validate.warn(
-            f"{store.path} is damaged and these patches are formed again: {describe_damage(damage)}"
+            f"{store.path} is damaged; these patches are formed again: {describe_damage(damage)}"
         )
     return {index: record for index, record in store.records().items() if index not in damage}

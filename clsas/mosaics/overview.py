@@ -1,4 +1,4 @@
-"""Overviews: large images at fewer pixels, which are read part by part."""
+"""Overviews: large images at fewer pixels, read part by part."""
 
 from __future__ import annotations
 
@@ -18,26 +18,29 @@ def reduced(
     read: Callable[[slice, slice], NDArray[np.complex64]],
     most: int,
 ) -> Image:
-    """Return an image at fewer pixels, each with the mean power of those it covers.
+    """Return an image at fewer pixels, each with the mean power of those that it covers.
 
     Parameters
     ----------
     grid : Grid
         Grid of the image.
     patch_shape : (rows, columns)
-        Approximate number of pixels that are read together.
+        Approximate number of pixels that are read at once.
     read : callable
-        Called with slices of rows and columns; returns their pixels, complex64 [rows, columns].
+        Called as read(rows, columns) with slices; returns their pixels, complex64 [rows, columns].
     most : int
         Largest number of pixels along the longer side of the overview.
     """
     height, width = patch_shape
     rows, columns = grid.shape
     step = math.ceil(max(rows, columns) / most)
-    down, across = min(step, rows), min(step, columns)  # pixels that one of the overview covers
+    down, across = (
+        min(step, rows),
+        min(step, columns),
+    )  # pixels per overview pixel
     shape = (rows // step or 1, columns // step or 1)
     power = np.zeros(shape)
-    # Read whole pixels of the overview, and about whole patches, at a time.
+    # Read blocks of whole overview pixels that are about as large as a patch.
     band, run = max(height // down, 1), max(width // across, 1)
     for first in range(0, shape[0], band):
         last = min(first + band, shape[0])

@@ -1,4 +1,4 @@
-"""Division of a mosaic into patches, and how large a patch may be."""
+"""Division of a mosaic into patches, and the choice of their size."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from clsas.core.grid import Grid
 from clsas.mosaics.record import PatchIndex
 from clsas.mosaics.visibility import SurveyVisibility
 
-_LARGEST_SIDE = 4096  # pixels; such a patch takes seconds, so larger ones would gain nothing
-_SMALLEST_SIDE = 128  # pixels; smaller patches would be read and planned more than imaged
+_LARGEST_SIDE = 4096  # pixels; such a patch takes seconds, and larger ones gain nothing
+_SMALLEST_SIDE = 128  # pixels; reading and planning smaller patches takes longer than imaging
 
 
 class PatchWindow(NamedTuple):
@@ -34,7 +34,7 @@ class Layout:
     grid : Grid
         Grid of the whole mosaic.
     patch_shape : (rows, columns)
-        Pixels of a patch; patches at the end may be smaller.
+        Number of pixels of a patch; the last patches along each axis may be smaller.
     """
 
     grid: Grid
@@ -49,7 +49,7 @@ class Layout:
         return rows, columns
 
     def __len__(self) -> int:
-        """Return the number of all patches."""
+        """Return the number of patches."""
         return math.prod(self.shape)
 
     def window(self, index: PatchIndex) -> PatchWindow:
@@ -62,14 +62,14 @@ class Layout:
 
 
 def host_bytes(channels: int, length: int, pixels: int) -> int:
-    """Return the memory for lines and pixels of a patch, each with one working copy."""
+    """Return the bytes for the lines and pixels of a patch, each with one working copy."""
     return 2 * 8 * (channels * length + pixels)
 
 
 def choose_patch_shape(
     visibility: SurveyVisibility, grid: Grid, memory_bytes: int
 ) -> tuple[int, int]:
-    """Return the pixels of the largest patches that are predicted to fit into memory.
+    """Return the number of pixels of the largest patches that are predicted to fit into memory.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def choose_patch_shape(
     side = _LARGEST_SIDE
     needed = 0
     while side >= _SMALLEST_SIDE:
-        # Patches as even as possible.
+        # Make the patches as equal as possible.
         height, width = (math.ceil(n / math.ceil(n / side)) for n in grid.shape)
         most = 0
         for row in (0, grid.shape[0] - 1):
@@ -89,24 +89,24 @@ def choose_patch_shape(
             if visible.any():
                 count, length = visibility.survey.extent(visible, *visibility.ranges_m(window))
                 most = max(most, count * length)
-        # The device holds upsampled lines and stages: about one and a half times the lines.
+        # Upsampled lines and stages on the device take about one and a half times the lines.
         needed = host_bytes(1, most, height * width) + 12 * most + (64 << 20)
         if needed <= memory_bytes:
             return height, width
         side //= 2
     raise ValueError(
-        f"memory_bytes must be at least {needed / 2**20:.0f} MiB to choose patches by it, of "
-        f"{height} x {width} pixels, got {memory_bytes / 2**20:.3g} MiB: give patches"
+        f"memory_bytes must be at least {needed / 2**20:.0f} MiB for the smallest patches, of "
+        f"{height} x {width} pixels, got {memory_bytes / 2**20:.3g} MiB: raise it or give patches"
     )
 
 
 def patch_shape_of(patches: tuple[int, int], grid: Grid) -> tuple[int, int]:
-    """Return the pixels of a patch for a number of patches along rows and columns.
+    """Return the number of pixels of a patch, given the number of patches along each axis.
 
     Raises
     ------
     TypeError, ValueError
-        If `patches` is not two whole numbers, or some patches would be empty.
+        If `patches` are not two whole numbers, or some patches would be empty.
     """
     try:
         given = validate.entries("patches", patches, "(rows, columns) of patches")
@@ -121,8 +121,8 @@ def patch_shape_of(patches: tuple[int, int], grid: Grid) -> tuple[int, int]:
         if math.ceil(pixels / side) != count:
             fewer = math.ceil(pixels / side)
             raise ValueError(
-                f"patches must leave each some of {pixels} pixels: {count} patches of {side} are "
-                f"too many, {fewer} are enough"
+                f"patches must all have pixels: {count} patches of {side} are too many for "
+                f"{pixels} pixels, {fewer} are enough"
             )
         shape.append(side)
     return shape[0], shape[1]

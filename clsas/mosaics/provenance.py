@@ -1,4 +1,4 @@
-"""Inputs of a mosaic: a description that is stored with it, and differences between two of them."""
+"""Inputs of a mosaic: the description stored with it, and differences between two descriptions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class OtherInputsError(ValueError):
 def inputs_of(
     survey: Survey, grid: Grid, request: dict[str, Any], beam: BeamWindow | None
 ) -> dict[str, Any]:
-    """Return the inputs of a mosaic in types of JSON."""
+    """Return the inputs of a mosaic as JSON types."""
     inputs = {
         "parts": survey.digests(),
         "grid": grid_digest(grid),
@@ -39,41 +39,42 @@ def inputs_of(
 def differences(
     attributes: dict[str, Any], given: dict[str, Any], patch_shape: tuple[int, int]
 ) -> list[str]:
-    """Return one message for every difference between the attributes of a store and given inputs.
+    """Return one message for every difference between the inputs of a store and the given ones.
 
-    The survey may have grown: the given parts only have to begin with the stored ones.
+    Files may have been added to the survey, so the given parts need only begin with the stored
+    ones.
     """
     found, stored = [], attributes["inputs"]
     if attributes["patch_shape"] != list(patch_shape):
         mine, theirs = ("{} x {}".format(*s) for s in (attributes["patch_shape"], patch_shape))
-        found.append(f"patches of {mine} pixels there, of {theirs} given")
+        found.append(f"patches have {mine} pixels in the store, {theirs} given")
     if given["parts"][: len(stored["parts"])] != stored["parts"]:
-        found.append("the range lines are others")
+        found.append("the range lines differ")
     for name, theirs in given.items():
         mine = stored.get(name)
         if name == "parts":
             continue
         if name == "grid" and mine != theirs:
             if stored.get("pixels") == given["pixels"]:
-                found.append("the grid lies elsewhere")
+                found.append("the grid has another position or other heights")
         elif isinstance(mine, dict) and isinstance(theirs, dict):
             found += [
-                f"{name}'s {key} is {mine.get(key)} there, {theirs[key]} given"
+                f"{name}'s {key} is {mine.get(key)} in the store, {theirs[key]} given"
                 for key in theirs
                 if mine.get(key) != theirs[key]
             ]
         elif mine != theirs:
-            found.append(f"{name} is {mine} there, {theirs} given")
+            found.append(f"{name} is {mine} in the store, {theirs} given")
     return found
 
 
 def stored_digest(path: Path) -> str:
-    """Return a digest of the inputs with which the store at a path was made.
+    """Return a digest of the inputs that the store at a path was made with.
 
     Raises
     ------
     ValueError
-        If there is no mosaic, or its document is damaged.
+        If there is no mosaic at the path, or its document is damaged.
     """
     text = json.dumps(read_document(path)["inputs"], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -1,7 +1,7 @@
-"""Records of finished patches: how each was formed, and checksums of it.
+"""Records of finished patches: how each was formed, and its checksums.
 
-A record is stored as the attributes of an empty Zarr group. It has a checksum of the patch's pixels
-and one of itself, so that a changed bit in either is found.
+A record is stored as the attributes of an empty Zarr group. It contains a checksum of the patch's
+pixels and one of itself, so that a changed bit in either is detected.
 """
 
 from __future__ import annotations
@@ -19,19 +19,20 @@ PIXELS_CHECKSUM = "pixels_crc32c"
 PatchIndex = tuple[int, int]
 """Row and column of a patch."""
 
-_LISTED = 3  # damaged patches that a message names; it counts the others
+_LISTED = 3  # damaged patches that a message names; the others are only counted
 
 
 @dataclass(frozen=True)
 class Record:
-    """How a finished patch was formed, and defects of its data.
+    """Record of how a finished patch was formed, and of defects of its data.
 
     Attributes
     ----------
     channels : int
-        Channels whose beam and recorded ranges touch the patch. If 0, all pixels are zero.
+        Number of channels whose beam and recorded ranges touch the patch. If 0, all pixels are
+        zero.
     survey_channels : int
-        Channels of the survey at that time.
+        Number of channels in the survey when the patch was formed.
     missing_channels : int
         Number of `channels` without samples.
     gap_m : float
@@ -40,14 +41,14 @@ class Record:
     predicted_error_db : float or None
         Predicted relative rms error against the exact image, dB; None for an empty patch.
     predicted_seconds, plan_seconds, read_seconds, seconds : float
-        Predicted time of imaging; measured times of planning, of reading lines, and in total.
+        Predicted time of imaging; measured times of planning, of reading lines, and in total, s.
     memory_bytes : int
-        Planned memory.
+        Predicted memory.
     device, driver : str
         Device that formed the patch, and its driver.
     plan : dict or None
-        The plan, as `clsas.Plan.from_json` reads it, without the beam's directions; None for an
-        exact image or an empty patch.
+        The plan as JSON, without the beam's directions; `clsas.Plan.from_json` reads it. None for
+        an exact image or an empty patch.
     has_pixels : bool
         True if any pixel is not 0.
     """
@@ -71,15 +72,15 @@ class Record:
 
     @property
     def is_empty(self) -> bool:
-        """True if no channel contributes; all pixels are then zero."""
+        """True if no channel with samples contributes; all pixels are then zero."""
         return self.channels == self.missing_channels
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """Defects of the data in words; empty if there are none."""
+        """Descriptions of the defects of the data; empty if there are none."""
         found = []
         if not self.channels:
-            found.append("empty: in no channel's beam and range")
+            found.append("empty: outside the beam or recorded ranges of every channel")
         elif self.missing_channels:
             found.append(f"{self.missing_channels} of {self.channels} channels have no samples")
         if self.gap_m:
@@ -87,7 +88,7 @@ class Record:
         return tuple(found)
 
     def attributes(self, pixels_checksum: str | None) -> dict[str, Any]:
-        """Return the record for a store; the checksum of pixels that are all zero is None."""
+        """Return the attributes to store; pixels that are all zero have the checksum None."""
         return with_checksum(asdict(self) | {PIXELS_CHECKSUM: pixels_checksum})
 
     @classmethod
@@ -114,12 +115,12 @@ class Record:
 
 
 def describe_damage(found: dict[PatchIndex, str]) -> str:
-    """Return the first damaged patches with their reasons, and the number of the others."""
+    """Return the first damaged patches with their reasons, and the number of others, in words."""
     named = [f"patch {row},{column}: {reason}" for (row, column), reason in found.items()]
     more = f" and {len(named) - _LISTED} more" if len(named) > _LISTED else ""
     return "; ".join(named[:_LISTED]) + more
 
 
 def describe_arrays(found: dict[str, str]) -> str:
-    """Return the damaged arrays with their reasons."""
+    """Return the damaged arrays with their reasons, in words."""
     return "; ".join(f"{name}: {reason}" for name, reason in found.items())

@@ -1,4 +1,4 @@
-"""Order in which patches are formed, also while the survey grows."""
+"""Order in which patches are formed, also while files are added to the survey."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from distributed import Client
 
 POLL_S = 0.5
-"""Seconds between looks for new files of a survey."""
+"""Seconds between searches for new files of a survey: a plain choice."""
 
 Formed = tuple[PatchIndex, Record, Image | None]
 
 
 @dataclass(frozen=True)
 class Growth:
-    """Folder to which files of a survey are added.
+    """Folder to which files of a survey are being added.
 
     Attributes
     ----------
@@ -45,22 +45,22 @@ class Growth:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """All that forming a mosaic needs.
+    """Everything needed to form a mosaic.
 
     Attributes
     ----------
     layout : Layout
     job : Job
-        Settings of the patches; the survey is added to it.
+        Settings of the patches, still without the survey.
     inputs : dict
-        What the store says the mosaic was made with.
+        Inputs of the mosaic, as stored with it.
     visibility : SurveyVisibility
         The survey when the mosaic was requested.
     devices : tuple of Device
         Devices of this process; empty with a client.
     client : distributed.Client or None
     growth : Growth or None
-        None if the survey is complete.
+        None if no files are to be added.
     """
 
     layout: Layout
@@ -78,10 +78,10 @@ class Run:
 
     @property
     def most_running(self) -> int:
-        """Number of patches that are submitted at once.
+        """Largest number of patches that are submitted at once.
 
-        One more than there are workers: finished patches wait in memory. A cluster returns only
-        records.
+        In this process it is one more than there are workers, since finished patches stay in memory
+        until they are taken. A cluster returns only records, so all patches are submitted at once.
         """
         return len(self.layout) if self.client is not None else self.workers + 1
 
@@ -92,7 +92,7 @@ class Run:
         return device_threads(self.workers, self.devices)
 
     def job_on(self, visibility: SurveyVisibility) -> Job:
-        """Return the settings of patches that are formed from the present survey."""
+        """Return the settings of the patches, with the present survey."""
         if self.client is None:
             return replace(self.job, local=visibility)
         return replace(self.job, files=stamped_files(visibility.survey))
@@ -125,7 +125,7 @@ class _GrowingSurvey:
         growth = self._run.growth
         if growth is None or self.has_ended:
             return False
-        # Asked before the files are listed, since nothing comes after the end.
+        # Ask before listing the files, since none is added after the end.
         ended = has_ended(growth.folder)
         paths, survey = files_of(growth.folder), self.visibility.survey
         grown = paths != survey.files
@@ -143,7 +143,7 @@ class _GrowingSurvey:
         return grown or self.has_ended
 
     def ready(self, todo: Sequence[PatchIndex]) -> list[PatchIndex]:
-        """Return the patches whose channels have all been recorded."""
+        """Return the patches whose channels have all been recorded, in the given order."""
         if self.has_ended:
             return list(todo)
         settled = self.visibility.settled
@@ -156,12 +156,12 @@ class _GrowingSurvey:
 def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Formed, None, None]:
     """Form the patches that are not finished, and yield each with its record and image.
 
-    The image is None where another process formed it. With a store, `finished` is kept up to date.
-    When the caller stops early, patches that have begun are completed in the store.
+    The image is None if another process formed it. With a store, `finished` is kept up to date. If
+    the caller stops early, patches that have been started are still completed in the store.
     """
     survey, layout, store = _GrowingSurvey(run), run.layout, run.job.store
     todo = [index for index in _all(layout) if index not in finished]
-    # Number of the survey's channels that a patch was formed from, or checked against, so far.
+    # For every patch, the number of channels in the survey when it was last formed or checked.
     known = {index: record.survey_channels for index, record in finished.items()}
     executor = run.executor()
     running: dict[Future, PatchIndex] = {}
@@ -187,7 +187,7 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Form
                     finished[index] = record
                 yield index, record, image
             news = survey.update()
-            # Form patches again that channels contribute to which came later.
+            # Form patches again if channels that were added later contribute to them.
             for index in set(known) - set(running.values()) - set(todo):
                 grid = layout.window(index).grid
                 if survey.visibility.any_channel_from(known[index], grid):
@@ -199,7 +199,7 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Form
     finally:
         with uninterrupted():
             begun = {future for future in running if not future.cancel()}
-        # Threads of this process finish what they have begun; workers of a cluster may be gone.
+        # Wait for patches that this process's threads have begun. A cluster may be gone by now.
         left = begun if run.client is None else set()
         while left:
             left = left - wait(left)
@@ -221,5 +221,5 @@ def wait_for_first_file(growth: Growth) -> None:
     start, folder = time.monotonic(), growth.folder
     while not files_of(folder):
         if has_ended(folder) or time.monotonic() - start > growth.idle_s:
-            raise ValueError(f"source must hold range lines: {folder} has no file *.h5")
+            raise ValueError(f"source must contain range lines, but {folder} has no file *.h5")
         time.sleep(POLL_S)

@@ -1,8 +1,8 @@
-"""Mosaics in Zarr stores: one array of pixels, and for every patch one chunk and one record.
+"""Mosaics in Zarr stores: an array of pixels with one chunk per patch, and one record per patch.
 
 docs/mosaic.md describes the layout. A patch is finished once it has a record, which is written
-after its pixels. Pixels and records have checksums. Both are on the disk when `Store.write`
-returns.
+after its pixels. Pixels and records have checksums, and `Store.write` returns once both are on the
+disk.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from numpy.typing import NDArray
 from clsas.core import reprs, validate
 from clsas.core.atomic import sync_folder
 from clsas.core.digests import grid_digest
-from clsas.core.extras import install_command
+from clsas.core.extras import needed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.reading import check_ordinary
 from clsas.mosaics.documents import (
     DIGESTS,
     DamageError,
+    check_inputs,
     check_own,
     check_place,
-    is_complete,
     is_there,
     read_document,
     with_checksum,
@@ -47,8 +47,8 @@ from clsas.mosaics.record import PatchIndex, Record, describe_arrays, describe_d
 if TYPE_CHECKING:
     import zarr
 
-_MENDED = "; clsas mosaic with the same inputs mends it"
-_OVERVIEW = 1024  # pixels along the longer side
+_REPAIR = "; run clsas mosaic with the same inputs to repair it"
+_OVERVIEW = 1024  # pixels along the longer side, which fills a screen
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,7 @@ class Store:
     Attributes
     ----------
     path : Path
+        Folder of the Zarr store.
     """
 
     path: Path
@@ -67,12 +68,12 @@ class Store:
         object.__setattr__(self, "path", validate.path("path", self.path))
 
     def __repr__(self) -> str:
-        """Return where the store is."""
+        """Return the path of the store."""
         return reprs.summary(self, repr(str(self.path)))
 
     @classmethod
     def at(cls, path: str | os.PathLike) -> Store:
-        """Return the store at a path where a mosaic may or may not exist.
+        """Return the store at a path, whether or not a mosaic exists there.
 
         Raises
         ------
@@ -89,9 +90,11 @@ class Store:
         Raises
         ------
         OSError
-            If there is none.
+            If nothing exists at the path.
         ValueError
-            If the path holds something else, or a mosaic of another version.
+            If the path contains something else, or a mosaic of another version.
+        ImportError
+            If Zarr is not installed.
         """
         store = cls.at(path)
         if not store.path.exists():
@@ -101,7 +104,7 @@ class Store:
 
     @property
     def patch_shape(self) -> tuple[int, int] | None:
-        """Pixels of a patch, or None if there is no mosaic yet."""
+        """Number of pixels of a patch, (rows, columns), or None if there is no mosaic yet."""
         if not is_there(self.path):
             return None
         rows, columns = read_document(self.path)["patch_shape"]
@@ -109,17 +112,17 @@ class Store:
 
     @cached_property
     def pixels(self) -> zarr.Array:
-        """Pixels on disk, complex64 [rows, columns]. Zarr verifies their checksums."""
+        """Pixels on disk, complex64 [rows, columns]. Zarr verifies their checksums on reading."""
         try:
             return _arrays().open_array(self.path, read_document(self.path), "pixels")
         except DamageError as error:
-            raise ValueError(f"{self.path} is damaged: pixels: {error}{_MENDED}") from error
+            raise ValueError(f"{self.path} is damaged: pixels: {error}{_REPAIR}") from error
 
     @property
     def has_digests(self) -> bool:
         """True if the store has digests of its arrays' metadata.
 
-        Stores of early versions do not, until a run continues them.
+        Stores of early versions lack them until a run continues the mosaic.
         """
         return DIGESTS in read_document(self.path)
 
@@ -130,25 +133,28 @@ class Store:
         Raises
         ------
         ValueError
-            If the mosaic has arbitrary points, which are not stored, or metadata, coordinates or
-            heights are damaged.
+            If the mosaic has arbitrary points, which are not stored, or if metadata, coordinates
+            or heights are damaged.
         """
         grid, found = self._compared()
         if grid is None:
-            raise ValueError(f"{self.path} is a mosaic of points, whose grid it does not hold")
+            raise ValueError(
+                f"{self.path} is a mosaic of arbitrary points, whose grid is not stored"
+            )
         if found:
-            raise ValueError(f"{self.path} is damaged: {describe_arrays(found)}{_MENDED}")
+            raise ValueError(f"{self.path} is damaged: {describe_arrays(found)}{_REPAIR}")
         if grid_digest(grid) != read_document(self.path)["inputs"].get("grid"):
-            raise ValueError(f"{self.path} is damaged: its grid is not the one that was written")
+            raise ValueError(f"{self.path} is damaged: its grid differs from what was written")
         return grid
 
     def array_damage(self) -> dict[str, str]:
-        """Compare metadata, coordinates and heights with what was written.
+        """Return the arrays whose metadata, coordinates or heights differ from what was written.
 
         Returns
         -------
         dict of str to str
-            Reasons by the name of the array, such as "its metadata do not match their digest".
+            Reason for each damaged array, by its name, such as "its metadata do not match their
+            digest". Empty if there is no damage.
 
         Raises
         ------
@@ -158,60 +164,67 @@ class Store:
         return self._compared()[1]
 
     def begin(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
-        """Create the store, or check that it was made with the same inputs.
+        """Create the store, or check that the one at the path was made with the same inputs.
+
+        Parameters
+        ----------
+        inputs : dict
+            Inputs of the mosaic: digests of its parts, its grid and its request.
+        grid : Grid
+            Grid of the mosaic.
+        patch_shape : (rows, columns)
+            Number of pixels of a patch.
 
         Raises
         ------
+        TypeError, ValueError
+            If `inputs` are not those of a mosaic on the grid.
         OtherInputsError
-            If the path holds a mosaic with other inputs; the message names the differences.
+            If the path contains a mosaic with other inputs; the message names the differences.
         ValueError
-            If the path holds something else.
+            If the path contains something else.
         OSError
             If the store cannot be written.
         """
         arrays = _arrays()
-        validate.instance("inputs", inputs, dict)
         validate.instance("grid", grid, Grid)
-        if "parts" not in inputs:
-            raise ValueError(f"inputs must have 'parts', got {validate.shown(sorted(inputs))}")
+        check_inputs(inputs, grid.shape)
         patch_shape = validate.sides("patch_shape", patch_shape)
         check_place(self.path)
         if not is_there(self.path):
             arrays.create_store(self.path, inputs, grid, patch_shape)
         stored = read_document(self.path)
         if found := differences(stored, inputs, patch_shape):
-            ways = "give it another path or the same inputs"
+            ways = "choose another path or repeat the inputs"
             if not any((self.path / GROUP).glob("*/zarr.json")):
-                ways += ", or delete it: no patch of it was finished"
+                ways += ", or delete the store: it has no finished patch"
             raise OtherInputsError(
                 f"{self.path} was made with other inputs: {'; '.join(found)}; {ways}"
             )
-        if mended := arrays.mend(self.path, grid):
-            validate.warn(f"{self.path} was damaged and is mended: {describe_arrays(mended)}")
+        if repaired := arrays.repair(self.path, grid):
+            validate.warn(
+                f"{self.path} was damaged and has been repaired: {describe_arrays(repaired)}"
+            )
         self.grow(inputs)
 
     def grow(self, inputs: dict[str, Any]) -> None:
-        """Store the inputs of a survey that has grown.
+        """Store the inputs of a survey to which files have been added.
 
         Raises
         ------
         TypeError, ValueError
-            If `inputs` are not a dict, or not those of a mosaic.
+            If `inputs` are not those of a mosaic on the store's grid.
         """
-        validate.instance("inputs", inputs, dict)
         attributes = read_document(self.path)
+        check_inputs(inputs, attributes["inputs"]["pixels"])
         if attributes["inputs"] != inputs:
-            changed = attributes | {"inputs": inputs}
-            if not is_complete(changed):
-                given = validate.shown(sorted(inputs))
-                raise ValueError(f"inputs must have the parts and pixels of a mosaic, got {given}")
-            write_attributes(self.path, with_checksum(changed))
+            write_attributes(self.path, with_checksum(attributes | {"inputs": inputs}))
 
     def records(self) -> dict[PatchIndex, Record]:
         """Return the records of all finished patches, by row and column.
 
-        Patches are left out if their records or the checksums behind their pixels are damaged.
-        `damage` also reads the pixels.
+        Patches whose record, or the checksum behind whose pixels, is damaged are left out. The
+        pixels themselves are not read; `damage` reads them too.
         """
         found = {}
         for index in self._indices():
@@ -224,17 +237,17 @@ class Store:
         return found
 
     def damage(self, tell: Callable[[int, int], object] | None = None) -> dict[PatchIndex, str]:
-        """Read every finished patch, and return the reason for each that is damaged.
+        """Read every finished patch, and return those that are damaged.
 
         Parameters
         ----------
         tell : callable, optional
-            Called with the number of patches read so far and the number of all.
+            Called as tell(patches read so far, number of patches).
 
         Returns
         -------
         dict of (row, column) to str
-            Reasons, such as "its pixels do not match their checksum".
+            Reason for each damaged patch, such as "its pixels do not match their checksum".
 
         Raises
         ------
@@ -263,6 +276,15 @@ class Store:
     ) -> None:
         """Write a patch and then its record, and wait until both are on the disk.
 
+        Parameters
+        ----------
+        row, column : int
+            Index of the patch.
+        rows, columns : slice
+            Pixels of the mosaic that belong to the patch.
+        pixels : complex64 [rows, columns]
+        record : Record
+
         Raises
         ------
         OSError
@@ -282,7 +304,7 @@ class Store:
         validate.instance("record", record, Record)
         folder = self._folder((row, column))
         check_own(self.path, folder)
-        # Remove the old record before the pixels that it belongs to are replaced.
+        # Remove the old record first, so that it never stands beside pixels of the new patch.
         if (folder / "zarr.json").exists():
             (folder / "zarr.json").unlink()
             sync_folder(folder)
@@ -292,7 +314,7 @@ class Store:
     def read(
         self, rows: slice = slice(None), columns: slice = slice(None)
     ) -> NDArray[np.complex64]:
-        """Return pixels, by default all, complex64 [rows, columns].
+        """Return the pixels of a window, by default all, complex64 [rows, columns].
 
         Raises
         ------
@@ -303,10 +325,10 @@ class Store:
         """
         validate.selection("rows", rows, ascending=True)
         validate.selection("columns", columns, ascending=True)
-        wanted = (
+        requested = (
             len(range(n)[part]) for n, part in zip(self.pixels.shape, (rows, columns), strict=True)
         )
-        validate.memory("the mosaic", 8 * math.prod(wanted))
+        validate.memory("the mosaic", 8 * math.prod(requested))
         try:
             _arrays().check_metadata(self.path, read_document(self.path))
             for index in self._touched(rows, columns):
@@ -320,10 +342,10 @@ class Store:
                 except DamageError as damage:
                     found[index] = str(damage)
             reason = describe_damage(found) if found else str(error)
-            raise ValueError(f"{self.path} is damaged: {reason}{_MENDED}") from error
+            raise ValueError(f"{self.path} is damaged: {reason}{_REPAIR}") from error
 
     def image(self, rows: slice = slice(None), columns: slice = slice(None)) -> Image:
-        """Return pixels, by default all, as an image.
+        """Return the pixels of a window, by default all, as an image.
 
         Raises
         ------
@@ -341,7 +363,7 @@ class Store:
         rows: slice = slice(None),
         columns: slice = slice(None),
     ) -> Image:
-        """Return the mosaic at fewer pixels, each with the mean power of those it covers.
+        """Return the mosaic at fewer pixels, each with the mean power of those that it covers.
 
         About one patch at a time is read, so the pixels may take more than memory. A height map
         becomes a plane.
@@ -381,7 +403,7 @@ class Store:
         return _arrays().compared(self.path, attributes, has_height(self.path, attributes))
 
     def _indices(self) -> list[PatchIndex]:
-        """Patches that have a folder for their record, in order."""
+        """Return the patches that have a folder for their record, in order."""
         shape = self._shape
         folders = self.path / GROUP
         found = []
@@ -400,7 +422,7 @@ class Store:
         return rows, columns
 
     def _touched(self, rows: slice, columns: slice) -> Iterator[PatchIndex]:
-        """Patches to which some pixels belong."""
+        """Yield the patches to which the pixels of a window belong."""
         touched: list[range] = []
         for part, count, side in zip(
             (rows, columns), self.pixels.shape, self.pixels.chunks, strict=True
@@ -424,7 +446,7 @@ class Store:
             check_ordinary(self._chunk(index))
             with self._chunk(index).open("rb") as file:
                 file.seek(8 * math.prod(self.pixels.chunks))
-                return file.read(2 * CHECKSUM_BYTES).hex()  # a whole file has half as many
+                return file.read(2 * CHECKSUM_BYTES).hex()  # of an intact file, half as many bytes
         except FileNotFoundError:
             return None  # Zarr writes no chunk of zeros
 
@@ -434,7 +456,7 @@ class Store:
         Raises
         ------
         DamageError
-            If the record is damaged, or the checksum behind the pixels is another one.
+            If the record is damaged, or the checksum behind the pixels is not that of the record.
         """
         found = Record.read(self._folder(index))
         if found is None:
@@ -450,7 +472,7 @@ class Store:
         return record
 
     def _verify(self, index: PatchIndex) -> None:
-        """Read a patch; raise DamageError if it is finished and differs from what was written."""
+        """Read a patch if it is finished; raise DamageError if it differs from what was written."""
         if self._record(index) is None or not self._chunk(index).exists():
             return
         row, column = (
@@ -464,8 +486,6 @@ class Store:
 
 def _arrays() -> ModuleType:
     """Return the module that needs Zarr."""
-    try:
+    with needed("stores of mosaics"):
         from clsas.mosaics import arrays
-    except ModuleNotFoundError:
-        raise ImportError(f"stores of mosaics need Zarr: {install_command('mosaic')}") from None
     return arrays

@@ -1,7 +1,8 @@
 """Surveys: range lines in files, read in the parts that a patch needs.
 
 A survey is one file of range lines, or a folder of such files in the order of their names. Files
-may be added while the survey is recorded. Its geometry is in memory, its samples are not.
+may be added while the survey is recorded. Only the geometry is kept in memory; samples are read
+when a patch needs them.
 """
 
 from __future__ import annotations
@@ -24,16 +25,16 @@ from clsas.files.hdf5 import FileFormatError, read_geometry, read_samples
 END = "end"
 """Name of the file that marks a folder as complete."""
 
-_TAPER = 64  # samples over which a line that is cut fades
-_MARGIN = 32  # untouched samples between pixels and taper, for interpolation and ringing
-_DIGESTED = 16  # lines of a file in its digest; for all of them the file would have to be read
-_SKIPPED = 64  # up to this many channels between two others are read too, rather than skipped
-_GAP = 3.0  # a distance between pings of more than this many median ones is a gap
+_TAPER = 64  # samples over which a line fades where it is cut
+_MARGIN = 32  # unchanged samples between pixels and taper, for interpolation and its ringing
+_DIGESTED = 16  # lines of a file that enter its digest; all of them would take too long to read
+_SKIPPED = 64  # unused channels in a row that are read along: faster than a second read
+_GAP = 3.0  # a gap is a distance between pings of more than this many median distances
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Range lines with only their geometry in memory.
+    """Range lines of which only the geometry is in memory.
 
     Attributes
     ----------
@@ -46,7 +47,8 @@ class Survey:
     lengths : tuple of int
         Samples per channel of every part.
     stamps : tuple of (int, int)
-        Size and time of change (ns) of every file when it was opened; 0, 0 for lines in memory.
+        Size (bytes) and time of change (ns) of every file when it was opened; 0, 0 for lines in
+        memory.
     """
 
     geometry: RangeLines
@@ -62,7 +64,7 @@ class Survey:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The parts that are files: all of them, unless the lines are in memory."""
+        """Parts that are files: all of them, unless the lines are in memory."""
         return tuple(part for part in self.parts if isinstance(part, Path))
 
     @property
@@ -78,7 +80,7 @@ class Survey:
         return float(first_m.min()), float(last_m.max())
 
     def digests(self, first: int = 0) -> list[str]:
-        """Return a digest of geometry and samples of every part from number `first` on.
+        """Return digests of the geometry and samples of every part from number `first` on.
 
         The digest of a file covers the samples of 16 lines.
         """
@@ -96,7 +98,10 @@ class Survey:
         return found
 
     def within(self, near_m: NDArray[np.float64], far_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which channels recorded any range between two bounds, bool [channels]."""
+        """Return which channels recorded any range between two bounds, bool [channels].
+
+        Bounds are in metres, float64 [channels].
+        """
         first_m = self.geometry.first_range_m
         last_m = first_m + (self.length - 1) * self.geometry.range_step_m
         return (far_m >= first_m) & (near_m <= last_m)
@@ -104,7 +109,7 @@ class Survey:
     def extent(
         self, visible: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
     ) -> tuple[int, int]:
-        """Return the number of lines that `read` returns, and of samples of each."""
+        """Return the number of lines that `read` returns, and the number of samples of each."""
         blocks = list(self._blocks(visible, near_m, far_m))
         longest = max(columns.stop - columns.start for _, _, columns in blocks)
         return int(np.count_nonzero(visible)), longest
@@ -112,16 +117,16 @@ class Survey:
     def read(
         self, visible: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
     ) -> tuple[RangeLines, NDArray[np.bool_]]:
-        """Return the lines of some channels between two ranges, and which have no samples.
+        """Return the lines of some channels between two ranges, and which of them lack samples.
 
         Parameters
         ----------
         visible : bool [channels]
             Channels to read; at least one.
         near_m, far_m : float64 [channels]
-            Ranges between which the samples are unchanged. If more was recorded, lines continue
-            for 32 samples and then fade over 64, so that they can be interpolated. Outside the
-            recording they are zero.
+            Ranges between which the samples are unchanged, metres. Beyond them the lines continue
+            for 32 recorded samples and then fade over 64, so that they can be interpolated.
+            Outside the recording they are zero.
 
         Returns
         -------
@@ -156,8 +161,8 @@ class Survey:
             first_m[here] = geometry.first_range_m[rows][chosen]
             first_m[here] += columns.start * geometry.range_step_m
             filled = here.stop
-        # The sum of a line shows defects quickly. It may also overflow or cancel, so suspected
-        # lines are checked sample by sample.
+        # The sum of a line reveals defects quickly. Since it may also overflow or cancel, only
+        # lines with a suspicious sum are checked sample by sample.
         with np.errstate(over="ignore", invalid="ignore"):
             sums = np.add.reduce(samples, axis=1)
         missing, silent = ~np.isfinite(sums), sums == 0
@@ -172,7 +177,7 @@ class Survey:
     def _blocks(
         self, visible: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
     ) -> Iterator[tuple[int, slice, slice]]:
-        """Yield part, channels and samples of every run of channels that is read together."""
+        """Yield the part, channels and samples of every block that is read at once."""
         step_m = self.geometry.range_step_m
         margin = _TAPER + _MARGIN
         for part, length in enumerate(self.lengths):
@@ -186,7 +191,7 @@ class Survey:
                 stop = int(np.ceil(((far_m[run] - first_m) / step_m).max())) + margin + 1
                 start = min(max(start, 0), length - 1)
                 stop = max(min(stop, length), start + 1)
-                # Near the ends of a line there is no room for a taper, so read up to the end.
+                # Near an end of the line a taper does not fit: read up to the end instead.
                 start = 0 if start < 2 * _TAPER else start
                 stop = length if stop > length - 2 * _TAPER else stop
                 yield part, slice(int(run[0]), int(run[-1]) + 1), slice(start, stop)
@@ -212,10 +217,10 @@ def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
     TypeError
         If `source` is neither lines nor a path.
     FileFormatError
-        If a file does not hold range lines.
+        If a file does not contain range lines.
     ValueError
-        If there is no file, or the files of a folder differ in carrier, sound speed, range step,
-        or in whether they have velocities.
+        If there is no file, or if the files of a folder differ in carrier, sound speed or range
+        step, or only some of them have velocities.
     OSError
         If a file cannot be read.
     """
@@ -224,7 +229,7 @@ def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
         return Survey(geometry, (source,), (0, source.channels), (source.length,), ((0, 0),))
     paths = files_of(source)
     if not paths:
-        raise ValueError(f"source must hold range lines: the folder {source} has no file *.h5")
+        raise ValueError(f"source must contain range lines, but {source} has no file *.h5")
     return open_files(paths)
 
 
@@ -237,7 +242,7 @@ def files_of(source: str | os.PathLike) -> tuple[Path, ...]:
 
 
 def has_ended(source: str | os.PathLike) -> bool:
-    """Return whether a survey is complete: it is a file, or its folder holds a file `end`."""
+    """Return whether a survey is complete: a file, or a folder that contains a file `end`."""
     path = Path(source)
     return not path.is_dir() or (path / END).exists()
 
@@ -254,14 +259,14 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
     Raises
     ------
     ValueError
-        As `open_survey` does, and if `paths` do not begin with the files of `before`.
+        As for `open_survey`, or if `paths` do not begin with the files of `before`.
     """
     known = 0 if before is None else len(before.parts)
     if before is not None and paths[:known] != before.files:
         changed = next(a for a, b in zip((*paths, None), before.files, strict=False) if a != b)
         raise ValueError(
-            f"source must grow by files whose names follow the last one, {before.files[-1].name}, "
-            f"got {'fewer files' if changed is None else changed.name}"
+            "source may only gain files whose names sort after the last one, "
+            f"{before.files[-1].name}, got {'fewer files' if changed is None else changed.name}"
         )
     stamps = [] if before is None else list(before.stamps)
     found = [] if before is None else [before.geometry]
@@ -277,11 +282,11 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
             ours, theirs = getattr(geometry, name), getattr(found[0], name)
             if ours != theirs:
                 raise ValueError(
-                    f"{path}: {name} must be that of the survey's first file, {theirs:g}, got "
+                    f"{path}: {name} must equal that of the survey's first file, {theirs:g}, got "
                     f"{ours:g}"
                 )
         for name in geometry.per_channel.keys() ^ found[0].per_channel.keys():
-            raise ValueError(f"{path}: {name} must be in every file of the survey or in none")
+            raise ValueError(f"{path}: {name} must be in all files of the survey or in none")
     entries = sum(each.size for part in found for each in part.per_channel.values())
     validate.memory(f"the {begins[-1]} channels of source", 8 * (entries + 2 * begins[-1]))
     of_channels: dict[str, Any] = {
@@ -293,9 +298,9 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
 
 
 def largest_gap_m(lines: RangeLines, missing: NDArray[np.bool_]) -> float:
-    """Return the longest distance between consecutive pings if it is a gap, else 0, metres.
+    """Return the longest distance between consecutive pings, metres, or 0 if it is not a gap.
 
-    A gap is longer than three median steps. Channels that are `missing` cause gaps, too.
+    A gap is longer than three median distances. Missing channels cause gaps too.
     """
     there = ~missing
     if np.count_nonzero(there) < 2:

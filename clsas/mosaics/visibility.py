@@ -1,4 +1,4 @@
-"""Visibility in surveys: the channels whose beam and recorded ranges reach a patch."""
+"""Visibility in surveys: which channels reach a patch with their beam and recorded ranges."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from clsas.sonar.beam import BeamWindow
 from clsas.sonar.directions import MOST_TRACK_PINGS
 from clsas.sonar.visibility import BeamTrack, Boxes
 
-# Memory of a channel while its visibility is found, without and with a beam: measured, 1e6 pings.
+# Bytes per channel that finding the visibility takes, without and with a beam: measured with 1e6
+# pings.
 _CHANNEL_BYTES, _BEAM_CHANNEL_BYTES = 200, 400
 
 
 @dataclass(frozen=True, eq=False)
 class SurveyVisibility:
-    """A survey with a beam.
+    """A survey and a beam, which determine the channels that contribute to a patch.
 
     Attributes
     ----------
     survey : Survey
     beam : BeamWindow or None
     along : float64 [channels, 3] or None
-        The track's unit directions; None without a beam.
+        Unit direction of the track at every channel; None without a beam.
     phase_centres_m : float64 [channels, 3]
     """
 
@@ -40,9 +41,12 @@ class SurveyVisibility:
 
     @classmethod
     def of(cls, survey: Survey, beam: BeamWindow | None) -> SurveyVisibility:
-        """Return a survey with the directions that a beam takes from its track.
+        """Return the visibility of a survey, with the directions of its track if there is a beam.
 
-        Raises ValueError if the channels of the survey do not fit into memory.
+        Raises
+        ------
+        ValueError
+            If the channels of the survey do not fit into memory.
         """
         per_channel = _CHANNEL_BYTES if beam is None else _BEAM_CHANNEL_BYTES
         validate.memory(f"the {survey.channels} channels of source", per_channel * survey.channels)
@@ -52,9 +56,9 @@ class SurveyVisibility:
 
     @property
     def settled(self) -> int:
-        """Number of channels, from the first, whose direction later channels will not change."""
+        """Number of leading channels whose direction later channels cannot change."""
         if self.beam is None:
-            return 0  # every channel may receive from every patch
+            return 0  # later channels may receive from any patch
         if self.beam.along is not None:
             return self.survey.channels
         pings = self.survey.geometry.ping_starts
@@ -62,7 +66,7 @@ class SurveyVisibility:
         return int(pings[-later]) if len(pings) > 2 * later else 0
 
     def ranges_m(self, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return bounds of the nearest and farthest range of a grid from every channel."""
+        """Return bounds of the nearest and farthest range of a grid from every channel, metres."""
         centre_m, half_m = bounding_box(grid)
         geometry = self.survey.geometry
         middle_m = bistatic_range_m(centre_m, geometry.tx_m, geometry.rx_m)
@@ -74,7 +78,7 @@ class SurveyVisibility:
         return middle_m - extent_m, middle_m + extent_m
 
     def channels(self, grid: Grid) -> NDArray[np.bool_]:
-        """Return which channels may contribute to a grid, [channels]."""
+        """Return which channels may contribute to a grid, bool [channels]."""
         found = self.survey.within(*self.ranges_m(grid))
         if self._beam_track is not None:
             centre_m, half_m = bounding_box(grid)
@@ -92,7 +96,7 @@ class SurveyVisibility:
         return first < self.survey.channels and bool(self.channels(grid)[first:].any())
 
     def has_passed(self, grid: Grid, settled: int) -> bool:
-        """Return whether the beam of the latest settled channels is ahead of a grid."""
+        """Return whether the beam of the latest settled channel has passed a grid completely."""
         if self.beam is None or self.along is None or self.any_channel_from(settled, grid):
             return False
         centre_m, half_m = bounding_box(grid)
@@ -101,13 +105,13 @@ class SurveyVisibility:
         extent_m = np.abs(half_m @ direction).sum()
         low, away_m = max(self.beam.limits[0], -1.0), float(np.linalg.norm(offset_m))
         radius_m = float(np.linalg.norm(np.abs(half_m).sum(axis=0)))
-        # The beam leaves the farthest point of the box last, or the nearest if it looks ahead.
+        # The beam leaves the farthest point of the box last, or the nearest if it points ahead.
         distance_m = away_m + radius_m if low < 0 else max(away_m - radius_m, 0.0)
         return bool(direction @ offset_m + extent_m < low * distance_m)
 
 
 def bounding_box(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the centre of a box around a grid, and half its sides as vectors [n, 3]."""
+    """Return the centre of a box around a grid, and half its edges as vectors [n, 3], metres."""
     if grid.points_m is not None:
         low, high = (edge(grid.points_m, axis=(0, 1)) for edge in (np.min, np.max))
         return (low + high) / 2, np.diag((high - low) / 2)

@@ -2,8 +2,8 @@
 
 A Dask scheduler runs any code that a client sends, and other users of the machine can connect to
 its port. Therefore every connection needs a certificate, which exists only in the memory of this
-run's processes. Dask's HTTP pages are switched off. Modules are imported from no folder that
-others can write to.
+run's processes. Dask's HTTP pages are switched off. No module is imported from a folder to which
+others can write.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from distributed.comm.core import CommClosedError
 from distributed.system import MEMORY_LIMIT
 
 from clsas.core.cache import private_folder
+from clsas.core.extras import needed
 from clsas.core.threads import uninterrupted
 
 _SAFE_PATH = "PYTHONSAFEPATH"
@@ -55,7 +56,7 @@ def local_client(workers: int) -> Iterator[Client]:
     OSError
         If the cache folder cannot be written, or others can write to it.
     """
-    # Scheduler and workers import modules from their folders.
+    # Scheduler and workers import modules from their folder, so it must be private.
     folder = private_folder("workers")
     opened = ExitStack()
     try:
@@ -102,12 +103,14 @@ def _cluster(workers: int, folder: Path) -> SpecCluster:
 
 @contextmanager
 def _deaf_to_ctrl_c() -> Iterator[None]:
-    """Let Ctrl-C, which a terminal sends to all processes, not reach those of a cluster.
+    """Start the processes of a cluster so that they ignore Ctrl-C.
 
-    Only this process heeds it, and ends the others. Processes inherit which signals are blocked
-    from the thread that starts them: that of the cluster, which inherits it from this one.
+    A terminal sends Ctrl-C to all processes. Only this process handles it, and ends the others.
+    A process inherits its blocked signals from the thread that starts it. Here this is the thread
+    of the cluster, which inherits them from the present thread.
     """
-    resource_tracker.ensure_running()  # else the first process does so, and unblocks Ctrl-C
+    # Otherwise starting the first process would start the tracker, which unblocks Ctrl-C.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -117,12 +120,12 @@ def _deaf_to_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def _environment_of_workers() -> Iterator[None]:
-    """Let processes that are started import nothing from the working directory.
+    """Prevent the processes that are started from importing modules of the working directory.
 
-    `python -c`, as which workers start, looks there first, and others may be able to write to it.
-    Afterwards this process has the variables that it had before. Dask sets its workers' variables
-    here, too, such as OMP_NUM_THREADS = 1, and adds the folder of a scheduler to where modules are
-    looked for.
+    Workers start as `python -c`, which searches the working directory first, and others may be able
+    to write to it. Afterwards the environment variables and `sys.path` are restored: Dask sets the
+    variables of its workers, such as OMP_NUM_THREADS = 1, in this process too, and adds the folder
+    of a scheduler to `sys.path`.
     """
     of_dask = config.get("distributed.nanny.pre-spawn-environ")
     names = (_SAFE_PATH, "PYTHONHASHSEED", "__DASK_PARENT_PID", *of_dask)
@@ -140,24 +143,20 @@ def _environment_of_workers() -> Iterator[None]:
 
 
 def _certificate() -> Security:
-    try:
-        return Security.temporary()
-    except ImportError:
-        raise ImportError(
-            "worker processes need the package cryptography, which makes the certificate that "
-            "keeps other users out: pip install 'clsas[mosaic]'"
-        ) from None
+    with needed("the certificate that keeps other users out of worker processes"):
+        import cryptography  # noqa: F401 (Dask imports it, and reports its absence otherwise)
+    return Security.temporary()
 
 
 def _cause(error: BaseException) -> str:
     """Return the first cause of an exception, on one line."""
     killed = "it was killed or exited by itself (out of memory?)"
-    if isinstance(error, CommClosedError):  # the end of the process was noticed by others first
+    if isinstance(error, CommClosedError):  # the connection broke before the process was missed
         return killed
     while error.__cause__ is not None:
         error = error.__cause__
     text = " ".join(str(error).split())
-    # This is all that Dask reports about a process that was killed.
+    # Dask reports nothing else about a process that was killed.
     if text == "Nanny failed to start worker process":
         return killed
     return f"{type(error).__name__}: {text}"

@@ -9,8 +9,8 @@ import numpy as np
 from clsas.core import validate
 from clsas.core.lines import RangeLines
 from clsas.core.pings import Transmissions
+from clsas.core.wavelengths import band_wavelength_m, is_about_zero
 from clsas.signal.readout import Readout
-from clsas.signal.spectrum import band_wavelength_m, is_about_zero
 
 _MOST_OVERSAMPLING = 64.0  # limits the range resolution of lines that are almost constant
 _REMEDY = "lines.without_still_pings() drops them"

@@ -13,9 +13,10 @@ from scipy.spatial.distance import cdist
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.image import Image
-from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.lines import RangeLines
 from clsas.core.phasors import phasors
 from clsas.core.threads import in_threads
+from clsas.core.wavelengths import wavelength_m
 from clsas.signal.readout import Readout
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.directions import track_directions

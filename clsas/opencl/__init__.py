@@ -1,1 +1,1 @@
-"""How a device sees the data: devices, kernels, upsampling, sine and cosine."""
+"""OpenCL: devices, kernels, buffers, upsampling, sine and cosine."""

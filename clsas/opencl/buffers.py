@@ -1,4 +1,4 @@
-"""The buffers that kernels share: their formats and sizes."""
+"""Formats and sizes of the buffers that kernels share."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import DTypeLike, NDArray
 
-from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.lines import RangeLines
 from clsas.core.threads import in_threads
+from clsas.core.wavelengths import wavelength_m
 from clsas.opencl import phases
 from clsas.opencl.device import Device, aligned
 from clsas.opencl.kernels import Kernel
@@ -23,14 +24,13 @@ from clsas.signal.interpolation import (
 from clsas.sonar.beam import INTERVALS, BeamWindow
 
 VECTOR_ROOM = 16
-"""Channels by which rows are longer in which a vector may begin at the last."""
-_LINES_AT_ONCE = 32  # upsampled together: what stays in a core's cache
-
+"""Padding, in channels, of rows in which a vector may begin at the last channel."""
+_LINES_AT_ONCE = 32  # lines that are upsampled together, so that they stay in a core's cache
 
 MARGIN = 32
-"""Zeros on either side of an upsampled line: what lies further out is moved into them."""
+"""Zeros on either side of an upsampled line. Positions farther out are moved into the zeros."""
 GUARD = 16
-"""Zeros on either side of a virtual channel's line, which the last stage's lookup may touch."""
+"""Zeros on either side of the line of a virtual channel, which the last stage's lookup may read."""
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,14 @@ class Buffer:
 
     @property
     def nbytes(self) -> int:
-        """Size of the buffer."""
+        """Size of the buffer, bytes."""
         return math.prod(self.shape) * np.dtype(self.dtype).itemsize
 
     def holding(self, values: NDArray) -> NDArray:
-        """Return an array of this shape and type that begins with values.
+        """Return an array of this shape and type that begins with the given values.
 
-        Only the last axis may be longer. There the last value is repeated: kernels compute whole
-        vectors, also of what is left out of their sums, and must not divide by zero.
+        Only the last axis may be longer. It is filled with the last value, because kernels compute
+        whole vectors, including lanes that are left out of the sums, and must not divide by zero.
         """
         count = values.shape[-1]
         if count == self.shape[-1]:
@@ -66,14 +66,15 @@ Buffers = dict[str, Buffer]
 
 @dataclass(frozen=True, eq=False)
 class BeamTable:
-    """A beam's weights on a device, tabulated over the sine of the aspect angle.
+    """Weights of a beam on a device, tabulated over the sine of the aspect angle.
 
     Attributes
     ----------
     per_sine : float
-        Intervals of the table per sine. Kernels take track directions times this.
+        Intervals of the table per unit of the sine. Track directions are multiplied by it before
+        they are handed to kernels.
     arguments : dict of str to Buffer or float
-        What the kernels take, by name (`cl/beam.h`).
+        Arguments of the kernels by name (`cl/beam.h`).
     """
 
     per_sine: float
@@ -81,13 +82,13 @@ class BeamTable:
 
     @property
     def origin(self) -> dict[str, Any]:
-        """The arguments of `expand_tiles`."""
+        """Arguments of the kernel `expand_tiles`."""
         name = "beam_origin"
         return {name: self.arguments[name]} if self.arguments else {}
 
 
 def beam_table(device: Device, beam: BeamWindow | None, lines: RangeLines) -> BeamTable:
-    """Upload a beam's weights; without a beam, kernels take no arguments for it."""
+    """Upload the weights of a beam. Without a beam, kernels have no arguments for it."""
     if beam is None:
         return BeamTable(0.0, {})
     low, high = (float(limit) for limit in beam.limits)
@@ -112,10 +113,10 @@ def upsampled_lines(
     pitch: int,
     gain: Gain | None = None,
 ) -> NDArray[np.float32]:
-    """Return lines upsampled as the kernels want them: `pitch` samples each, zeros around.
+    """Return upsampled lines in the format of the kernels: `pitch` samples each, with zeros around.
 
-    With one lane per work-item they are interleaved, [channels, pitch, 2]; with more, real and
-    imaginary parts are planes, [channels, 2, pitch]. `gain` multiplies their spectrum.
+    With one lane per work-item, real and imaginary parts are interleaved, [channels, pitch, 2].
+    With more lanes they are separate, [channels, 2, pitch]. The spectrum is multiplied by `gain`.
     """
     of_line = (pitch, 2) if width == 1 else (2, pitch)
     padded = aligned(np.zeros, (len(samples), *of_line), np.float32)
@@ -137,13 +138,13 @@ def upsampled_lines(
 
 
 def float_pairs(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return float32 [n, 6]: positions [n, 3] as nearest float32 numbers, and what these leave."""
+    """Return positions [n, 3] rounded to float32, followed by the remainders, float32 [n, 6]."""
     nearest = positions_m.astype(np.float32)
     return np.concatenate([nearest, (positions_m - nearest).astype(np.float32)], axis=1)
 
 
 def filter_table(device: Device, coefficients: NDArray[np.floating]) -> cl.Buffer:
-    """Upload the coefficients of an interpolation filter as kernels take them."""
+    """Upload the coefficients of an interpolation filter in the format of the kernels."""
     return device.upload(coefficients.astype(np.float32))
 
 
@@ -153,39 +154,39 @@ def phase_polynomials(device: Device, terms: int) -> cl.Buffer:
 
 
 def expansion_terms(beam: BeamWindow | None) -> int:
-    """Return how many numbers `expand_tiles` finds per tile and channel."""
+    """Return the number of coefficients that `expand_tiles` computes per tile and channel."""
     return 9 if beam is None else 19
 
 
 def expansion_kernel(device: Device, beam: BeamWindow | None, **paths: int) -> Kernel:
-    """Return `expand_tiles`; `paths` are its options BISTATIC and MOVING."""
+    """Return the kernel `expand_tiles`; `paths` are its options BISTATIC and MOVING."""
     intervals = 0 if beam is None else INTERVALS
     return device.kernel("expand_tiles", WIDTH=device.info.width, BEAM=intervals, **paths)
 
 
 def channel_pitch(channels: int) -> int:
-    """Channels with padding to whole vectors of any width."""
+    """Return the number of channels padded to whole vectors of any width."""
     return round_up(channels, 16)
 
 
 def round_up(number: int, multiple: int) -> int:
-    """Return the least multiple that is not below a number."""
+    """Return the smallest multiple that is not below a number."""
     return -(-number // multiple) * multiple
 
 
 def slices(whole: slice, most: int) -> Iterator[slice]:
-    """Cut a slice into pieces of at most `most`."""
+    """Divide a slice into pieces of at most `most`."""
     for start in range(whole.start, whole.stop, most):
         yield slice(start, min(start + most, whole.stop))
 
 
 def lines_buffer(lines: int, pitch: int, half_precision: bool) -> Buffer:
-    """Return the buffer of lines that stages take up, and hand on."""
+    """Return the buffer of the lines that stages read and write."""
     return Buffer((lines, pitch, 2), np.float16 if half_precision else np.float32)
 
 
 def beam_buffers(beam: BeamWindow | None) -> Buffers:
-    """Return the table of a beam's weights."""
+    """Return the buffer of the table of a beam's weights."""
     return {} if beam is None else {"beam_table": Buffer((INTERVALS, 4), np.float32)}
 
 
@@ -195,7 +196,7 @@ def total_bytes(buffers: Buffers) -> int:
 
 
 def pixel_buffers(pixels: int, beam: BeamWindow | None) -> Buffers:
-    """Return the pixels formed together, and the sums of their weights for a normalising beam."""
+    """Return buffers for pixels and, with a normalising beam, for the sums of their weights."""
     buffers = {"pixels": Buffer((pixels,), np.complex64)}
     if beam is not None and beam.normalise:
         buffers["weight_sums"] = Buffer((pixels,), np.complex64)
@@ -203,19 +204,20 @@ def pixel_buffers(pixels: int, beam: BeamWindow | None) -> Buffers:
 
 
 def padded_length(resampling: Resampling) -> int:
-    """Return the samples of an upsampled line on the device, with zeros around it.
+    """Return the length of an upsampled line on the device, with the zeros around it.
 
-    Lines at equal places in a cache's sets would evict each other.
+    A multiple of 256 is avoided, because lines at the same positions of cache sets would evict each
+    other.
     """
     length = -(-(resampling.length + 2 * MARGIN) // 16) * 16
     return length + 16 * (length % 256 == 0)
 
 
 class Slot:
-    """Named buffers of one job, filled anew once the job that used them last is done.
+    """Named buffers of one job, which are filled again once the job that used them is done.
 
-    With two slots in turn the host fills one while the device works on the other. `busy` is to be
-    set to the last event that uses any of them.
+    With two slots in turn, the host fills one while the device works on the other. Set `busy` to
+    the last event that uses any of the buffers.
     """
 
     def __init__(self, device: Device) -> None:
@@ -225,11 +227,11 @@ class Slot:
         self._buffers: dict[str, cl.Buffer] = {}
 
     def __getitem__(self, name: str) -> cl.Buffer:
-        """Return a buffer that was filled or made before."""
+        """Return a buffer that was filled or made earlier."""
         return self._buffers[name]
 
     def wait(self) -> None:
-        """Wait until the buffers are free; to be called before they are filled."""
+        """Wait until the buffers are free. Call this before they are filled."""
         self._wait_for_job()
         self.filled.clear()
 
@@ -242,11 +244,11 @@ class Slot:
         return {name: self.buffer(name, buffer.nbytes) for name, buffer in buffers.items()}
 
     def zeros(self, name: str, bytes_: int) -> cl.Buffer:
-        """Return a buffer of at least so many bytes, that held zeros when it was made."""
+        """Return a buffer of at least so many bytes, which contained zeros when it was made."""
         return self._at_least(name, bytes_, self.device.zeros)
 
     def _wait_for_job(self) -> None:
-        # A job of which nothing was seen has not waited for what was filled for it.
+        # A job that no channel contributes to is never run, so nothing has waited for its uploads.
         for event in [*self.filled, *([] if self.busy is None else [self.busy])]:
             event.wait()
 
@@ -260,7 +262,7 @@ class Slot:
         return self._buffers[name]
 
     def fill(self, name: str, array: np.ndarray) -> None:
-        """Start copying an array into a buffer; `filled` gains the event to wait for."""
+        """Start copying an array into a buffer; the event to wait for is appended to `filled`."""
         array = np.ascontiguousarray(array)
         buffer = self.buffer(name, array.nbytes)
         event = cl.enqueue_copy(self.device.uploads, buffer, array, is_blocking=False)

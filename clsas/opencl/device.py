@@ -1,4 +1,4 @@
-"""Choosing an OpenCL device, building kernels once, and profiling them."""
+"""Choice of an OpenCL device, building of kernels, and profiling."""
 
 from __future__ import annotations
 
@@ -26,42 +26,42 @@ from clsas.opencl.refusals import DeviceError, check_process, no_device, no_matc
 
 ENVIRONMENT_VARIABLE = "CLSAS_DEVICE"
 KINDS = ("gpu", "cpu", "accelerator")
-"""Kinds of device, from the one that is chosen first."""
+"""Kinds of device, in the order in which they are preferred."""
 _PLATFORMS = {"pocl": "portable computing language"}
-"""Names of platforms that people use and that are no part of the full one, in lower case."""
-_ALIGNMENT = 4096  # bytes: of pages
-# Kernels that a device keeps built: up to 0.6 MiB each with PoCL, 4 MiB with Intel's runtime. An
-# image takes 1 to 5 of them.
+"""Common names of platforms that are not part of the full name, in lower case."""
+_ALIGNMENT = 4096  # bytes: size of a page
+# Built kernels that a device keeps. They take up to 0.6 MiB each with PoCL, and up to 4 MiB with
+# Intel's runtime. An image uses 1 to 5 kernels.
 _MOST_KERNELS = 32
 
-_GROUP = 64  # work-items of a GPU's work-groups: two warps, or a wavefront
+_GROUP = 64  # work-items of a work-group on a GPU: two warps, or a wavefront
 
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """One OpenCL device, and how clsas would drive it.
+    """Properties of an OpenCL device, and the way in which clsas uses it.
 
     Attributes
     ----------
     index : int
-        Place in `list_devices()`.
+        Position in `list_devices()`.
     platform, name, driver : str
-        As the driver reports them.
+        Platform, name and driver version, as reported by the driver.
     kind : str
         "gpu", "cpu" or "accelerator".
     compute_units : int
-        Cores of a CPU, multiprocessors of a GPU.
+        Number of cores of a CPU, or of multiprocessors of a GPU.
     memory_bytes, max_buffer_bytes : int
-        Global memory and largest single buffer.
+        Size of the global memory and of the largest single buffer.
     fp64 : bool
-        True if the device has double precision (clsas never needs it).
+        True if the device has double precision, which clsas does not need.
     width : int
-        Float lanes per work-item that clsas uses: 1 on GPUs, and where the driver's compiler
-        vectorises across work-items itself.
+        Float lanes per work-item that clsas uses. It is 1 on GPUs, and on CPUs whose compiler
+        vectorises across work-items.
     stage_width : int
         Float lanes per work-item in factorized images.
     permute : bool
-        True if kernels may look samples up in registers, of AVX2 or AVX-512.
+        True if kernels may look up samples in registers of AVX2 or AVX-512.
     """
 
     index: int
@@ -81,21 +81,21 @@ class DeviceInfo:
 
     @property
     def half_precision(self) -> bool:
-        """True if kernels load and store half-precision numbers as fast as others.
+        """True if kernels load and store half-precision numbers as fast as single precision.
 
-        Of CPUs those do that permute.
+        Among CPUs, those with `permute` do.
         """
         return self.kind == "gpu" or self.permute
 
     @property
     def label(self) -> str:
-        """Platform and name in one string; what a name is matched against."""
+        """Platform and name in one string, with which the names that users give are compared."""
         return f"{self.platform}: {self.name}"
 
 
 @dataclass(frozen=True)
 class KernelTimes:
-    """How often a kernel ran on the device, and for how long, in seconds."""
+    """Number of runs of a kernel on the device, and their times in seconds."""
 
     count: int
     minimum_s: float
@@ -106,17 +106,17 @@ class KernelTimes:
 
 @dataclass(eq=False)
 class Device:
-    """An opened device: its context, its queues and the kernels built so far.
+    """Open device: its context, its queues and the kernels built so far.
 
-    Kernels run in order on `queue`; uploads go through `uploads`, beside them. Threads may share
-    a device; `profile` then counts what all of them run.
+    Kernels run in order on `queue`. Uploads run beside them on `uploads`. Threads may share a
+    device; `profile` then counts the kernels of all threads.
     """
 
     info: DeviceInfo
     context: cl.Context
     queue: cl.CommandQueue
     uploads: cl.CommandQueue
-    # By name and options; the kernel used last is the last one.
+    # By name and options. The kernel that was used last comes last.
     _kernels: dict[tuple, Kernel] = field(default_factory=dict, repr=False)
     _events: list[tuple[str, cl.Event]] | None = field(default=None, repr=False)
 
@@ -125,23 +125,24 @@ class Device:
         return reprs.summary(self, repr(self.info.label))
 
     def __reduce__(self) -> tuple[Callable[[DeviceInfo], Device], tuple[DeviceInfo]]:
-        """Pickle as what it is called: the process that reads it opens its own device."""
+        """Pickle the description only. The process that unpickles it opens its own device."""
         return _opened_alike, (self.info,)
 
-    # A kernel holds its arguments from when they are set until it is enqueued.
+    # Held from when the arguments of a kernel are set until it is enqueued, because the kernel
+    # stores them.
     _lock: threading.RLock = field(default_factory=threading.RLock, repr=False)
 
     def for_stages(self) -> Device:
-        """Return the device as factorized images drive it: kernels and profile are shared."""
+        """Return the device with the width of factorized images; kernels and profile are shared."""
         if self.info.width == self.info.stage_width:
             return self
         return replace(self, info=replace(self.info, width=self.info.stage_width))
 
     @property
     def build_seconds(self) -> float:
-        """Time that the driver took to build the kernels which the device holds.
+        """Time that the driver took to build the kernels that the device keeps, seconds.
 
-        Drivers that compile again when a kernel first runs, as PoCL does, take more in all.
+        Drivers such as PoCL compile again when a kernel first runs. That time is not included.
         """
         with self._lock:
             return sum(kernel.build_seconds for kernel in self._kernels.values())
@@ -149,20 +150,20 @@ class Device:
     def kernel(self, name: str, **options: int) -> Kernel:
         """Return the kernel of `cl/<name>.cl`, built once per set of options.
 
-        The device keeps the 32 kernels that were used last. A kernel used again after that is
-        built again, which is a lookup in the driver's cache on disk.
+        The device keeps the 32 kernels that were used last. Others are built again when they are
+        needed, which takes only a lookup in the driver's cache on disk.
 
         Parameters
         ----------
         name : str
-            The kernel, which has a file of its own.
+            Name of the kernel and of its file.
         **options : int
             Preprocessor definitions.
 
         Raises
         ------
         DeviceError
-            If the driver's compiler refuses it; the message holds the compiler's log.
+            If the driver's compiler refuses the kernel. The message contains the compiler's log.
         """
         check_process()
         key = (name, *sorted(options.items()))
@@ -170,7 +171,7 @@ class Device:
             kernel = self._kernels.pop(key, None) or self._build(name, options)
             self._kernels[key] = kernel
             while len(self._kernels) > _MOST_KERNELS:
-                # Runs hold the kernels they use, and the driver those it was given.
+                # Runs keep references to the kernels they use, and the driver to those enqueued.
                 del self._kernels[next(iter(self._kernels))]
             return kernel
 
@@ -184,7 +185,7 @@ class Device:
         except cl.RuntimeError as error:
             what = f"{self.info.label} could not build {name}.cl with {' '.join(definitions)}"
             raise not_built(what, self.info.platform, error) from error
-        # Not Program.all_kernels: PyOpenCL never releases what that returns.
+        # Program.all_kernels is avoided, because PyOpenCL never releases the kernels it returns.
         compiled = cl.Kernel(program, name)
         return Kernel(name, parameters, compiled, build_seconds=time.perf_counter() - start)
 
@@ -200,10 +201,10 @@ class Device:
     ) -> cl.Event:
         """Enqueue a kernel over `size` work-items, with an argument for each of its parameters.
 
-        Unless `local` says otherwise, work-items that hold vectors are work-groups of their own
-        (PoCL compiles a kernel anew for every local size). On a GPU 64 along the first axis form
-        one, which share what a tile or a line needs, or as many as divide the axis. Elsewhere the
-        driver chooses.
+        Unless `local` is given, every work-item with several lanes is a work-group of its own,
+        because PoCL compiles a kernel again for every local size. On a GPU, 64 work-items along the
+        first axis form a work-group and share the data of a tile or a line. If 64 does not divide
+        the axis, the largest common divisor is taken. Otherwise the driver chooses.
 
         Parameters
         ----------
@@ -212,12 +213,12 @@ class Device:
         size : tuple of int
             Work-items along each axis.
         wait_for : sequence of Event, optional
-            What the kernel starts after, beside what is on the queue.
+            Events after which the kernel starts, in addition to those on the queue.
         local : tuple of int, optional
             Work-items of a work-group along each axis.
         **arguments : Buffer, int, float or array
-            By the names of the kernel's parameters: a buffer for every pointer; numbers, converted
-            to 32 bits; for `float2` to `float4` as many numbers.
+            Arguments by the names of the kernel's parameters: a buffer for every pointer, numbers,
+            which are converted to 32 bits, and 2 to 4 numbers for `float2` to `float4`.
 
         Raises
         ------
@@ -237,12 +238,12 @@ class Device:
         return event
 
     def in_whole_groups(self, items: int) -> int:
-        """Return a number of work-items, on a GPU with those that fill the last work-group."""
+        """Return a number of work-items, rounded up to whole work-groups on a GPU."""
         return -(-items // _GROUP) * _GROUP if self.info.kind == "gpu" else items
 
     @contextlib.contextmanager
     def profile(self) -> Iterator[dict[str, KernelTimes]]:
-        """Time every kernel run within the block; the yielded dict is filled at its end."""
+        """Time every kernel run within the block. The yielded dict is filled at its end."""
         times: dict[str, KernelTimes] = {}
         self._events = []
         try:
@@ -259,25 +260,25 @@ class Device:
             self._events = None
 
     def finish(self) -> None:
-        """Wait until the device has done all it was given."""
+        """Wait until the device has finished everything that was enqueued."""
         check_process()
         self.uploads.finish()
         self.queue.finish()
 
     def buffer(self, bytes_: int) -> cl.Buffer:
-        """Return a read-write buffer of anything, to be kept until the device is done with it."""
+        """Return an uninitialised buffer. Keep it until the device is done with it."""
         check_process()
         flags, bytes_ = cl.mem_flags.READ_WRITE, max(int(bytes_), 4)
         if self.info.kind != "cpu":
             return cl.Buffer(self.context, flags, bytes_)
-        # NumPy's memory lies in large pages where the system has them: far fewer faults and
-        # misses than in a driver's.
+        # NumPy allocates large pages where the system has them. There are far fewer page faults and
+        # TLB misses than in memory that a driver allocates.
         return self.share(aligned(np.empty, (bytes_,), np.uint8))
 
     def share(self, array: np.ndarray) -> cl.Buffer:
-        """Return a buffer that holds an array: on a CPU its own memory, elsewhere a copy.
+        """Return a buffer with the contents of an array: its own memory on a CPU, else a copy.
 
-        Both are to be kept, and the array left alone, until the device is done with them.
+        Keep both, and do not change the array, until the device is done with them.
         """
         check_process()
         how = cl.mem_flags.USE_HOST_PTR if self.info.kind == "cpu" else cl.mem_flags.COPY_HOST_PTR
@@ -285,7 +286,7 @@ class Device:
         return cl.Buffer(self.context, access | how, hostbuf=array)
 
     def upload(self, array: np.ndarray) -> cl.Buffer:
-        """Return a buffer that holds a copy of `array`; one of anything where that is empty."""
+        """Return a buffer with a copy of `array`, or an uninitialised buffer if it is empty."""
         check_process()
         if not array.size:
             return self.buffer(0)
@@ -302,7 +303,7 @@ class Device:
 
 
 def aligned(make: Callable[..., np.ndarray], shape: tuple[int, ...], kind: DTypeLike) -> np.ndarray:
-    """Return np.empty or np.zeros of a shape that begins where vectors and pages do."""
+    """Return an array made by np.empty or np.zeros that begins at the start of a page."""
     count = math.prod(shape) * np.dtype(kind).itemsize
     memory = make(count + _ALIGNMENT, np.uint8)
     start = -memory.ctypes.data % _ALIGNMENT
@@ -312,7 +313,7 @@ def aligned(make: Callable[..., np.ndarray], shape: tuple[int, ...], kind: DType
 def _built(context: cl.Context, text: str, options: Sequence[str] = ()) -> cl.Program:
     """Return a built program."""
     with warnings.catch_warnings():
-        # Some drivers' compilers greet; a failure brings its log anyway.
+        # Some compilers print a greeting. If a build fails, the error contains the log in any case.
         warnings.simplefilter("ignore", cl.CompilerWarning)
         return cl.Program(context, text).build(list(options))
 
@@ -323,8 +324,9 @@ def _describe(index: int, device: cl.Device) -> DeviceInfo:
     platform = device.platform.name
     width, permute, stage_width = 1, False, 1
     if is_cpu and platform.startswith("Intel"):
-        # Its compiler vectorises exact images across work-items, faster than through explicit
-        # vectors. In stages it fails to, and is twelve times as slow as with them.
+        # Intel's compiler vectorises exact images across work-items, which is faster than explicit
+        # vectors. It fails to do so in stages, which are then twelve times as slow as with explicit
+        # vectors.
         lanes = device.native_vector_width_float
         stage_width = lanes if lanes in (8, 16) else 4
     elif is_cpu:
@@ -348,12 +350,12 @@ def _describe(index: int, device: cl.Device) -> DeviceInfo:
 
 @functools.cache
 def _compiled_vectors(device: cl.Device) -> tuple[int, bool]:
-    """Return the floats of a vector as a CPU's compiler has them, and whether it permutes them."""
+    """Return the number of floats in a vector of a CPU, and whether its compiler permutes them."""
     try:
         context = cl.Context([device])
         kernel = cl.Kernel(_built(context, kernel_source("vector_size.cl")), "vector_size")
         size = kernel.get_work_group_info(cl.kernel_work_group_info.COMPILE_WORK_GROUP_SIZE, device)
-    except cl.Error:  # whatever is wrong is told where there is work to do
+    except cl.Error:  # the error is reported when a kernel is built for an image
         return 4, False
     lanes, permute, _ = size
     return (lanes, permute == 2) if lanes in (8, 16) else (4, False)
@@ -375,72 +377,92 @@ def _raw_devices() -> list[cl.Device]:
 
 
 def list_devices() -> list[DeviceInfo]:
-    """Return every OpenCL device of every platform; empty when there is none."""
-    return [_describe(index, device) for index, device in enumerate(_raw_devices())]
+    """Return all OpenCL devices of all platforms.
 
-
-def choose(wish: str | int | None = None) -> tuple[DeviceInfo, str]:
-    """Return the device that `wish` names, and why it was chosen.
-
-    Parameters
-    ----------
-    wish : str or int, optional
-        An index of `list_devices()`, a kind ("gpu", "cpu" or "accelerator"), a platform or part
-        of its name ("pocl", "intel", "nvidia", "amd"), or a part of "platform: name"; in any case.
-        What comes first in this list and matches counts: "intel" is Intel's platform also where
-        other platforms drive an Intel CPU. None takes the environment variable CLSAS_DEVICE.
-        Of several devices that match, or without a wish, the first GPU is chosen, then the CPU
-        with the widest vectors.
+    Returns
+    -------
+    list of DeviceInfo
+        Empty if there is no device.
 
     Raises
     ------
     DeviceError
-        If there is no device, saying how to get one, or none that fits, naming those there are.
+        In a process that was forked after its parent had used OpenCL.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> for device in clsas.list_devices():
+    ...     print(device.index, device.label)  # doctest: +SKIP
+    0 Portable Computing Language: pthread-AMD EPYC 7763 64-Core Processor
+    """
+    return [_describe(index, device) for index, device in enumerate(_raw_devices())]
+
+
+def choose(request: str | int | None = None) -> tuple[DeviceInfo, str]:
+    """Return the device that a request names, and the reason for the choice.
+
+    Parameters
+    ----------
+    request : str or int, optional
+        An index of `list_devices()`, a kind ("gpu", "cpu" or "accelerator"), a platform or part of
+        its name ("pocl", "intel", "nvidia", "amd"), or part of "platform: name". Upper and lower
+        case are the same. The first of these that matches is used, so that "intel" is Intel's
+        platform even if other platforms also support the Intel CPU. By default the environment
+        variable CLSAS_DEVICE is the request. If several devices match, or there is no request, the
+        first GPU is chosen, or else the CPU with the widest vectors.
+
+    Raises
+    ------
+    DeviceError
+        If there is no device, or none that matches. The message says how to get a device, or lists
+        the available ones.
     """
     devices = list_devices()
     if not devices:
         raise no_device()
     source = ""
-    if wish is None and os.environ.get(ENVIRONMENT_VARIABLE):
-        wish = os.environ[ENVIRONMENT_VARIABLE]
+    if request is None and os.environ.get(ENVIRONMENT_VARIABLE):
+        request = os.environ[ENVIRONMENT_VARIABLE]
         source = f" by {ENVIRONMENT_VARIABLE}"
-    if wish is None:
+    if request is None:
         chosen = _first(devices)
         if chosen.kind == "gpu":
             return chosen, "the first GPU"
         widest = f" with vectors of {chosen.width}" if chosen.width > 1 else ""
         return chosen, f"the first {chosen.kind.upper()}{widest}; there is no GPU"
-    if isinstance(wish, str) and re.fullmatch(r"\s*[0-9]+\s*", wish, re.ASCII):
-        wish = int(wish)
-    if isinstance(wish, (int, np.integer)) and not isinstance(wish, bool):
-        fitting = [info for info in devices if info.index == wish]
-    elif isinstance(wish, str):
-        fitting = _named(wish.strip().lower(), devices)
+    if isinstance(request, str) and re.fullmatch(r"\s*[0-9]+\s*", request, re.ASCII):
+        request = int(request)
+    if isinstance(request, (int, np.integer)) and not isinstance(request, bool):
+        matching = [info for info in devices if info.index == request]
+    elif isinstance(request, str):
+        matching = _named(request.strip().lower(), devices)
     else:
-        raise TypeError(f"device must be a name, an index or None, got {validate.shown(wish)}")
-    if not fitting:
+        raise TypeError(f"device must be a name, an index or None, got {validate.shown(request)}")
+    if not matching:
         have = "; ".join(f"{info.index}: {info.label}" for info in devices)
-        raise no_match(f"{validate.shown(wish)}, asked for{source}. Available: {have}", devices)
-    return _first(fitting), f"asked for{source} as {wish!r}"
+        name = validate.shown(request)
+        raise no_match(f"{name}, which was requested{source}. Available: {have}", devices)
+    return _first(matching), f"requested{source} as {request!r}"
 
 
 def _first(devices: Sequence[DeviceInfo]) -> DeviceInfo:
-    """Return the device that is chosen of several: a GPU, else the CPU of the widest vectors."""
+    """Return the preferred device of several: a GPU, or else the CPU with the widest vectors."""
     return min(devices, key=lambda info: (KINDS.index(info.kind), -info.width, info.index))
 
 
 def _named(name: str, devices: Sequence[DeviceInfo]) -> list[DeviceInfo]:
-    """Return the devices of a kind, else of a platform, else those whose label holds a name."""
+    """Return the devices of a kind, or else of a platform, or else with a name in their label."""
     if not name:
         return []
     names = name, _PLATFORMS.get(name, name)
-    for fits in (
+    for matches in (
         lambda info: info.kind == name,
         lambda info: any(each in info.platform.lower() for each in names),
         lambda info: any(each in info.label.lower() for each in names),
     ):
-        if fitting := [info for info in devices if fits(info)]:
-            return fitting
+        if matching := [info for info in devices if matches(info)]:
+            return matching
     return []
 
 
@@ -454,7 +476,7 @@ def _open(index: int) -> Device:
 
 
 def _opened_alike(info: DeviceInfo) -> Device:
-    """Return the device of this process that is like another process's: what unpickling does."""
+    """Return the device of this process that matches a description, to unpickle a device."""
     alike = [each for each in list_devices() if each.label == info.label]
     if not alike:
         known = ", ".join(each.label for each in list_devices())
@@ -465,8 +487,11 @@ def _opened_alike(info: DeviceInfo) -> Device:
     return _open(same[0].index)
 
 
-def open_device(wish: Device | str | int | None = None) -> Device:
-    """Return an opened device: `wish` itself, or what `choose` finds; opened once per process."""
-    if isinstance(wish, Device):
-        return wish
-    return _open(choose(wish)[0].index)
+def open_device(request: Device | str | int | None = None) -> Device:
+    """Return `request` if it is an open device, or else the device that `choose` returns.
+
+    Every device is opened once per process.
+    """
+    if isinstance(request, Device):
+        return request
+    return _open(choose(request)[0].index)

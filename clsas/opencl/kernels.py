@@ -1,4 +1,4 @@
-"""Kernels of `cl/`: their sources, and how they take their arguments by name."""
+"""Kernels of `cl/`: their sources, and their arguments by name."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def kernel_source(name: str) -> str:
 
 
 def whole_source(name: str) -> str:
-    """Return the text of a file of `cl/` with the headers that it includes in place, each once.
+    """Return the text of a file of `cl/` in which every included header is inserted, each once.
 
-    Headers are put in here, not found by the driver, because some drivers cannot read paths with
-    spaces, or keep what they built from a header that has changed since. The compiler's messages
-    name the files nevertheless.
+    Headers are inserted here and not by the driver, because some drivers cannot read paths with
+    spaces, or do not build again after a header has changed. Messages of the compiler still name
+    the original files.
     """
     return "\n".join(_with_headers(name, set()))
 
@@ -54,26 +54,26 @@ def _with_headers(name: str, included: set[str]) -> list[str]:
 
 
 def kernel_parameters(text: str, name: str, options: Mapping[str, int]) -> dict[str, str]:
-    """Return the parameters of a kernel, in order: their types by their names.
+    """Return the parameters of a kernel in order, as types by name.
 
-    They are read from the source because drivers' own answers cannot be relied on: Intel's has
-    none for a program from a cache, and PoCL renames parameters that are called like one of
-    OpenCL's functions. The list may hold `#if`, `#else` and `#endif`, with build options, `!` and
-    `&&` as conditions.
+    They are read from the source, because the answers of drivers are not reliable: Intel's driver
+    has none for a program from its cache, and PoCL renames parameters with the name of an OpenCL
+    function. The parameter list may contain `#if`, `#else` and `#endif`, with build options, `!`
+    and `&&` in conditions.
 
     Parameters
     ----------
     text : str
         Source of the program.
     name : str
-        The kernel.
+        Name of the kernel.
     options : mapping of str to int
-        Build options. One that is missing is 0, as it is to the compiler.
+        Build options. A missing option is 0, as it is for the compiler.
 
     Returns
     -------
     dict of str to str
-        A type is "buffer", or that of a number or vector, as in "int" or "float4".
+        Each type is "buffer", or the type of a number or vector, such as "int" or "float4".
     """
     text = _COMMENT.sub("", text)
     found = re.search(rf"__kernel\s+void\s+{name}\s*\(([^)]*)\)", text)
@@ -91,7 +91,7 @@ def kernel_parameters(text: str, name: str, options: Mapping[str, int]) -> dict[
 
 
 def _compiled_lines(lines: Sequence[str], options: Mapping[str, int]) -> list[str]:
-    """Return the lines that the preprocessor leaves."""
+    """Return the lines that remain after preprocessing."""
     left, conditions = [], []
     for line in lines:
         directive, _, condition = line.strip().partition(" ")
@@ -102,7 +102,9 @@ def _compiled_lines(lines: Sequence[str], options: Mapping[str, int]) -> list[st
         elif directive == "#endif":
             conditions.pop()
         elif directive.startswith("#"):
-            raise ValueError(f"parameters of kernels take #if, #else and #endif, not {line!r}")
+            raise ValueError(
+                f"parameters of kernels may contain #if, #else and #endif, but not {line!r}"
+            )
         elif all(conditions):
             left.append(line)
     return left
@@ -120,16 +122,16 @@ def _is_true(condition: str, options: Mapping[str, int]) -> bool:
 
 @dataclass(eq=False)
 class Kernel:
-    """A built kernel, whose arguments are given by the names of its parameters.
+    """Built kernel, whose arguments are given by the names of its parameters.
 
     Attributes
     ----------
     name : str
     parameters : dict of str to str
-        Types by names, in order; see `kernel_parameters`.
+        Types by name, in order; see `kernel_parameters`.
     compiled : pyopencl.Kernel
     build_seconds : float
-        Time that the driver took to build it.
+        Time that the driver took to build the kernel.
     """
 
     name: str
@@ -138,7 +140,7 @@ class Kernel:
     build_seconds: float = 0.0
 
     def __post_init__(self) -> None:
-        """Tell the driver the types; refuse a source that does not fit what was built."""
+        """Set the argument types; refuse a source that does not agree with the built kernel."""
         self._converters = {
             parameter: _converter(type_) for parameter, type_ in self.parameters.items()
         }
@@ -147,7 +149,7 @@ class Kernel:
                 f"kernel {self.name} was built with {self.compiled.num_args} parameters, but its "
                 f"source declares {len(self.parameters)}: {', '.join(self.parameters)}"
             )
-        # PyOpenCL hands numbers of known types over ten times as fast.
+        # PyOpenCL passes numbers ten times as fast if their types are known.
         self.compiled.set_scalar_arg_dtypes(
             [_SCALARS.get(type_) for type_ in self.parameters.values()]
         )
@@ -158,7 +160,7 @@ class Kernel:
         Raises
         ------
         TypeError
-            If an argument is missing or unknown, or does not fit its parameter.
+            If an argument is missing or unknown, or has a type that does not match its parameter.
         """
         if arguments.keys() != self.parameters.keys():
             missing = [name for name in self.parameters if name not in arguments]
@@ -179,7 +181,7 @@ class Kernel:
 
 
 def _converter(type_: str) -> Callable[[object], object]:
-    """Return a function that converts a value to a parameter's type, or says what must be given."""
+    """Return a function that converts a value to the type of a parameter, or raises TypeError."""
     scalars = {"buffer": _buffer, "int": _int, "float": _float}
     if type_ in scalars:
         return scalars[type_]
@@ -211,7 +213,7 @@ def _vector(length: int, value: object) -> np.ndarray:
     vector = np.asarray(value)
     if vector.shape != (length,) or vector.dtype.kind not in "iuf":
         raise TypeError(f"{length} numbers")
-    # A vector of three takes the room of four.
+    # A vector of three numbers is stored in the space of four.
     converted = np.zeros(4 if length == 3 else length, np.float32)
     converted[:length] = vector
     return converted

@@ -1,4 +1,4 @@
-"""Polynomials for the sine and cosine of a phase, as short as an image's error allows."""
+"""Polynomials for the sine and cosine of a phase, as short as the error of an image allows."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 TERMS = (4, 5, 6)
-"""Of a polynomial: relative rms errors of -61, -92 and -126 dB."""
+"""Numbers of terms that are available. Their relative rms errors are -61, -92 and -126 dB."""
 PRECISE_TERMS = 7
-"""Of a polynomial that errs by no more than single precision, for phases on which images depend
-more than once: those of upsampling and of stages."""
+"""Number of terms with which the error is that of single precision. It is used for phases on which
+several parts of an image depend: those of upsampling and of stages."""
 
 FACTORIZED_SHARE, EXACT_SHARE = 0.03, 0.08
-"""Of an image's error, as power. Errors of the many channels of exact images average out."""
+"""Shares of the error power of an image that polynomials may add. Exact images may have the larger
+one, because the errors of their many channels average out."""
 
 _PHASES = (np.arange(2000) + 0.5) / 2000 - 0.5  # cycles
 
@@ -23,8 +24,8 @@ _PHASES = (np.arange(2000) + 0.5) / 2000 - 0.5  # cycles
 def polynomials(terms: int) -> NDArray[np.float32]:
     """Return the coefficients for sine and cosine, float32 [2, terms], highest power first.
 
-    With r the phase in cycles, from -0.5 to 0.5, they are least-squares fits of sin(2 pi r)/r and
-    of cos(2 pi r) by powers of r^2.
+    They are least-squares fits of sin(2 pi r)/r and cos(2 pi r) by powers of r^2, where r is the
+    phase in cycles, from -0.5 to 0.5.
     """
     powers = _powers(terms)
     sine = np.linalg.lstsq(_PHASES[:, None] * powers, np.sin(2 * np.pi * _PHASES), rcond=None)[0]
@@ -41,9 +42,9 @@ def error(terms: int) -> float:
 
 
 def terms_within(error_db: float, share: float) -> int:
-    """Return how many terms an image of some relative rms error, dB, needs.
+    """Return the number of terms for an image with a given relative rms error, dB.
 
-    `share` is that of the error's power.
+    `share` is the share of the error power that the polynomials may add.
     """
     most = np.sqrt(share) * 10 ** (error_db / 20)
     return next((terms for terms in TERMS if error(terms) <= most), TERMS[-1])

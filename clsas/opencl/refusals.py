@@ -1,4 +1,4 @@
-"""Why OpenCL cannot be used: there is no driver, PoCL has no cache, or the process was forked."""
+"""Errors if OpenCL cannot be used: no driver, no cache folder for PoCL, or a forked process."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ if TYPE_CHECKING:
     from clsas.opencl.device import DeviceInfo
 
 _HOW_TO_GET_A_DEVICE = """\
-No OpenCL device was found. Any one of these gives one:
+No OpenCL device was found. Any one of the following provides one:
   - a CPU driver from PyPI:  {command}
   - the vendor's driver of your GPU or CPU, which installs an .icd file in /etc/OpenCL/vendors;
     PyOpenCL's wheel looks there and in {folder}
-    (copy or write an .icd file there when the driver lives in your Python environment:
+    (copy or write an .icd file there if the driver is part of your Python environment:
     it is one line, the path of the driver's shared library).
-  The environment variable OCL_ICD_VENDORS, where it is set, replaces these places."""
+  The environment variable OCL_ICD_VENDORS, if it is set, replaces these folders."""
 
 
 POCL = "Portable Computing Language"
 """Name of PoCL's platform."""
-_KERNEL_BYTES = 1 << 16  # arbitrary: of a kernel on disk; a full disk has no room for it
+_KERNEL_BYTES = 1 << 16  # arbitrary size of a kernel on disk, for which a full disk has no room
 
 
 class DeviceError(RuntimeError):
-    """No OpenCL device fits, it refused to build a kernel, or the process was forked."""
+    """Error if no OpenCL device matches, a kernel cannot be built, or the process was forked."""
 
 
 def no_device() -> DeviceError:
-    """Return the error that says why there is no device, and how to get one."""
+    """Return the error for a machine without devices, which says how to get one."""
     if any(platform.name == POCL for platform in _platforms()) and (why := _cache_problem()):
         return DeviceError(f"No OpenCL device was found: {why}")
     folder = Path(cl.__file__).parent / ".libs"
@@ -45,9 +45,10 @@ def no_device() -> DeviceError:
 
 
 def no_match(what: str, devices: Sequence[DeviceInfo]) -> DeviceError:
-    """Return the error that says why none of some devices is what was asked for.
+    """Return the error for a request that no device matches.
 
-    PoCL has no device where it cannot write its cache.
+    If PoCL is installed but cannot write its cache folder, it has no device, and the message says
+    so.
     """
     of_pocl = any(info.platform == POCL for info in devices)
     why = "" if of_pocl or all(each.name != POCL for each in _platforms()) else _cache_problem()
@@ -55,7 +56,7 @@ def no_match(what: str, devices: Sequence[DeviceInfo]) -> DeviceError:
 
 
 def not_built(what: str, platform: str, error: cl.Error) -> DeviceError:
-    """Return the error that says why a driver of a platform could not build something."""
+    """Return the error for a build that failed, with the log of the platform's driver."""
     if platform == POCL and (why := _cache_problem()):
         return DeviceError(f"{what}: {why}")
     return DeviceError(f"{what}:\n{indent(str(error), '  ', lambda line: True)}")
@@ -71,25 +72,26 @@ def _platforms() -> list[cl.Platform]:
 def check_process() -> None:
     """Raise DeviceError in a process that was forked after its parent had used OpenCL.
 
-    Threads of drivers stay behind in the parent: whatever waits for them waits for ever.
+    The threads of drivers exist only in the parent, and the forked process would wait for them for
+    ever.
     """
     if _first_process() != os.getpid():
         raise DeviceError(
-            "OpenCL cannot be used in a process that was forked after its parent had used it: the "
-            "threads of its drivers stay in the parent. Start processes by "
-            'multiprocessing.get_context("spawn"), or fork before OpenCL is used, also before '
+            "OpenCL cannot be used in a process that was forked after its parent had used it, "
+            "because the threads of its drivers exist only in the parent. Start processes with "
+            'multiprocessing.get_context("spawn"), or fork before OpenCL is used and before '
             "devices are listed"
         )
 
 
 @functools.cache
 def _first_process() -> int:
-    """Return the process that called this first, in it and in those forked from it since."""
+    """Return the id of the process that called this first, also in processes forked from it."""
     return os.getpid()
 
 
 def _cache_problem() -> str:
-    """Return why PoCL cannot write its cache folder, without which it builds nothing, or ""."""
+    """Return why PoCL cannot write its cache folder, which it needs to build; "" if it can."""
     folder = _cache_folder()
     try:
         os.makedirs(folder, exist_ok=True)

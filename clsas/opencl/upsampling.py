@@ -1,4 +1,4 @@
-"""Lines upsampled on a device."""
+"""Upsampling of range lines on a device."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from clsas.opencl.buffers import MARGIN, Buffer, Buffers, lines_buffer, phase_po
 from clsas.opencl.device import Device
 from clsas.signal.interpolation import PHASES, Resampling, Upsampler
 
-_GROUP = 64  # work-items that share a line where each has one lane
+_GROUP = 64  # work-items that share a line if each has one lane
 GIVEN_BYTES = 64 << 20
-"""Lines as they come that are on a device at once, at most."""
+"""Largest size of the lines that are on a device at once before they are upsampled."""
 
 
 def upsampling_buffers(channels: int, length: int, pitch: int, half_precision: bool) -> Buffers:
-    """Return the buffers that upsampling lines of some length takes: both kinds of lines."""
+    """Return the buffers for upsampling: the upsampled lines, and the given ones."""
     at_once = min(max(GIVEN_BYTES // (8 * length), 1), channels)
     return {
         "lines": lines_buffer(channels, pitch, half_precision),
@@ -37,12 +37,13 @@ def upsample(
     half_precision: bool = False,
     gain: float = 1.0,
 ) -> cl.Buffer:
-    """Return lines [channels, n] upsampled on a device as its kernels want them.
+    """Return lines [channels, n], upsampled on a device in the format of its kernels.
 
-    The samples are to be kept, and left alone, until the device is done with them. The result has
-    `pitch` samples per line, with zeros around them: interleaved, [channels, pitch, 2], with
-    one lane per work-item, else [channels, 2, pitch]. It is `gain` times the lines, and with
-    `half_precision` held so.
+    Keep the samples, and do not change them, until the device is done with them. The result has
+    `pitch` samples per line, with zeros around them. With one lane per work-item, real and
+    imaginary parts are interleaved, [channels, pitch, 2]; otherwise they are separate,
+    [channels, 2, pitch]. Lines are multiplied by `gain`, and stored in half precision if
+    `half_precision` is set.
     """
     width, taps, step = device.info.width, upsampler.taps, upsampler.step
     shifted = resampling.shift != 0

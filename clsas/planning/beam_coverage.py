@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.lines import some_channels, wavelength_m
+from clsas.core.lines import some_channels
+from clsas.core.wavelengths import wavelength_m
 from clsas.planning.caching import shared
 from clsas.planning.sample_points import points_at_m
 from clsas.planning.visibility_model import VisibilityModel

@@ -13,11 +13,11 @@ from clsas.aperture import phase_rates
 from clsas.aperture.mean_track import MeanTrack
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import SAMPLED_CHANNELS, antennas_of, some_channels, steepest
+from clsas.core.wavelengths import cycles_per_m_at
 from clsas.planning.caching import cached, shared
 from clsas.planning.sample_pixels import SPREAD_POINTS
 from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
-from clsas.signal.spectrum import cycles_per_m_at
 
 _NEIGHBOURS = 64  # channels over which density is measured; half or twice: no change
 _SHEET_REFERENCES = 2.0  # that each channel of a sheet counts as, measured with 54 000 channels

@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 from clsas.aperture.nearest import stage_errors_m
 from clsas.aperture.phase_rates import drift, stretches
 from clsas.core.geometry import pairwise_range_m
-from clsas.core.lines import wavelength_m
+from clsas.core.wavelengths import wavelength_m
 from clsas.exact.layout import ROUNDING
 from clsas.exact.tiles import BLOCKS
 from clsas.opencl.device import Device

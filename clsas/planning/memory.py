@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clsas.exact.tiles import STACK
+from clsas.exact.tiles import item_pixels
 from clsas.factorized.buffers import (
     LEAST_BATCH,
     leaf_tables,
@@ -128,7 +128,7 @@ class BufferSizes:
         if self.model.surface.is_plane:
             return self._divided(self.tile), math.prod(self.sides[0])
         pixels = self.model.subimages.most_padded_pixels(self.sides[-1], self.sides[0], self.width)
-        return pixels // (STACK * self.width), pixels
+        return pixels // item_pixels(self.width), pixels
 
 
 @dataclass(frozen=True)

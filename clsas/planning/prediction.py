@@ -332,7 +332,7 @@ def _stages(
             samples,
             work,
             channels=round(of_stage.count),
-            operations=combined * samples,
+            operations=float(combined * samples),
             error_db=error_db,
         )
     pixels, backprojected = model.subimages.padded_pixels(side, width), count * of_stage.count
@@ -350,7 +350,7 @@ def _stages(
         samples,
         work,
         channels=round(of_stage.count),
-        operations=count * pixels * of_stage.count,
+        operations=float(count * pixels * of_stage.count),
         error_db=candidate.final.scatter_db,
     )
     return stages, total

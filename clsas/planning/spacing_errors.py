@@ -21,7 +21,7 @@ from clsas.aperture.dense_channels import strip_channels
 from clsas.aperture.mean_track import MeanTrack
 from clsas.aperture.virtual_channels import VirtualChannels, interpolated_channels
 from clsas.core.decibels import power
-from clsas.core.lines import wavelength_m
+from clsas.core.wavelengths import wavelength_m
 from clsas.planning import phase_rates
 from clsas.planning.caching import cached
 from clsas.planning.channels import carriers

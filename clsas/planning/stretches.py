@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from clsas.aperture.filters import Gain
 from clsas.aperture.phase_rates import drift, stretches
+from clsas.core.wavelengths import cycles_per_m_at
 from clsas.planning.channels import SampledChannels, sampled_channels
 from clsas.planning.subimages import SMALL
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator
-from clsas.signal.spectrum import Spectrum, cycles_per_m_at, shares_of_bins
+from clsas.signal.spectrum import Spectrum, shares_of_bins
 
 _LEAST_BINS = 1 / 32  # of the lines' spectrum; arbitrary: so small a shift widens no band
 _MOST_CYCLES = 8.0  # per sample, far beyond what any filter passes

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.exact.tiles import STACK
+from clsas.exact.tiles import item_pixels
 from clsas.factorized.surface import Surface, within_roots
 
 Side = tuple[int, int]
@@ -47,7 +47,7 @@ class Subimages:
         return int(within_roots(np.add, self._padded(side, width), side, root).max())
 
     def _padded(self, side: Side, width: int) -> NDArray[np.int64]:
-        size = STACK * width
+        size = item_pixels(width)
         return -(-self.surface.counts(side) // size) * size
 
     def extents(self, side: Side, root: Side, *, most: bool = False) -> NDArray[np.float64]:

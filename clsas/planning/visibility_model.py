@@ -16,6 +16,7 @@ from clsas.aperture.dense_tracks import Shape, mean_track_of, simplest_track
 from clsas.aperture.mean_track import MeanTrack
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
+from clsas.core.wavelengths import band_wavelength_m, cycles_per_m_at
 from clsas.factorized.surface import LEAST_SIDE, Surface, surface_of
 from clsas.planning.caching import cached, shared
 from clsas.planning.sample_points import (
@@ -26,13 +27,7 @@ from clsas.planning.sample_points import (
 )
 from clsas.planning.subimages import SMALL, Side, Subimages
 from clsas.signal.ambiguity import Ambiguity, ambiguity
-from clsas.signal.spectrum import (
-    Spectrum,
-    band_wavelength_m,
-    cycles_per_m_at,
-    line_energy,
-    measure_spectrum,
-)
+from clsas.signal.spectrum import Spectrum, line_energy, measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
-
-from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from clsas.aperture.interpolated import InterpolatedAperture
 from clsas.aperture.nearest import NearestBeams
 from clsas.core import reprs, validate
-from clsas.core.fields import CONFIG, Count, Number, Size, Whole
+from clsas.core.fields import CONFIG, Constraint, Count, Number, Size, Whole
 from clsas.opencl.phases import TERMS
 from clsas.signal.fields import RangeFilter, StoredResampling, StoredUpsampler
 from clsas.signal.interpolation import PHASES
@@ -21,7 +19,7 @@ UNREACHED = "no line reaches the grid"
 """Reason for an exact image that is all zeros; `clsas.plan` has then warned."""
 
 
-@dataclass(frozen=True, config=CONFIG)
+@dataclass(frozen=True)
 class ExactImage:
     """Backprojection of all channels to all pixels.
 
@@ -41,8 +39,10 @@ class ExactImage:
     half_precision: ClassVar[bool] = False
     band: ClassVar[None] = None
 
+    __pydantic_config__ = CONFIG
 
-@dataclass(frozen=True, eq=False, config=CONFIG)
+
+@dataclass(frozen=True, eq=False)
 class Factorization:
     """A division of the image into subimages within subimages, and the filters between stages.
 
@@ -86,9 +86,9 @@ class Factorization:
         the mean track, averaged over all channels.
     """
 
-    sides: Annotated[tuple[Size, ...], Field(min_length=1)]
+    sides: Annotated[tuple[Size, ...], Constraint(min_length=1)]
     tile: Size
-    aperture: Annotated[InterpolatedAperture | NearestBeams, Field(discriminator="method")]
+    aperture: Annotated[InterpolatedAperture | NearestBeams, Constraint(discriminator="method")]
     align: RangeFilter
     final: RangeFilter
     resampling: StoredResampling
@@ -96,15 +96,16 @@ class Factorization:
     half_precision: bool
     half_lengths: tuple[Count, ...]
     most_channels: tuple[Count, ...]
-    highest_cycles_per_m: Annotated[float, Field(ge=0.0, le=1e9)]
-    closest_m: Annotated[float, Field(ge=0.0, le=1e12)]
-    limits: tuple[Annotated[float, Field(ge=-3.0, lt=math.inf)], Number] | None
+    highest_cycles_per_m: Annotated[float, Constraint(ge=0.0, le=1e9)]
+    closest_m: Annotated[float, Constraint(ge=0.0, le=1e12)]
+    limits: tuple[Annotated[float, Constraint(ge=-3.0, lt=math.inf)], Number] | None
     roots_at_once: Whole
     roots_prepared: Whole
-    phase_terms: Annotated[int, Field(ge=TERMS[0], le=TERMS[-1])] = TERMS[-1]
-    stretch: Annotated[float, Field(ge=-0.5, le=1.0)] = 0.0
+    phase_terms: Annotated[int, Constraint(ge=TERMS[0], le=TERMS[-1])] = TERMS[-1]
+    stretch: Annotated[float, Constraint(ge=-0.5, le=1.0)] = 0.0
     kind: Literal["factorized"] = "factorized"
 
+    __pydantic_config__ = CONFIG
     __repr__ = reprs.of_fields
 
     @property
@@ -140,7 +141,7 @@ class Factorization:
             check(len(getattr(self, name)) == levels, name, f"{levels} numbers, one for each stage")
         ascend = self.limits is None or self.limits[0] < self.limits[1]
         check(ascend, "limits", "two ascending sines")
-        together = self.roots_prepared % self.roots_at_once == 0
+        together = self.roots_at_once > 0 and self.roots_prepared % self.roots_at_once == 0
         check(together, "roots_prepared", f"a multiple of roots_at_once, {self.roots_at_once}")
         made = self.upsampler is not None
         check(made or not self.half_precision, "half_precision", "false without an upsampler")

@@ -5,14 +5,13 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from typing import Annotated, Any
-
-from pydantic import Field, TypeAdapter, ValidationError
-from pydantic.dataclasses import dataclass
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
 from clsas.core import reprs, validate
 from clsas.core.digests import grid_digest, lines_digest
-from clsas.core.fields import CONFIG, Number, StoredAs, explained
+from clsas.core.extras import is_installed, needed
+from clsas.core.fields import CONFIG, Constraint, Number, StoredAs, explained
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.reading import parse_json
@@ -23,12 +22,15 @@ from clsas.plans.predictions import ErrorBudget, Prediction, Stage, Work
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import EFFECTS
 
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
 VERSION = 5
 """Version of a plan's JSON. Version 1, from before clsas 0.1.0, had no number; version 2 had a
 single mean track; version 3 lacked the origin of costs; version 4 called `method` `image`."""
 
 
-@dataclass(frozen=True, eq=False, config=CONFIG)
+@dataclass(frozen=True, eq=False)
 class Plan:
     """How an image will be formed, decided in advance, with predicted error, time and memory.
 
@@ -57,12 +59,14 @@ class Plan:
     """
 
     tolerance_db: Number | None
-    method: Annotated[Factorization | ExactImage, Field(discriminator="kind")]
+    method: Annotated[Factorization | ExactImage, Constraint(discriminator="kind")]
     prediction: Prediction
     beam: Annotated[BeamWindow, StoredAs(dict[str, Any])] | None
     lines_digest: str
     grid_digest: str
     left_out: tuple[str, ...] = ()
+
+    __pydantic_config__ = CONFIG
 
     def __post_init__(self) -> None:
         """Raise ValueError if the fields contradict each other."""
@@ -155,6 +159,11 @@ class Plan:
         Returns
         -------
         str
+
+        Raises
+        ------
+        ImportError
+            If pydantic is not installed (extra `files`).
         """
         validate.flag("filters", filters)
         # The digest is of lists and numbers as they are after a round trip through JSON.
@@ -182,7 +191,11 @@ class Plan:
         ValueError
             If the text is not such a plan, was written by an unsupported version, or does not match
             its digest.
+        ImportError
+            If pydantic is not installed (extra `files`).
         """
+        with needed("plans as JSON"):
+            from pydantic import ValidationError
         try:
             values = parse_json(text)
             if not isinstance(values, dict):
@@ -201,6 +214,8 @@ class Plan:
     def check(self, lines: RangeLines, grid: Grid) -> None:
         """Check that this plan was made for the geometry of these lines and this grid.
 
+        If pydantic is installed (extra `files`), the values of all fields are checked as well.
+
         Parameters
         ----------
         lines : RangeLines
@@ -209,10 +224,13 @@ class Plan:
         Raises
         ------
         TypeError, ValueError
-            If it was made for others, or an argument is not of these types.
+            If it was made for another geometry, a field has a value that it may not have, or an
+            argument is not of these types.
         """
         validate.instance("lines", lines, RangeLines)
         validate.instance("grid", grid, Grid)
+        if is_installed("pydantic"):
+            _check_values(self)
         for name, mine, theirs in (
             ("lines", self.lines_digest, lines_digest(lines)),
             ("grid", self.grid_digest, grid_digest(grid)),
@@ -227,6 +245,16 @@ class Plan:
             most = abs(lines.carrier_cycles_per_m) + 1 / lines.range_step_m
             given = self.factorization.highest_cycles_per_m
             validate.number("highest_cycles_per_m", given, "cycles/m", most=most)
+
+
+def _check_values(plan: Plan) -> None:
+    """Raise ValueError if a field has a value that it may not have, for example by `replace`."""
+    from pydantic import ValidationError
+
+    try:
+        _stored().validate_python(plan)
+    except ValidationError as error:
+        raise ValueError(f"the plan is invalid: {explained(error, vars(plan))}") from None
 
 
 def _check_version(values: dict[str, Any]) -> None:
@@ -267,6 +295,8 @@ def _check_digest(values: dict[str, Any]) -> None:
 @functools.cache
 def _stored() -> TypeAdapter[Plan]:
     """Return the pydantic adapter that reads and writes plans."""
+    with needed("plans as JSON"):
+        from pydantic import TypeAdapter
     return TypeAdapter(Plan)
 
 

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from clsas.core import reprs
 from clsas.core.decibels import in_db
-from clsas.core.fields import CONFIG, Number, StoredAs
+from clsas.core.fields import CONFIG, Constraint, Number, StoredAs
 from clsas.core.fields import Amount as StoredAmount
 
 Amount: TypeAlias = float | NDArray[np.float64]
 """A number, or an array with one number for each of several sizes of subimages."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Work:
     """Counted operations of a device and its host.
 
@@ -89,7 +86,7 @@ class Work:
         return Work(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class ErrorBudget:
     """Relative error powers by cause, which add up to the predicted error.
 
@@ -167,7 +164,7 @@ CostSource: TypeAlias = Literal["given", "calibrated", "scaled", "default"]
 """Origin of the costs of a prediction: see `clsas.planning.costs.KnownCosts`."""
 
 
-@dataclass(frozen=True, config=CONFIG)
+@dataclass(frozen=True)
 class Stage:
     """Predicted work, error and time of one stage, or of the backprojection at the end.
 
@@ -199,8 +196,10 @@ class Stage:
     error_db: float
     seconds: float
 
+    __pydantic_config__ = CONFIG
 
-@dataclass(frozen=True, eq=False, config=CONFIG)
+
+@dataclass(frozen=True, eq=False)
 class Prediction:
     """Predicted error, time and memory of an image.
 
@@ -230,7 +229,7 @@ class Prediction:
     error_db: Number
     seconds: Number
     exact_seconds: Number
-    memory_bytes: Annotated[int, Field(ge=0)]
+    memory_bytes: Annotated[int, Constraint(ge=0)]
     device: str
     stages: tuple[Stage, ...]
     work: Annotated[Work, StoredAs(dict[str, StoredAmount])]
@@ -238,4 +237,5 @@ class Prediction:
     cost_source: CostSource = "given"
     costs_measured: str = ""
 
+    __pydantic_config__ = CONFIG
     __repr__ = reprs.of_fields

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from clsas.core import validate
 from clsas.core.atomic import replacing
-from clsas.core.extras import install_command
+from clsas.core.extras import needed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -91,11 +91,15 @@ def with_fewer_colours(png: str | os.PathLike | BytesIO, colours: int) -> bytes:
 
 
 def figure_class() -> type[Figure]:
-    """Return the class of matplotlib's figures; raise ImportError if it is not installed."""
-    try:
+    """Return matplotlib's class of figures.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed; the message says how to install it.
+    """
+    with needed("pictures"):
         from matplotlib.figure import Figure
-    except ImportError:
-        raise ImportError(f"pictures need matplotlib: {install_command('plot')}") from None
     return Figure
 
 
@@ -130,8 +134,9 @@ def drawable(name: str, value: object) -> str:
 
     Text between dollar signs must be valid mathematics, and control characters have no glyphs.
     """
-    from matplotlib import cbook
-    from matplotlib.mathtext import MathTextParser
+    with needed("pictures"):
+        from matplotlib import cbook
+        from matplotlib.mathtext import MathTextParser
 
     given = validate.text(name, value)
     if cbook.is_math_text(given):

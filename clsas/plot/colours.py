@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from clsas.core import validate
+from clsas.core.extras import needed
 
 if TYPE_CHECKING:
     from matplotlib.colors import Colormap
@@ -38,8 +39,9 @@ def colour_map(name: str | Colormap) -> Colormap:
     TypeError, ValueError
         If `name` is neither a known name nor a colour map.
     """
-    from matplotlib import colormaps
-    from matplotlib.colors import Colormap, LinearSegmentedColormap
+    with needed("pictures"):
+        from matplotlib import colormaps
+        from matplotlib.colors import Colormap, LinearSegmentedColormap
 
     if isinstance(name, Colormap):
         return name

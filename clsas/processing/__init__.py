@@ -1,1 +1,1 @@
-"""From a recording to a focused image: the steps of `clsas process`, recorded and resumable."""
+"""From a recording to a focused image: the steps of `clsas process`, with a record of each."""

@@ -1,4 +1,4 @@
-"""The chain from a recording to a focused image, step by step, each run only if it has to."""
+"""Chain of steps from a recording to a focused image, each of which runs only if it has to."""
 
 from __future__ import annotations
 
@@ -30,45 +30,53 @@ from clsas.signal.echoes import Echoes
 
 @dataclass(frozen=True, eq=False)
 class Processed:
-    """Results of a processing, in its folder.
+    """Results of processing a recording, in a folder.
 
     Attributes
     ----------
     folder : Path
-        Holds the record `process.json`, and the files of every step.
+        Folder with the record `process.json` and the files of every step.
     steps : tuple of StepRecord
         Records of the steps, in the order in which they ran.
     repeated : tuple of str
-        Steps that were run; the others had been run before with the same inputs.
+        Steps that ran this time; the others had run before with the same inputs.
     """
 
     folder: Path
     steps: tuple[StepRecord, ...]
     repeated: tuple[str, ...]
-    _lines: Callable[[], RangeLines]
+    _read_lines: Callable[[], RangeLines]
 
     def __repr__(self) -> str:
-        """Return the folder and the steps."""
+        """Return the folder and the names of the steps."""
         names = ", ".join(step.name for step in self.steps)
         return reprs.summary(self, repr(str(self.folder)), names)
 
     def __getitem__(self, name: str) -> StepRecord:
-        """Return the record of a step; raises KeyError if it did not run."""
+        """Return the record of a step; raise KeyError if it did not run."""
         return {step.name: step for step in self.steps}[name]
 
     @property
     def lines(self) -> RangeLines:
-        """The lines as far as these steps corrected them, read from the folder.
+        """Lines with the corrections of these steps, read from the folder.
 
-        Raises ValueError if they changed since.
+        Raises
+        ------
+        ValueError
+            If the file has changed since it was written.
         """
-        return self._lines()
+        return self._read_lines()
 
     @property
     def image(self) -> Image:
-        """The image, read from the folder.
+        """Image, read from the folder.
 
-        Raises KeyError without the step "image", and ValueError if the image changed since.
+        Raises
+        ------
+        KeyError
+            If the step "image" did not run.
+        ValueError
+            If the file has changed since it was written.
         """
         record = self["image"]
         return loaded(self.folder / record.result_file, record.files[record.result_file], Image)
@@ -83,31 +91,34 @@ def process(
     device: Device | str | int | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Processed:
-    """Take a recording to a focused image: inspect, calibrate, navigate, focus, image, mosaic.
+    """Return the results of processing a recording to a focused image.
 
-    Every step is recorded in the folder `output`, in `process.json`: its inputs and options, the
-    version of clsas, its numbers, warnings and files. A step that ran before with the same inputs,
-    options and version, and whose files are as they were written, is not run again. Files of a
-    step appear together once it is done, and replace all that it wrote before.
+    The steps are inspect, calibrate, navigate, focus, image and mosaic. Every step is recorded in
+    `process.json` in the folder `output`: its inputs and options, the version of clsas, its
+    numbers, warnings and files. A step is not run again if it ran before with the same inputs,
+    options and version, and its files have not changed. The files of a step appear together once it
+    is done, and replace all files that it wrote before.
 
     Parameters
     ----------
     scene : path-like or SceneFile
-        Grid, image and the table `[process]`: docs/scene-files.md lists its keys.
+        Scene with the grid, the image and the table `[process]`. docs/scene-files.md lists its
+        keys.
     lines : RangeLines, Echoes or path-like, optional
-        The recording, instead of the scene's. A path is any that `clsas.load` reads.
+        Recording to process instead of that of the scene. A path may lead to any file that
+        `clsas.load` reads.
     output : path-like, optional
-        Folder for the results, created if its parent is there. By default the scene's, else the
-        name of the scene's file without its suffix. Only files of this scene's record are
-        replaced.
+        Folder for the results, created if its parent exists. The default is the folder that the
+        scene specifies, or else the path of the scene file without its suffix. Only files that the
+        record of this scene names are replaced.
     steps : sequence of str, optional
-        Steps to bring up to date, instead of all of the scene's. They always run in the order
-        above. Those of the scene that correct the lines before them are brought up to date first,
-        so that a step always begins with the same lines; others are left alone.
+        Steps to bring up to date instead of all steps of the scene. They always run in the order
+        above. The preceding steps of the scene that correct the lines are brought up to date first,
+        so that a step always starts from the same lines. Other steps are left alone.
     device : Device, str or int, optional
         See `clsas.opencl.device.choose`.
     progress : callable, optional
-        Called as progress(step, steps done, steps).
+        Called as progress(step, done, total), with the name of a step and its progress.
 
     Returns
     -------
@@ -116,12 +127,12 @@ def process(
     Raises
     ------
     TypeError, ValueError
-        If an argument is of the wrong kind, the scene lacks what a step needs, the folder holds
-        the results of another scene or files that clsas did not write and would replace, or a step
-        refuses the lines, or the recording changes while it is processed. What was finished before
-        is kept.
+        If an argument is of the wrong kind, if the scene lacks something that a step needs, if the
+        folder contains the results of another scene or files that clsas did not write and would
+        replace, if a step refuses the lines, or if the recording changes while it is processed.
+        The results of finished steps are kept.
     OSError
-        If a file cannot be read or written, or another process is at work in the folder
+        If a file cannot be read or written, or another process is using the folder
         (BlockingIOError).
     DeviceError
         If there is no such device.
@@ -129,8 +140,18 @@ def process(
     Warns
     -----
     ClsasWarning
-        What the steps warn of. The record holds it too. If files of steps that were left alone
-        belong to other lines or options.
+        If a step warns; its record contains the warning too. Also if files of steps that were left
+        alone belong to other lines or options.
+
+    See Also
+    --------
+    Processed : The results.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> found = clsas.process("scene.toml", steps=["inspect", "image"])  # doctest: +SKIP
+    >>> found["image"].numbers["contrast"]  # doctest: +SKIP
     """
     if not isinstance(scene, SceneFile):
         scene = read_scene(validate.path("scene", scene))
@@ -155,20 +176,20 @@ def process(
             elif name in of_scene:
                 chain.leave(name)
             else:
-                chain.tell(name, "the scene leaves it out")
+                chain.warn_if_outdated(name, "since the scene leaves it out")
     return Processed(folder, tuple(chain.done), tuple(chain.repeated), chain.lines)
 
 
 def _with_corrections(chosen: tuple[str, ...], of_scene: tuple[str, ...]) -> tuple[str, ...]:
-    """Return steps, with those of the scene that correct the lines they begin with."""
-    # An inspection looks at the recording as it came.
+    """Return steps, with those of the scene that correct the lines before them."""
+    # An inspection examines the uncorrected recording.
     last = max((STEPS.index(name) for name in chosen if name != "inspect"), default=0)
     before = {name for name in of_scene if name in CORRECTIONS and STEPS.index(name) < last}
     return tuple(name for name in STEPS if name in {*chosen, *before})
 
 
 class _Chain:
-    """A processing on its way."""
+    """State of a processing: the present lines, and the records of the steps so far."""
 
     def __init__(
         self,
@@ -179,7 +200,7 @@ class _Chain:
         records: dict[str, StepRecord],
     ) -> None:
         self.scene, self.folder, self.recording, self.device = scene, folder, recording, device
-        self.records = dict(records)  # of all steps, also of those that are left alone
+        self.records = dict(records)  # of all steps, including those that are left alone
         self.done: list[StepRecord] = []
         self.repeated: list[str] = []
         self.digest = recording.digest
@@ -187,11 +208,11 @@ class _Chain:
         self.lines = recording.read
 
     def step(self, name: str, progress: Callable[[int, int], None] | None) -> None:
-        """Run a step, unless it ran before with the same inputs."""
+        """Run a step unless it ran before with the same inputs."""
         options = options_of(name, self.scene)
         digest = self._digest(name, options)
         record = self.records.get(name)
-        # A mosaic has records of its own, patch by patch.
+        # A mosaic always runs: it has its own records, and forms only the missing patches.
         kept = record is not None and record.digest == digest and name != "mosaic"
         messages: tuple[str, ...] = ()
         if record is None or not kept or not record.is_intact(self.folder):
@@ -207,15 +228,15 @@ class _Chain:
             validate.warn(f"{name}: {message}")
 
     def leave(self, name: str) -> None:
-        """Leave the files of a step of the scene alone."""
+        """Skip a step of the scene, and warn if its files are out of date."""
         digest, record = self._digest(name, options_of(name, self.scene)), self.records.get(name)
         if record is not None and record.digest != digest:
-            self.tell(name, "its lines or options changed since")
+            self.warn_if_outdated(name, "since its lines or options have changed")
         if name in CORRECTIONS:
             self.digest = digest
 
-    def tell(self, name: str, why: str) -> None:
-        """Warn of a step's files that are in the folder and do not belong to the other ones."""
+    def warn_if_outdated(self, name: str, why: str) -> None:
+        """Warn if the folder contains files of a step that no longer belong to the others."""
         record = self.records.get(name)
         files = () if record is None else record.files
         if found := [each for each in files if (self.folder / each).exists()]:
@@ -234,7 +255,7 @@ class _Chain:
         options: dict[str, Any],
         progress: Callable[[int, int], None] | None,
     ) -> StepRecord:
-        lines = self.lines()  # a damaged recording is refused before anything is written
+        lines = self.lines()  # raises for a damaged recording, before anything is written
         start = time.perf_counter()
         with staging(self.folder) as staged:
             job = Job(
@@ -269,9 +290,10 @@ class _Chain:
         return record
 
     def _keep(self, record: StepRecord, staged: Path) -> None:
-        """Put a step's files in the place of all that it wrote before, and record them.
+        """Replace all files that a step wrote before by the new ones, and record them.
 
-        A crash leaves a record whose files are missing or old: the step then runs again.
+        After a crash in between, the record names files that are missing or old, so that the step
+        runs again.
         """
         before = self.records.get(record.name)
         for name in set(() if before is None else before.files) - set(record.files):
@@ -285,9 +307,9 @@ class _Chain:
 
 
 def _outcome(name: str, job: Job) -> tuple[Outcome, tuple[str, ...]]:
-    """Return the outcome of a step, and clsas's warnings; its errors get the step's name."""
+    """Return the outcome of a step and its ClsasWarnings; put its name in front of errors."""
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", append=True)  # after filters of the caller's
+        warnings.simplefilter("always", append=True)  # after the caller's filters
         try:
             outcome = RUN[name](job)
         except (TypeError, ValueError) as error:

@@ -1,10 +1,10 @@
-"""The folder of a processing: which one, and what may be written there."""
+"""Folder of a processing: its choice, its lock, and the files that may be replaced in it."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from clsas.core import validate
@@ -16,18 +16,20 @@ from clsas.processing.steps import FILES
 
 
 def folder_of(scene: SceneFile, output: str | os.PathLike | None) -> Path:
-    """Return the folder given, or that of the scene; raises ValueError if there is neither."""
+    """Return the given folder, or that of the scene; raise ValueError if there is neither."""
     if output is not None:
         return validate.path("output", output)
     if "output" in scene.process:
         return scene.process["output"]
     if not Path(scene.name).suffix:
-        raise ValueError("output must be given: the scene has no file that names a folder")
+        raise ValueError(
+            "output must be given, since the scene has no file to name the folder after"
+        )
     return Path(scene.name).with_suffix("")
 
 
 def check_folder(folder: Path, recording: Recording) -> None:
-    """Raise ValueError if the folder cannot be made or is that of the recording."""
+    """Raise ValueError if the folder cannot be created, or contains the recording."""
     source = recording.described["file"]
     if source is not None and Path(source).parent.resolve() == folder.resolve():
         raise ValueError(f"output must not be the folder of the recording, got {str(folder)!r}")
@@ -35,20 +37,20 @@ def check_folder(folder: Path, recording: Recording) -> None:
         raise ValueError(f"output must be a folder, got the file {str(folder)!r}")
     if not folder.parent.is_dir():
         raise ValueError(
-            f"output {str(folder)!r} cannot be made: there is no folder {str(folder.parent)!r}"
+            f"output {str(folder)!r} cannot be created: there is no folder {str(folder.parent)!r}"
         )
 
 
 def checked_records(
     scene: SceneFile, folder: Path, names: tuple[str, ...]
 ) -> dict[str, StepRecord]:
-    """Return the records of the folder; steps may replace nothing there but what these name.
+    """Return the records of the folder after checking that steps replace only their own files.
 
     Raises
     ------
     ValueError
-        If the folder has the record of another scene, or holds a file that a step writes and no
-        record names.
+        If the folder contains the record of another scene, or a file that a step would replace and
+        that no record names.
     OSError
         If the record cannot be read.
     """
@@ -58,29 +60,35 @@ def checked_records(
         for file in FILES[name]:
             if file not in own and os.path.lexists(folder / file):
                 raise ValueError(
-                    f"output {str(folder)!r} holds {file}, which {name} would replace and which "
-                    "clsas did not write: choose another output, or remove it"
+                    f"output {str(folder)!r} contains {file}, which {name} would replace and which "
+                    "clsas did not write: choose another output, or remove the file"
                 )
     return records
 
 
 @contextmanager
 def made(folder: Path) -> Iterator[None]:
-    """Lock a folder, which is made if it is not there, and removed if nothing came into it.
+    """Lock a folder, and create it if it does not exist; then it is removed again if still empty.
 
     Raises
     ------
     BlockingIOError
-        If another process has locked it.
+        If another process has locked the folder.
+    OSError
+        If the folder cannot be created.
     """
-    if folder.is_dir():
-        with locked(folder):
-            yield
-        return
-    folder.mkdir(exist_ok=True)
+    is_new = False
     try:
-        with locked(folder):
+        with ExitStack() as held:
+            while True:
+                is_new = is_new or not folder.is_dir()
+                folder.mkdir(exist_ok=True)
+                # Another process may remove the folder, which it created, before this one locks it.
+                with suppress(FileNotFoundError):
+                    held.enter_context(locked(folder))
+                    break
             yield
     finally:
-        with suppress(OSError):  # it is not empty
-            folder.rmdir()
+        if is_new:
+            with suppress(OSError):  # the folder is not empty
+                folder.rmdir()

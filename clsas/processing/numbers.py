@@ -1,4 +1,4 @@
-"""Numbers of the steps' results, in types of JSON: what reports and records hold."""
+"""Numbers of the steps' results, as JSON types, for reports and records."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from clsas.navigation.micronavigation import Micronavigation
 
 
 def of_navigation(found: Micronavigation) -> dict[str, Any]:
-    """Return how much a track was corrected by micronavigation, and how certainly."""
+    """Return the size and uncertainty of the corrections that micronavigation found."""
     measured = np.isfinite(found.sway_steps_sd_m)
     return {
         "pings": len(found.sway_m),
@@ -29,7 +29,7 @@ def of_navigation(found: Micronavigation) -> dict[str, Any]:
 
 
 def of_focus(found: Autofocus) -> dict[str, Any]:
-    """Return how much a track was corrected by autofocus, and what it gained."""
+    """Return the size and uncertainty of autofocus's corrections, and the gain in sharpness."""
     rms_m = float(np.sqrt(np.mean(np.sum(found.correction_m**2, axis=1))))
     return {
         "focused": found.focused,
@@ -41,7 +41,7 @@ def of_focus(found: Autofocus) -> dict[str, Any]:
 
 
 def of_image(image: Image) -> dict[str, Any]:
-    """Return what an image shows as a whole; all None of an image of zeros."""
+    """Return measures of a whole image, all of them None if every pixel is zero."""
     peak = float(np.abs(image.pixels).max())
     if peak == 0:
         return {"peak_db": None, "contrast": None, "entropy": None}

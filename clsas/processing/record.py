@@ -1,6 +1,6 @@
 """Record of a processing: inputs, versions and numbers of every step, as JSON beside the image.
 
-The record also says which files of a folder are clsas's own: those that its steps wrote.
+The record also identifies the files in the folder that clsas wrote and may replace.
 """
 
 from __future__ import annotations
@@ -27,34 +27,36 @@ from clsas.files.scene_files import SceneFile
 
 NAME = "process.json"
 _FORMAT, _VERSION = "clsas processing", 2
-_BLOCK = 1 << 22  # bytes that are read at once
+_BLOCK = 1 << 22  # bytes that are read at once: a plain choice
 
 
 @dataclass(frozen=True)
 class StepRecord:
-    """Inputs, results and files of a step.
+    """Record of a step: its inputs, results and files.
 
     Attributes
     ----------
     name : str
         The step: "inspect", "calibrate", "navigate", "focus", "image" or "mosaic".
     digest : str
-        Of its inputs, its options and clsas's version.
+        Digest of the inputs, the options and the version of clsas.
     lines : str
-        Digest of the lines that it began with: the recording's, or the correcting step's before it.
+        Digest of the lines that the step began with: that of the recording, or of the last step
+        before it that corrected the lines.
     corrections : tuple of str
         Steps that had corrected these lines.
     options : dict
-        Options of the step, in types of JSON.
+        Options of the step, as JSON types.
     numbers : dict
-        What it found, in types of JSON.
+        Numbers that the step found, as JSON types.
     files : dict
-        Digest of every file that it wrote, by name.
+        Digest of every file that the step wrote, by name.
     warnings : tuple of str
-        Its warnings.
+        Warnings of the step.
     seconds : float
+        Time that the step took.
     device : str
-        The device that it used.
+        Device that the step used.
     """
 
     name: str
@@ -69,18 +71,18 @@ class StepRecord:
     device: str = ""
 
     def __repr__(self) -> str:
-        """Return the step, its files and its time."""
+        """Return the name, the number of files and the time of the step."""
         return reprs.summary(
             self, self.name, f"{len(self.files)} files", reprs.quantity(self.seconds, "s")
         )
 
     @property
     def result_file(self) -> str:
-        """Name of the file with the step's lines or image, if it saves any."""
+        """Name of the file for the lines or the image of the step, if it saves any."""
         return f"{self.name}.h5"
 
     def is_intact(self, folder: Path) -> bool:
-        """Return whether all files of the step are there, as they were written."""
+        """Return whether all files of the step exist as they were written."""
         if self.name in (*CORRECTIONS, "image") and self.result_file not in self.files:
             return False
         try:
@@ -90,16 +92,16 @@ class StepRecord:
 
 
 def read_records(folder: Path, scene: SceneFile) -> dict[str, StepRecord]:
-    """Return the records of a scene's folder by step; none if there is no `process.json`.
+    """Return the records in a scene's folder by step; none if there is no `process.json`.
 
     Records of single steps that cannot be read are left out.
 
     Raises
     ------
     ValueError
-        If `process.json` is no record of clsas, of another version, or of another scene.
+        If `process.json` is not a record of clsas, or is of another version or scene.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
     """
     try:
         document = reading.parse_json(reading.read_bytes(folder / NAME))
@@ -107,20 +109,21 @@ def read_records(folder: Path, scene: SceneFile) -> dict[str, StepRecord]:
         return {}
     except (IsADirectoryError, ValueError):
         document = None
-    holds = f"output {str(folder)!r} holds"
+    contains = f"output {str(folder)!r} contains"
     if not isinstance(document, dict) or document.get("format") != _FORMAT:
         raise ValueError(
-            f"{holds} a {NAME} that is no record of clsas: choose another output, or remove it"
+            f"{contains} a {NAME} that clsas did not write: choose another output, or remove the "
+            "file"
         )
     if document.get("version") != _VERSION or not isinstance(document.get("steps"), list):
         raise ValueError(
-            f"{holds} a {NAME} of another version of clsas: choose another output, or remove the "
-            "folder"
+            f"{contains} a {NAME} of another version of clsas: choose another output, or remove "
+            "the folder"
         )
     if (other := document.get("scene")) != (own := _of_folder(scene, folder)):
         raise ValueError(
-            f"{holds} the results of another scene, {validate.shown(other)} as seen from there, "
-            f"not {own!r}: choose another output, or remove the folder"
+            f"{contains} the results of another scene: {validate.shown(other)} relative to the "
+            f"folder, not {own!r}. Choose another output, or remove the folder"
         )
     found = {}
     for step in document["steps"]:
@@ -156,7 +159,7 @@ def write_records(
 
 
 def step_digest(name: str, options: dict[str, Any], *inputs: str) -> str:
-    """Return the digest of a step with its options and the digests of its inputs."""
+    """Return the digest of a step, from its options and the digests of its inputs."""
     text = json.dumps([__version__, name, json_able(options), *inputs], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -167,7 +170,7 @@ def file_digest(path: Path) -> str:
     Raises
     ------
     OSError, ValueError
-        If it cannot be read, or is no ordinary file.
+        If the file cannot be read, or is not an ordinary file.
     """
     reading.check_ordinary(path)
     sha = hashlib.sha256()
@@ -178,7 +181,7 @@ def file_digest(path: Path) -> str:
 
 
 def contents_digest(lines: RangeLines) -> str:
-    """Return a digest of lines, with their samples."""
+    """Return a digest of lines, including their samples."""
     scalars = [lines.range_step_m, lines.carrier_hz, lines.sound_speed_m_s]
     sha = hashlib.sha256(np.array(scalars).tobytes())
     for array in (lines.samples, *lines.per_channel.values()):
@@ -187,12 +190,12 @@ def contents_digest(lines: RangeLines) -> str:
 
 
 def _of_folder(scene: SceneFile, folder: Path) -> str:
-    """Return a scene's file as seen from the folder, so that both may move together."""
+    """Return the path of a scene's file relative to the folder, so that both can move together."""
     if not Path(scene.name).is_file():
         return scene.name
     return os.path.relpath(os.path.realpath(scene.name), os.path.realpath(folder))
 
 
 def _is_plain(name: object) -> bool:
-    """Return whether a name is that of a file in the folder, and not a path out of it."""
+    """Return whether a name is that of a file in the folder, not a path that leads elsewhere."""
     return isinstance(name, str) and name not in ("", ".", "..") and Path(name).name == name

@@ -1,4 +1,4 @@
-"""The recording that a processing begins with."""
+"""Recording that a processing begins with."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from clsas.signal.echoes import Echoes
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """The lines to begin with, read when they are needed.
+    """Lines to begin with, which are read when they are needed.
 
     Attributes
     ----------
     described : dict
-        What the record says of them.
+        Description of the lines for the record.
     digest : str
-        Of their contents, and how echoes are compressed.
+        Digest of the contents of the lines and, if they are echoes, of the options of compression.
     """
 
     described: dict[str, Any]
@@ -39,7 +39,7 @@ class Recording:
     def of(
         cls, scene: SceneFile, given: RangeLines | Echoes | str | os.PathLike | None
     ) -> Recording:
-        """Return the recording given, or that of the scene."""
+        """Return the given recording, or that of the scene."""
         options = scene.compress
         if isinstance(given, Echoes):
             given = compress(given, **options)
@@ -49,25 +49,27 @@ class Recording:
         path = scene.process.get("lines") if given is None else validate.path("lines", given)
         if path is None:
             raise ValueError(
-                f"{scene.name}: missing key 'lines' in [process], the recording to process"
+                f"{scene.name}: missing key 'lines' in [process], the path of the recording"
             )
         if given is None and not path.exists():
-            raise ValueError(f"{scene.name}: [process] lines must be a file, there is no {path}")
+            raise ValueError(
+                f"{scene.name}: [process] lines must be a file, but {path} does not exist"
+            )
         digest = file_digest(path)
         of_both = step_digest("recording", options, digest)
         return cls({"file": str(path), "digest": digest}, of_both, path, None, options)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Pickle without lines that were read: they are read again from their file."""
+        """Return the fields to pickle, without lines that were read: they are read again."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def read(self) -> RangeLines:
-        """Return the lines; those of echoes are compressed.
+        """Return the lines; echoes are compressed.
 
         Raises
         ------
         ValueError
-            If the file holds anything else, or changed since its digest was taken.
+            If the file contains anything else, or has changed since its digest was computed.
         """
         return self._lines
 
@@ -83,18 +85,20 @@ class Recording:
 
 
 def loaded(path: Path, digest: str, *kinds: type) -> Any:
-    """Return the object in a file whose contents have a digest.
+    """Return the object in a file after checking the digest of the file.
 
     Raises
     ------
     ValueError
-        If the file holds an object of another type than `kinds`, or other contents.
+        If the file contains an object of another type than `kinds`, or has another digest.
     """
     found = load(path)
     if not isinstance(found, kinds):
-        wanted = " or ".join(kind.__name__ for kind in kinds)
-        raise ValueError(f"{path} must hold {wanted}, got {type(found).__name__}")
-    # After reading, so that nothing can take its place in between.
+        names = " or ".join(kind.__name__ for kind in kinds)
+        raise ValueError(f"{path} must contain {names}, got {type(found).__name__}")
+    # Compute the digest after reading, so that a change in between is detected.
     if file_digest(path) != digest:
-        raise ValueError(f"{path} changed since its digest was recorded: process it again")
+        raise ValueError(
+            f"{path} has changed since its digest was recorded: run clsas process again"
+        )
     return found

@@ -1,4 +1,4 @@
-"""Steps of a processing. Each takes lines, and writes what it finds into the folder."""
+"""Steps of a processing. Each takes lines and writes its results into the folder."""
 
 from __future__ import annotations
 
@@ -49,19 +49,19 @@ class Job:
     ----------
     scene : SceneFile
     folder : Path
-        Where files go. They are moved from there once the step is done.
+        Folder for the step's files, from which they are moved once the step is done.
     store : Path
-        Where a mosaic goes, which continues what it finds there.
+        Store of the mosaic, which is continued if it exists.
     given : Callable
-        Returns the lines of the recording.
+        Returns the uncorrected lines of the recording.
     lines : RangeLines
-        As far as they are corrected.
+        Lines with the corrections so far.
     corrections : tuple of str
-        Steps that corrected them.
+        Steps that corrected the lines.
     device : Device
     progress : Progress
     former : StepRecord or None
-        Record of the step when it ran last.
+        Record of the last run of the step.
     """
 
     scene: SceneFile
@@ -79,7 +79,7 @@ class Job:
         return dict(self.scene.process.get(step, {}))
 
     def draw(self, name: str, draw: Callable[[], Any]) -> list[str]:
-        """Write a picture, and return its name; without matplotlib there is none."""
+        """Write a picture and return a list of its name; the list is empty without matplotlib."""
         if not is_installed("matplotlib"):
             return []
         plot.save(draw(), self.folder / name)
@@ -93,11 +93,11 @@ class Outcome:
     Attributes
     ----------
     numbers : dict
-        In types of JSON.
+        Numbers that the step found, as JSON types.
     files : list of str
-        Names of files that it wrote.
+        Names of the files that the step wrote.
     lines : RangeLines or None
-        Corrected lines.
+        Corrected lines, if the step corrects them.
     """
 
     numbers: dict[str, Any]
@@ -106,7 +106,7 @@ class Outcome:
 
 
 def options_of(step: str, scene: SceneFile) -> dict[str, Any]:
-    """Return all of a scene that a step depends on, in types of JSON once arrays are lists."""
+    """Return all options of a scene that a step depends on, as JSON types or arrays."""
     options = dict(scene.process.get(step, {}))
     if step in ("inspect", "focus", "image", "mosaic"):
         options["grid"] = None if scene.grid is None else grid_digest(scene.grid)
@@ -121,12 +121,12 @@ def options_of(step: str, scene: SceneFile) -> dict[str, Any]:
 
 
 def request_of(scene: SceneFile) -> dict[str, Any]:
-    """Return how the scene wants an image."""
+    """Return the scene's request for an image, or the default tolerance."""
     return scene.request or {"tolerance_db": TOLERANCE_DB}
 
 
 def inspected(job: Job) -> Outcome:
-    """Look at the recording; write its table."""
+    """Inspect the recording, and write the table of findings."""
     scene = job.scene
     found = inspect(
         job.given(), scene.grid, device=job.device, beam=scene.image.get("beam"),
@@ -141,14 +141,14 @@ def inspected(job: Job) -> Outcome:
 
 
 def calibrated(job: Job) -> Outcome:
-    """Find time offset, sound speed and lever arm by known points."""
+    """Find time offset, sound speed and lever arm from known points."""
     options = job.options("calibrate")
     found = calibrate_track(job.lines, options.pop("points_m"), **options, progress=job.progress)
     return Outcome(found.figures, lines=found.lines)
 
 
 def navigated(job: Job) -> Outcome:
-    """Correct the track by displaced phase centres."""
+    """Correct the track with displaced phase centres (micronavigation)."""
     found = micronavigate(job.lines, **job.options("navigate"), progress=job.progress)
     _write_track(job.folder / "navigate.csv", found)
     files = ["navigate.csv"]
@@ -159,7 +159,7 @@ def navigated(job: Job) -> Outcome:
 
 
 def focused(job: Job) -> Outcome:
-    """Correct the track by the bright responses of an image."""
+    """Correct the track with the bright responses of an image (autofocus)."""
     (grid,) = job.scene.need("grid")
     found = autofocus(
         job.lines, grid, beam=job.scene.image.get("beam"), **job.options("focus"),
@@ -173,7 +173,7 @@ def focused(job: Job) -> Outcome:
 
 
 def imaged(job: Job) -> Outcome:
-    """Form the image; where the lines were corrected, also the one that they gave before."""
+    """Form the image and, if the lines were corrected, also the image without corrections."""
     (grid,) = job.scene.need("grid")
     given, lines = job.given(), job.lines
     corrected = bool(job.corrections)
@@ -184,8 +184,8 @@ def imaged(job: Job) -> Outcome:
         before, _ = _formed(job, given, grid, shares[0])
         image, error_db = _formed(job, lines, grid, shares[1])
     save(job.folder / "image.h5", image)
-    # The folder may hold lines of steps that the scene has left out since.
-    title = f"After {', '.join(job.corrections)}" if corrected else "Recording as it came"
+    # Name the corrections: the folder may still have lines of steps that the scene now leaves out.
+    title = f"After {', '.join(job.corrections)}" if corrected else "Uncorrected recording"
     files = ["image.h5", *job.draw("image.png", lambda: plot.image_db(image, title=title))]
     found = numbers.of_image(image) | {"predicted_error_db": error_db}
     if corrected:
@@ -197,7 +197,7 @@ def imaged(job: Job) -> Outcome:
 
 
 def joined(job: Job) -> Outcome:
-    """Form a mosaic in a Zarr store. If its inputs are the same, patches are not formed again."""
+    """Form a mosaic in a Zarr store. Finished patches with the same inputs are kept."""
     scene = job.scene
     (grid,) = scene.need("grid")
     request = request_of(scene)
@@ -234,16 +234,16 @@ def joined(job: Job) -> Outcome:
 
 
 def _is_own_store(job: Job) -> bool:
-    """Return whether this step made the store, so that it may replace it.
+    """Return whether an earlier run of this step made the store, so that it may be replaced.
 
-    A store in the folder of the processing is the step's once it is recorded. One elsewhere must
-    also be as the step left it.
+    For a store in the folder of the processing, the record of the step suffices. A store elsewhere
+    must also have the inputs with which the step left it.
     """
     if job.former is None or "store" not in job.former.numbers:
         return False
     recorded = str(job.former.numbers["store"])
     if "store" not in job.scene.mosaic:
-        # The folder may have moved, or be named from another working directory.
+        # Compare names only: the folder may have moved, or its path be relative.
         return Path(recorded).name == job.store.name
     if recorded != str(job.store):
         return False
@@ -251,7 +251,7 @@ def _is_own_store(job: Job) -> bool:
 
 
 def _remove_store(path: Path) -> None:
-    """Remove a store in one step, so that a killed process leaves no part of it at its path."""
+    """Remove a store in one step, so that a killed process leaves no partial store at its path."""
     real = path.resolve()
     with staging(real.parent) as temporary:
         real.rename(temporary / real.name)
@@ -276,26 +276,29 @@ FILES: dict[str, tuple[str, ...]] = {
     "image": ("image.h5", "image.png", "before.h5", "before-and-after.png"),
     "mosaic": (),
 }
-"""Files that every step may write. A mosaic's store guards itself."""
+"""Files that every step may write. The store of a mosaic has its own checks."""
 
 TABLES = {name: f"[process.{name}]" for name in CORRECTIONS} | {
     "inspect": "[grid]",
     "image": "[image]",
     "mosaic": "[mosaic]",
 }
-"""Table of the scene file with every step's options."""
+"""Table of the scene file that contains the options of a step, by step."""
 
 
 def check_pictures() -> None:
-    """Warn if there will be no pictures."""
+    """Warn if no pictures can be written."""
     if not is_installed("matplotlib"):
-        warn(f"no pictures are written: they need matplotlib, {install_command('plot')}")
+        warn(f"no pictures are written, since they need matplotlib: {install_command('plot')}")
 
 
 def _formed(
     job: Job, lines: RangeLines, grid: Grid, part: tuple[int, int]
 ) -> tuple[Image, float | None]:
-    """Return the image of lines, and its predicted error; this is one part of several."""
+    """Return the image of lines and its predicted error.
+
+    `part` is the number of this image, from 0, and the number of images, for the progress.
+    """
     number, parts = part
 
     def progress(done: int, total: int) -> None:

@@ -1,1 +1,1 @@
-"""Signals: echoes and their compression, spectra, interpolation in range."""
+"""Signals: echoes and their compression, spectra, and interpolation in range."""

@@ -1,8 +1,8 @@
 """Errors that no imager can avoid, because the lines do not determine the image.
 
-Samples beyond the ends of a line are unknown. So is the side of the guard band to which energy
-inside it belongs. Every imager adds these errors to its prediction, and warns if they are too
-large.
+Samples beyond the ends of a line are unknown. If the band fills the whole sampled band, it is also
+unknown to which end of the band the energy between its edges belongs. Every imager adds these
+errors to its prediction, and warns if they are too large.
 """
 
 from __future__ import annotations
@@ -24,38 +24,41 @@ from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
 BEST_DB = -85.0
-"""Least relative rms error that single precision leaves of an image."""
+"""Smallest relative rms error of an image that single precision allows."""
 
-_CLOSE_DB = 0.5  # of an error that just cannot be reached
-_AT_END = 0.03  # error near an end over its power; measured on noise in 40 to 90 % of the band
-_END = 4  # samples whose mean power is that of an end: the taps on one side of a filter
-_NEAR_END = 5  # samples around an end within which interpolators differ: half of 8 taps, and one
-_CUT = 0.01  # an end fades if its power is below this share of that of the last samples
-_FADING = 16  # these samples
-_THIN = 0.42  # half bandwidth, cycles per sample, up to which a cut only affects `_NEAR_END`
-_CHANNELS = 64  # sampled; half or twice as many change nothing
-_POINTS = 16  # sampled along either side of the grid
-_MOST = 0.5  # share of the allowed error power above which to warn: 3 dB more than requested
-_LEAST = 1e-3  # share of the allowed error power below which to ignore it
+_CLOSE_DB = 0.5  # margin by which a request may be out of reach without a warning
+# Error power near an end over the power of the end, measured on noise in 40 to 90 % of the band.
+_AT_END = 0.03
+_END = 4  # samples whose mean power is taken as that of an end: the taps on one side of a filter
+_NEAR_END = 5  # samples around an end within which interpolators differ: half of 8 taps, plus one
+# An end fades if the power of its last sample is below this share of the mean of so many samples.
+_CUT, _FADING = 0.01, 16
+# Half bandwidth, cycles per sample, up to which a cut affects only the samples within `_NEAR_END`.
+_THIN = 0.42
+_CHANNELS = 64  # channels sampled; half or twice as many change nothing
+_POINTS = 16  # points sampled along either side of the grid
+# Share of the allowed error power above which to warn: the error is then 1.8 dB above the request.
+_MOST = 0.5
+_LEAST = 1e-3  # share of the allowed error power below which errors are ignored
 
 
 @dataclass(frozen=True)
 class Ambiguity:
-    """Relative error power of an image that the lines themselves leave open.
+    """Relative error power of an image that follows from the lines themselves.
 
     Attributes
     ----------
     ends : float
-        From samples beyond the ends of lines that do not fade.
+        Error power due to unknown samples beyond the ends of lines that do not fade.
     aliasing : float
-        From edges of the band that alias, if it fills the whole sampled band.
+        Error power due to band edges that alias, if the band fills the whole sampled band.
     oversampling : float
         Sample rate over the width of the occupied band.
     brightness : float
-        Power of the image over that of what its beam passes: see `clsas.signal.brightness`.
+        Power of the image over the power that its beam passes; see `clsas.signal.brightness`.
     scatter : float
-        Factor by which chance may raise the relative error power of images of few resolution
-        cells: see `clsas.signal.scatter`.
+        Factor by which chance may raise the relative error power of images with few resolution
+        cells; see `clsas.signal.scatter`.
     """
 
     ends: float = 0.0
@@ -66,7 +69,7 @@ class Ambiguity:
 
     @property
     def least_brightness(self) -> float:
-        """Power of the image over that of what its beam passes, as dark as chance may make it."""
+        """Power of the image over the power that its beam passes, as low as chance may make it."""
         return self.brightness / self.scatter
 
     @property
@@ -75,15 +78,16 @@ class Ambiguity:
         return self.ends + self.aliasing
 
     def of_passed_db(self, requested_db: float) -> float:
-        """Return an error relative to what the beam passes that keeps `requested_db` of the image.
+        """Return the error relative to what the beam passes that meets `requested_db`, dB.
 
-        It is never below `BEST_DB`. `warn` warns if the image is darker than that allows, but not
-        if only chance may make it so: predicted errors contain that.
+        The result is never below `BEST_DB`. If the image is so dark that the request cannot be met,
+        `warn` warns. It does not warn of what only chance may cause, which predicted errors
+        include.
         """
         return max(requested_db + in_db(self.least_brightness), min(requested_db, BEST_DB))
 
     def rest_db(self, requested_db: float, other_error: float = 0.0) -> float:
-        """Error left for all other causes, dB, so that the whole image keeps `requested_db`.
+        """Return the error left for all other causes, dB, so that the image meets `requested_db`.
 
         `other_error` is the error power of causes that are already known. If these leave too
         little, the result is `requested_db`, and `warn` warns.
@@ -99,29 +103,29 @@ class Ambiguity:
 
         def outcome(error_power: float) -> str:
             found_db = in_db(allowed + error_power)
-            return f"the error may be {found_db:.0f} dB in place of {name} {requested_db:.3g} dB"
+            return f"the error may be {found_db:.0f} dB instead of {name} {requested_db:.3g} dB"
 
         if requested_db + in_db(self.brightness) < BEST_DB - _CLOSE_DB:
             dark_db = -in_db(self.brightness)
             validate.warn(
-                f"the image is {dark_db:.0f} dB darker than what the beam passes, since most "
-                "echoes come from where the beam hardly covers the grid: the error may be "
-                f"{BEST_DB + dark_db:.0f} dB in place of {name} {requested_db:.3g} dB; use a wider "
-                "beam, or a grid that it covers"
+                f"the image is {dark_db:.0f} dB darker than the echoes that the beam passes, "
+                "because most of them come from places where the beam hardly covers the grid: the "
+                f"error may be {BEST_DB + dark_db:.0f} dB instead of {name} {requested_db:.3g} dB; "
+                "use a wider beam, or a grid that the beam covers"
             )
         if self.ends > _MOST * allowed:
             validate.warn(
                 "lines do not fade towards ends that the grid reaches, or their guard band is thin "
                 f"(oversampling {self.oversampling:.4g}) and the cut affects samples farther "
-                f"inside: pixels depend on how lines are interpolated, so that "
-                f"{outcome(self.ends)}; "
-                "let the grid end before the lines, let the lines fade, or sample them more finely"
+                "inside: pixels depend on how the lines are interpolated, so that "
+                f"{outcome(self.ends)}; let the grid end before the lines do, fade the lines "
+                "(lines.tapered_ends), or sample them more finely"
             )
         if self.aliasing > _MOST * allowed:
             validate.warn(
-                "the lines' band fills all that is sampled, so that its edges may alias: "
-                f"oversampling is {self.oversampling:.4g}, more than {NEEDED_OVERSAMPLING:.4g} is "
-                f"needed; {outcome(self.aliasing)}; sample more finely "
+                "the band of the lines fills the whole sampled band, so that its edges may alias: "
+                f"oversampling is {self.oversampling:.4g}, but must be above "
+                f"{NEEDED_OVERSAMPLING:.4g}; {outcome(self.aliasing)}; sample more finely "
                 "(compress(oversampling=...))"
             )
 
@@ -134,10 +138,10 @@ def ambiguity(
     beam: BeamWindow | None = None,
     along: NDArray[np.float64] | None = None,
 ) -> Ambiguity:
-    """Unavoidable error power of an image on a grid.
+    """Return the unavoidable error power of an image on a grid.
 
-    `energy` holds that of every line, in any unit, [channels]; `along` the track's unit directions
-    for a beam, [channels, 3].
+    `energy` is the energy of every line in any unit, [channels]. `along` are the unit directions of
+    the track, [channels, 3], or None without a beam.
     """
     return Ambiguity(
         ends_error(lines, grid, spectrum, beam, along),
@@ -155,20 +159,20 @@ def ends_error(
     beam: BeamWindow | None,
     along: NDArray[np.float64] | None,
 ) -> float:
-    """Relative error power from truncated lines: the samples beyond an end are unknown.
+    """Return the relative error power due to truncated lines, whose further samples are unknown.
 
     Notes
     -----
-    Within five samples of an end every interpolator responds differently to the cut. The total
-    error is `_AT_END` of an end sample's power. With a thin guard band the cut also affects samples
-    farther inside: m samples from the end, the sinc interpolation of a component at distance d from
-    the spectral centre has an error of 1/(2 pi m cos(pi d)) of its amplitude. Summed over the
-    samples from `near` to `far`, and over the part of a flat band of half width h beyond `_THIN`,
-    the error is
+    Within five samples of an end, every interpolator responds differently to the cut. The total
+    error there is `_AT_END` times the power of an end sample. With a thin guard band the cut also
+    affects samples farther inside. At m samples from the end, the sinc interpolation of a component
+    at distance d from the spectral centre has an error of 1/(2 pi m cos(pi d)) of its amplitude.
+    Summed over the samples from `near` to `far`, and over the part of a flat band of half width h
+    beyond `_THIN`, the error is
 
         S/pi^2 (1/near - 1/far),  S = (tan(pi h) - tan(pi _THIN))/(4 pi h),
 
-    of an end sample's power, unless the lines fade.
+    times the power of an end sample, unless the lines fade.
     """
     some = some_channels(lines.channels, _CHANNELS)
     part, points_m = lines.select(some), grid.spread(_POINTS)
@@ -195,7 +199,7 @@ def ends_error(
     if not imaged.any():
         return 0.0
     at_ends = np.zeros(len(some))
-    # Samples from either end on, and the distances of the nearest and the farthest pixel.
+    # For either end: the samples counted from it, and the nearest and the farthest pixel.
     for samples, near, far in (
         (square, nearest, farthest),
         (square[:, ::-1], last - farthest, last - nearest),
@@ -212,7 +216,7 @@ def ends_error(
 
 
 def end_powers(lines: RangeLines) -> tuple[float, float]:
-    """Power of the first and of the last samples over that of whole lines; 0 where lines fade."""
+    """Return the power of the first and last samples over the mean power; 0 where lines fade."""
     part = lines.select(some_channels(lines.channels, _CHANNELS))
     square = part.samples.real.astype(np.float64) ** 2
     square += part.samples.imag.astype(np.float64) ** 2
@@ -227,5 +231,5 @@ def end_powers(lines: RangeLines) -> tuple[float, float]:
 
 
 def _ends_loudly(square: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which lines do not fade towards their first sample; `square` is [channels, length]."""
+    """Return a mask of lines that do not fade towards the first sample of `square`, [n, length]."""
     return square[:, 0] > _CUT * square[:, :_FADING].mean(axis=1)

@@ -1,8 +1,8 @@
 """Ratio of the power of an image to the power that its beam passes.
 
-Where the beam hardly covers the parts of a scene that its lines hold the echoes of, most of what it
-passes cancels in the image. Errors of interpolation do not cancel. They are therefore larger
-relative to such an image than relative to one that the beam covers evenly.
+If most echoes in the lines come from parts of the scene that the beam hardly covers, most of what
+the beam passes cancels in the image. Interpolation errors do not cancel. They are therefore larger
+relative to such an image than relative to an image that the beam covers evenly.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, some_channels, wavelength_m
+from clsas.core.lines import RangeLines, some_channels
+from clsas.core.wavelengths import wavelength_m
 from clsas.signal.spectrum import Spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
@@ -21,12 +22,14 @@ from clsas.sonar.visibility import sines
 # of points at the edge of the beam look 3 dB brighter than they are; twice as many change 1 dB.
 _GROUP = 64
 _LEAST_GROUP = 32
-_GROUPS = 8  # spread evenly along the lines
-_POINTS = (16, 48)  # along either side of the grid: at first, and where that finds little power
-_DARKEST = 1e-8  # far below what any image resolves
-_DARK = 0.5  # power ratio above which images are not dark; sampling alone moves it by 1 dB
-_COVERED = 0.25  # of the best point's power: a beam that covers all points so well leaves none dark
-_COVERAGE_CHANNELS = 256  # sampled for that
+_GROUPS = 8  # groups of channels, spread evenly along the lines
+# Points along either side of the grid: first, and again if those find little power.
+_POINTS = (16, 48)
+_DARKEST = 1e-8  # least ratio returned, far below what any image resolves
+_DARK = 0.5  # ratio above which images are not dark; sampling alone changes it by 1 dB
+# If the beam covers every point with this share of the power of the best-covered point, the image
+# is not dark. So many channels are sampled to find out.
+_COVERED, _COVERAGE_CHANNELS = 0.25, 256
 
 
 def brightness(
@@ -36,21 +39,21 @@ def brightness(
     beam: BeamWindow | None,
     along: NDArray[np.float64] | None,
 ) -> float:
-    """Return the power of an image over that of what its beam passes, 1 for all but dark images.
+    """Return the power of an image over the power that its beam passes, 1 unless it is dark.
 
     Parameters
     ----------
     lines, grid, spectrum
-        What is imaged, and the spectrum of the lines.
+        Lines, pixels, and the spectrum of the lines.
     beam, along : BeamWindow and float64 [channels, 3], or None
-        Weights of the channels, and the track's unit directions at these.
+        Weights of the channels, and the unit directions of the track at the channels.
 
     Notes
     -----
     With z_i = w_i s_i(rho_i) exp(j 2 k rho_i), sums of z_i over groups of neighbouring channels
-    keep what arrives from about the direction of a pixel. Their power, averaged over pixels and
-    groups, over that of all z_i is the brightness. It takes the groups as incoherent, as they are
-    for echoes of a seabed; coherent ones make images brighter still.
+    keep what arrives from about the direction of a pixel. The brightness is the power of these
+    sums, averaged over pixels and groups, over the power of all z_i. Groups are assumed to be
+    incoherent, as they are for echoes of a seabed. Coherent groups make images brighter.
     """
     if beam is None or along is None or beam.normalise:
         return 1.0
@@ -81,7 +84,7 @@ def _of_groups(
     beam: BeamWindow,
     along: NDArray[np.float64],
 ) -> float:
-    """Return the power of sums over groups of channels, [groups, channels], over their terms'."""
+    """Return the power of sums over groups [groups, channels], relative to that of their terms."""
     channels = groups.ravel()
     part = lines.select(channels)
     range_m = pairwise_range_m(
@@ -114,7 +117,7 @@ def _weights(
     beam: BeamWindow,
     along: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the beam's weights, [points, channels]."""
+    """Return the weights of the beam, [points, channels]."""
     sine = sines(points_m, lines.phase_centres_m[channels], along[channels]).T
     weights: NDArray[np.float64] = beam.weights(sine, wavelength_m(lines))
     return weights

@@ -23,10 +23,11 @@ from clsas.sonar.system import Pulse
 
 Window = str | float | tuple
 
-_BAND_EDGE = 0.1  # width, in bandwidths, of the edges that truncating the filter gives its band
+# Width, in bandwidths, of the edges that the band of the filter gets when the filter is truncated.
+_BAND_EDGE = 0.1
 _BLOCK = 1 << 22  # complex128 samples of the channels that are compressed together
-# Memory in work, fitted to peaks of 0.3 to 2 GiB, which it predicts to 30 %.
-_FFT_LINES = 3  # twiddle factors and work of an FFT, in lines as long as those transformed
+# Model of the memory in use, fitted to measured peaks of 0.3 to 2 GiB, which it predicts to 30 %.
+_FFT_LINES = 3  # twiddle factors and work area of an FFT, in lines of the transform's length
 _BYTES_MIXED = 64  # per sample that is mixed to baseband
 _BYTES_FILTERED = 160  # per frequency of the filter
 
@@ -40,7 +41,7 @@ def compress(
     replica: Replica | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> RangeLines:
-    """Compress echoes into range lines.
+    """Return the range lines of echoes, compressed by a matched filter.
 
     Parameters
     ----------
@@ -51,11 +52,11 @@ def compress(
         Window over the band: "none", or a window of `scipy.signal.get_window`, such as "hamming",
         "taylor" or ("kaiser", 6.0).
     oversampling : float
-        Sample rate of the lines over the bandwidth, 1 to 10 000. A ratio of whole numbers
-        approximates it to 1e-6; `range_step_m` of the result is exact.
+        Sample rate of the lines over the bandwidth, 1 to 10 000. It is approximated to 1e-6 by a
+        ratio of whole numbers, for which `range_step_m` of the result is exact.
     bandwidth_hz : float, optional
-        Width of the band that is kept, centred on the carrier; by default the pulse's. Required
-        without a pulse. Within the sampled band of a replica.
+        Width of the band that is kept, centred on the carrier, hertz. The default is that of the
+        pulse. It is required without a pulse, and must lie within the sampled band of a replica.
     replica : Replica, optional
         Measured pulse, which the matched filter uses instead of the nominal one of `echoes`.
     progress : callable, optional
@@ -64,8 +65,8 @@ def compress(
     Returns
     -------
     RangeLines
-        Lines from the range of each channel's first sample up to the last range whose pulse is
-        completely recorded. A point of amplitude A has a peak of A with the phase
+        Lines from the range of each channel's first sample to the last range whose pulse was
+        recorded completely. A point of amplitude A has a peak of A with the phase
         exp(-j 2 pi fc tau) = exp(-j 2 k rho).
 
     Raises
@@ -75,16 +76,36 @@ def compress(
         sampled band, the recording is not longer than the pulse, or the lines do not fit into
         memory.
 
+    See Also
+    --------
+    simulate : Echoes of a scene.
+    from_full_matrix, from_phase_history : Range lines of other recordings.
+
     Notes
     -----
     The lines are y(t) = sum_n x(t_n) h(t - t_n)/fs, with
 
         h(t) = integral over the band of W(f) P*(f) exp(j 2 pi f t) df / integral of W |P|^2
 
-    [17], [37]. Without a pulse P is flat; of a replica it is the spectrum of its samples. The sharp
-    ends of the band make h infinitely long. The part of h that is as long as the recording is
-    unchanged, and the rest fades smoothly in the padding. The result is therefore exactly the
-    linear convolution, without wrap-around.
+    (Ødegaard 2004, equations [17] and [37]). P is the spectrum of the pulse or of the samples of
+    the replica, and flat without a pulse. The sharp ends of the band make h infinitely long. The
+    part of h that is as long as the recording is left unchanged, and the rest fades smoothly within
+    the padding. The result is therefore exactly the linear convolution, without wrap-around.
+
+    Examples
+    --------
+    An echo from 15 m, whose peak lies at sample 15 m / 12.5 mm of the line:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> pulse = clsas.Pulse(carrier_hz=100e3, bandwidth_hz=30e3, duration_s=1e-3)
+    >>> time_s = np.arange(2000) / 60e3
+    >>> samples = pulse.envelope(time_s - 0.02)[None]
+    >>> echoes = clsas.Echoes(samples, 0.0, 60e3, 100e3, [0, 0, 0], [0, 0, 0], 1500.0, pulse)
+    >>> lines = clsas.compress(echoes, window="hamming")
+    >>> peak = np.abs(lines.samples[0]).argmax()
+    >>> f"peak at {lines.first_range_m[0] + peak * lines.range_step_m:.2f} m"
+    'peak at 15.00 m'
     """
     validate.instance("echoes", echoes, Echoes)
     validate.progress(progress)
@@ -106,7 +127,8 @@ def compress(
     wanted = float(oversampling) * band / rate
     budget, cause = validate.Budget(), "oversampling" if wanted > 1 else "bandwidth_hz"
     budget.take(cause, 8 * echoes.channels * whole * wanted)
-    # One padded channel before and after resampling, whose lengths may be too large for integers.
+    # One padded channel before and after resampling. Their lengths may not fit into integers, so
+    # this is checked before they are computed.
     budget.take(cause, 0, passing_bytes=32 * (echoes.length + fade) * (1 + wanted))
     ratio = _fraction(wanted)
     units = fft.next_fast_len(math.ceil(2 * (echoes.length + fade) / ratio.denominator))
@@ -114,7 +136,7 @@ def compress(
     length = int(whole * ratio + 1e-9) + 1
 
     outermost = math.ceil((0.5 + _BAND_EDGE) * band * padded / rate)
-    # If the filter's edges do not fit, compute twice the points and keep every other one.
+    # If the edges of the filter do not fit, compute twice as many points and keep every other one.
     every = 1 if resampled > 2 * outermost else 2
     rows = min(max(1, _BLOCK // max(padded, every * resampled)), echoes.channels)
     in_work = 16 * (rows + _FFT_LINES) * (padded + every * resampled)
@@ -161,10 +183,10 @@ def band_window(
     Parameters
     ----------
     window : str, float or tuple
-        "none", or a window of `scipy.signal.get_window`, whose 4097 symmetric samples are
+        "none", or a window of `scipy.signal.get_window`. Its 4097 symmetric samples are
         interpolated by cubic splines.
     bandwidth_hz : float
-        Width of the band.
+        Width of the band, hertz.
 
     Raises
     ------
@@ -177,7 +199,7 @@ def band_window(
 
     count = 4097
     try:
-        if not isinstance(window, (str, tuple)):  # SciPy takes True for a number
+        if not isinstance(window, (str, tuple)):  # SciPy would accept True as a number
             window = validate.number("it", window)
         values = get_window(window, count, fftbins=False)
     except (ValueError, TypeError, IndexError) as error:
@@ -211,7 +233,7 @@ def _band(echoes: Echoes, bandwidth_hz: float | None, replica: Replica | None) -
 
 
 def _fraction(ratio: float) -> Fraction:
-    """Ratio of small whole numbers that approximates a ratio to 1e-6."""
+    """Return a fraction of small whole numbers that approximates a ratio to 1e-6."""
     if ratio > 1:
         return Fraction(ratio).limit_denominator(1000)
     return 1 / Fraction(1 / ratio).limit_denominator(1000)
@@ -225,7 +247,7 @@ def _filter_response(
     period_s: float,
     reach_s: float,
 ) -> NDArray[np.complex128]:
-    """Transfer function, at frequencies bins/period, of the filter that fades beyond +-reach."""
+    """Return the transfer function at bins/period of the filter that fades beyond +-reach."""
 
     def spectrum(frequency: NDArray) -> NDArray:
         return np.full(len(frequency), 1 / band) if pulse is None else pulse.spectrum(frequency)
@@ -237,7 +259,8 @@ def _filter_response(
         return weights(frequency) * np.abs(spectrum(frequency)) ** 2
 
     edges = [-band / 2, band / 2]
-    # The phase rate of P is its delay. Windows have a few cycles over the band.
+    # The phase of P changes with frequency at most at the rate of its duration. Windows have a few
+    # cycles over the band.
     rate = 8 / band + (0.0 if pulse is None else pulse.duration_s)
     points = fft.next_fast_len(math.ceil(1.25 * band * period_s))
     lag = fft.fftfreq(points) * period_s
@@ -251,7 +274,7 @@ def _filter_response(
 
 
 def _baseband(echoes: Echoes, block: slice) -> NDArray:
-    """Complex baseband samples of some channels.
+    """Return the complex baseband samples of some channels.
 
     Real samples are mixed down and doubled. The band filter then removes the image at twice the
     carrier, which leaves the baseband of the analytic signal.

@@ -18,36 +18,50 @@ class Echoes:
     """Raw echoes of every channel, with the channels' geometry.
 
     Sample n of channel i was taken start_time_s[i] + n/sample_rate_hz after the start of
-    transmission. A point of amplitude A at the two-way delay tau gives
-    A p(t - tau) exp(-j 2 pi fc tau) in complex baseband, with p the pulse's envelope and fc the
-    carrier. In passband it gives the real part of A p(t - tau) exp(+j 2 pi fc (t - tau)).
+    transmission. In complex baseband, a point of amplitude A at the two-way delay tau gives
+    A p(t - tau) exp(-j 2 pi fc tau), where p is the envelope of the pulse and fc the carrier. In
+    passband it gives the real part of A p(t - tau) exp(+j 2 pi fc (t - tau)).
 
     Parameters
     ----------
     samples : array_like, [channels, length]
-        Complex baseband (stored as complex64), or real passband (float32).
+        Complex baseband (stored as complex64), or real passband (stored as float32).
     start_time_s : array_like, [channels] or scalar
-        Time of the first sample after the start of transmission.
+        Time of the first sample after the start of transmission, seconds.
     sample_rate_hz : float
-        Samples per second.
+        Sample rate, hertz.
     carrier_hz : float
-        Frequency that was mixed out; for real samples the frequency of their carrier.
+        Frequency that was mixed out, hertz. For real samples the frequency of their carrier.
     tx_m, rx_m : array_like, [channels, 3] or [3]
-        Transmitter and receiver positions at transmission.
+        Transmitter and receiver positions at transmission, metres.
     sound_speed_m_s : float
-        Speed of sound.
+        Speed of sound, metres per second.
     pulse : Pulse, optional
-        Transmitted pulse, with the same carrier. None: the pulse is too short to need
+        Transmitted pulse, with the same carrier. None if the pulse is too short to need
         compression.
     rx_velocity_m_s : array_like, [channels, 3] or [3], optional
-        Velocity of the receivers during the echoes' flight; None is stop-and-hop.
+        Velocity of the receivers while the sound travels, metres per second. None means
+        stop-and-hop.
 
     Raises
     ------
     TypeError, ValueError
         If an array has the wrong type or shape, is empty or not finite, a number is outside its
-        limits, the pulse has another carrier, or float32 cannot represent the samples to its
-        precision.
+        limits, the pulse has another carrier, or the largest sample is too large or too small for
+        float32.
+
+    See Also
+    --------
+    compress : Range lines of echoes.
+    simulate : Echoes of a scene.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> import numpy as np
+    >>> samples = np.zeros((4, 1000), complex)
+    >>> clsas.Echoes(samples, 0.0, 60e3, 100e3, [0, 0, 0], [0, 0, 0], 1500.0)
+    Echoes(4 channels of 1000 samples at 60 kHz, carrier 100 kHz)
     """
 
     samples: NDArray[np.complex64] | NDArray[np.float32]
@@ -60,7 +74,7 @@ class Echoes:
     pulse: Pulse | None = None
     rx_velocity_m_s: NDArray[np.float64] | None = None
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,
@@ -96,7 +110,7 @@ class Echoes:
                 )
 
     def __repr__(self) -> str:
-        """Return sizes and rates: the arrays are long."""
+        """Return sizes and rates, because the arrays are long."""
         return reprs.summary(
             self,
             f"{self.channels} channels of {self.length} samples at "

@@ -1,21 +1,20 @@
-"""Types of fields that hold filters and resamplings: see `clsas.core.fields`."""
+"""Types of fields for filters and resamplings that are stored as JSON; see `clsas.core.fields`."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Annotated
 
-from pydantic import Field
-from pydantic import dataclasses as pydantic_dataclasses
-
-from clsas.core.fields import CONFIG, Array, Number, StoredAs, Whole
+from clsas.core.fields import CONFIG, Array, Constraint, Number, StoredAs, Whole
 from clsas.signal.interpolation import PHASES, UPSAMPLING_TAPS, Interpolator, Resampling, Upsampler
 
 
-@pydantic_dataclasses.dataclass(config=CONFIG)
+@dataclass
 class _Filter:
+    __pydantic_config__ = CONFIG
     taps: int
-    upsampling: Annotated[float, Field(ge=1.0, lt=math.inf)]
+    upsampling: Annotated[float, Constraint(ge=1.0, lt=math.inf)]
     coefficients: Array
     error_db: Number
     scatter_db: Number
@@ -29,8 +28,9 @@ class _Filter:
             raise ValueError(f"coefficients must have the shape {shape}, got {got}")
 
 
-@pydantic_dataclasses.dataclass(config=CONFIG)
+@dataclass
 class _Upsampler:
+    __pydantic_config__ = CONFIG
     step: Whole
     coefficients: Array
     error_db: Number
@@ -43,16 +43,17 @@ class _Upsampler:
             )
 
 
-_Samples = Annotated[int, Field(gt=0, lt=2**30)]
+_Samples = Annotated[int, Constraint(gt=0, lt=2**30)]
 
 
-@pydantic_dataclasses.dataclass(config=CONFIG)
+@dataclass
 class _Resampling:
-    lead: Annotated[int, Field(ge=0, lt=2**20)]
+    __pydantic_config__ = CONFIG
+    lead: Annotated[int, Constraint(ge=0, lt=2**20)]
     period: _Samples
     upsampled_period: _Samples
     shift: int
-    first: Annotated[int, Field(gt=-(2**20), lt=2**20)]
+    first: Annotated[int, Constraint(gt=-(2**20), lt=2**20)]
     length: _Samples
 
     def __post_init__(self) -> None:

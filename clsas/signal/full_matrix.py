@@ -1,4 +1,4 @@
-"""Range lines of a full matrix capture: every element transmits, all receive."""
+"""Range lines of a full matrix capture, in which every element transmits and all receive."""
 
 from __future__ import annotations
 
@@ -31,32 +31,52 @@ def from_full_matrix(
     samples : array_like of float, [tx, rx, time] or [pairs, time]
         Real samples on their carrier.
     elements_m : array_like of float, [elements, 3]
-        Positions of the elements.
+        Positions of the elements, metres.
     sample_rate_hz : float
-        Samples per second.
+        Sample rate, hertz.
     carrier_hz : float
-        Centre frequency of the elements.
+        Centre frequency of the elements, hertz.
     sound_speed_m_s : float
-        Speed of the waves in the material.
+        Speed of the waves in the material, metres per second.
     start_time_s : float
-        Time of the first sample after transmission began.
+        Time of the first sample after the start of transmission, seconds.
     pairs : pair of array_like of int, [pairs], optional
-        Transmitting and receiving element of every line, from 0, for samples [pairs, time].
+        Numbers, from 0, of the transmitting and the receiving element of every line, for samples of
+        shape [pairs, time].
     bandwidth_hz, window, oversampling
-        As in `compress`, without a pulse: pulses of an array are short. The band is twice the
-        carrier by default, and the window is zero at both of its ends. It removes constants.
+        As for `compress`. No pulse is needed, because the pulses of such arrays are short. The
+        default band is twice the carrier, and the default window is zero at both ends of it, which
+        removes constants.
 
     Returns
     -------
     RangeLines
-        One line per pair, in the order of the samples. A pair of two elements whose reverse is not
-        among the pairs counts twice, since it stands for its reverse by reciprocity.
+        One line per pair, in the order of the samples. A pair whose reverse is not among the pairs
+        counts twice, because by reciprocity it also represents its reverse.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument has the wrong type or shape or is outside its limits, or a pair names an
-        element that does not exist or is there twice.
+        If an argument has the wrong type or shape or is outside its limits, a pair names an element
+        that does not exist, or a pair occurs twice.
+
+    See Also
+    --------
+    read_full_matrix : Reader of captures in MATLAB files.
+
+    Examples
+    --------
+    An array of 4 elements, 0.3 mm apart, at 5 MHz:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> elements_m = 0.3e-3 * np.array([[n, 0, 0] for n in range(4)])
+    >>> lines = clsas.from_full_matrix(
+    ...     np.zeros((4, 4, 400)), elements_m,
+    ...     sample_rate_hz=50e6, carrier_hz=5e6, sound_speed_m_s=6300.0,
+    ... )
+    >>> lines.samples.shape, f"{1e3 * lines.last_range_m[0]:.2f} mm"
+    ((16, 160), '25.04 mm')
     """
     elements_m = validate.array("elements_m", elements_m, np.float64, (None, 3))
     count = len(elements_m)
@@ -88,7 +108,10 @@ def from_full_matrix(
     validate.phase(carrier_hz, speed, speed / 2 * last_s)
     numbers = tx * count + rx
     if len(np.unique(numbers)) < len(numbers):
-        raise ValueError(f"pairs must differ, got {len(np.unique(numbers))} of {len(numbers)}")
+        raise ValueError(
+            f"pairs must differ from each other, got {len(np.unique(numbers))} different ones of "
+            f"{len(numbers)}"
+        )
     alone = (tx != rx) & ~np.isin(rx * count + tx, numbers)
     lines = compress(
         Echoes(

@@ -1,4 +1,4 @@
-"""Range interpolation: least-squares filters, and the upsampling that they need."""
+"""Interpolation of range lines: least-squares filters, and the upsampling before them."""
 
 from __future__ import annotations
 
@@ -13,46 +13,50 @@ from scipy.linalg import cho_factor, cho_solve, toeplitz
 
 from clsas.core import reprs, validate
 from clsas.core.lines import RangeLines
-from clsas.signal.spectrum import Spectrum, cycles_per_m_at
+from clsas.core.wavelengths import cycles_per_m_at
+from clsas.signal.spectrum import Spectrum
 
 TAPS = (2, 4, 6, 8)
 UPSAMPLINGS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0)
 MOST_UPSAMPLING = 64.0
 
 COST = {2: 0.75, 4: 1.0, 6: 1.3, 8: 1.55}
-"""Device time per pixel and channel by taps, relative to 4 taps. Measured with PoCL and Intel's
-runtime on an AVX-512 CPU (`scripts/bench taps`); with AVX2 more taps cost a tenth more."""
+"""Device time per pixel and channel by number of taps, relative to 4 taps. Measured with PoCL and
+Intel's runtime on an AVX-512 CPU (`scripts/bench taps`). With AVX2, more taps cost a tenth more."""
 
 _UPSAMPLING_COST = 40.0  # host time of one upsampled sample, in units of `COST`
 
 Gain = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Spectral gain as a function of the distance from the spectral centre, cycles per sample."""
 
-_NOISE_FLOOR = 1e-13  # of the power, in every bin: keeps fits regular where the band is empty
-_POSITIONS = 17  # between two samples, at which filters are fitted; half or twice: 0.3 dB
-_SINGULAR = np.finfo(np.float64).eps  # relative singular values below this are rounding
-_SCATTER_DB = 0.5  # margin for the scatter of measured errors, of exact images too
+# Share of the power that is added to every bin, so that fits stay regular where the band is empty.
+_NOISE_FLOOR = 1e-13
+# Positions between two samples at which filters are fitted. Half or twice as many change errors by
+# 0.3 dB.
+_POSITIONS = 17
+_SINGULAR = np.finfo(np.float64).eps  # smaller relative singular values are rounding errors
+_SCATTER_DB = 0.5  # margin for the scatter of measured errors around predicted ones
 
 
 @dataclass(frozen=True, eq=False)
 class Interpolator:
-    """A filter that evaluates lines between their samples after they are upsampled.
+    """Filter that evaluates upsampled lines between their samples.
 
     Attributes
     ----------
     taps : int
         Samples per evaluation: 2, 4, 6 or 8.
     upsampling : float
-        Upsampling factor of the lines, by FFT, before the filter is applied.
+        Factor by which lines are upsampled by FFT before the filter is applied.
     coefficients : float64 [taps/2, 2, taps/2]
-        Per pair of taps from the innermost, the polynomials E and O, highest power first: the
-        weight of the tap at +-(pair + 1/2) from the middle is E(nu^2) +- nu O(nu^2), with nu in
-        [-1/2, 1/2] the position from the middle.
+        Polynomials E and O for every pair of taps from the innermost outwards, highest power first.
+        The weight of the tap at +-(pair + 1/2) from the middle is E(nu^2) +- nu O(nu^2), where nu
+        in [-1/2, 1/2] is the position relative to the middle.
     error_db : float
         Predicted relative rms error of an evaluation of these lines, dB.
     scatter_db : float
-        Predicted error if the mean response of the filter over all positions, `response`, is
-        divided out of the lines beforehand, dB.
+        Predicted relative rms error if the lines have been divided by the mean response of the
+        filter over all positions, `response`, dB.
     """
 
     taps: int
@@ -68,7 +72,7 @@ class Interpolator:
         self.coefficients.flags.writeable = False
 
     def weights(self, nu: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the taps' weights at positions `nu` from the middle, shape [..., taps]."""
+        """Return the weights of the taps at positions `nu` from the middle, [..., taps]."""
         nu = np.asarray(nu)
         square = (nu * nu)[..., None, None]
         values = np.zeros((*nu.shape, *self.coefficients.shape[:2]))
@@ -78,7 +82,7 @@ class Interpolator:
         return np.concatenate([(even - odd)[..., ::-1], even + odd], axis=-1)
 
     def response(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the filter's gain at some frequencies, averaged over all positions.
+        """Return the gain of the filter at some frequencies, averaged over all positions.
 
         `frequency` is the distance from the spectral centre, cycles per upsampled sample.
         """
@@ -96,26 +100,26 @@ def design(taps: int, upsampling: float, spectrum: Spectrum) -> Interpolator:
     taps : int
         2 (linear interpolation), 4, 6 or 8.
     upsampling : float
-        Upsampling factor of the lines before the filter, >= 1.
+        Factor by which the lines are upsampled before the filter is applied, >= 1.
     spectrum : Spectrum
         Spectrum of the lines before upsampling.
 
     Notes
     -----
-    With frequency f in cycles per upsampled sample and taps at +-a, a = 1/2, 3/2, ..., the error of
-    a symmetric filter is
+    With the frequency f in cycles per upsampled sample and taps at +-a, a = 1/2, 3/2, ..., the
+    error of a symmetric filter is
 
         2 sum_a E_a(nu^2) cos(2 pi f a) - cos(2 pi f nu)
         + j [2 nu sum_a O_a(nu^2) sin(2 pi f a) - sin(2 pi f nu)].
 
-    Its real and imaginary parts are two separate least-squares problems in the coefficients of the
-    polynomials, weighted by the power at f. Linear interpolation is fixed: E = 1/2, O = 1.
+    The real and the imaginary part are two separate least-squares problems for the coefficients of
+    the polynomials, weighted by the power at f. Linear interpolation is fixed: E = 1/2, O = 1.
     """
     return designs(taps, [upsampling], spectrum)[0]
 
 
 def designs(taps: int, upsamplings: Sequence[float], spectrum: Spectrum) -> list[Interpolator]:
-    """Return what `design` returns for each of some upsamplings, in one go."""
+    """Return the interpolators of `design` for several upsampling factors at once."""
     rate = np.array(upsamplings, np.float64)[:, None, None]
     f = spectrum.frequency[:, None] / rate  # [rates, frequencies, 1]
     nu, of_position, from_positions = _positions(taps)
@@ -130,14 +134,14 @@ def designs(taps: int, upsamplings: Sequence[float], spectrum: Spectrum) -> list
         if taps == 2:
             coefficients[:, :, part] = (0.5, 1.0)[part]
         else:
-            # The basis is a product of functions of f and of nu, so they are fitted one by one.
+            # The basis is a product of functions of f and of nu, which are fitted one by one.
             q, r = np.linalg.qr(share * of_frequency)
             aim_in_basis = q.swapaxes(1, 2) @ (share * aim)
             at_positions = np.linalg.pinv(r, rcond=_SINGULAR) @ aim_in_basis
             coefficients[:, :, part] = at_positions @ from_positions[part].T
         residuals.append(of_frequency @ coefficients[:, :, part] @ of_position[part].T - aim)
-    # With the phase of the position removed, the error is the response minus 1. Its mean over
-    # positions is real, since errors at nu and -nu are conjugates.
+    # Once the phase of the position is removed, the error is the response minus 1. Its mean over
+    # positions is real, because errors at nu and -nu are complex conjugates.
     mean = np.array([1.0, *np.full(len(nu) - 1, 2.0)]) / (2 * len(nu) - 1)
     even, odd = residuals
     square = (even**2 + odd**2) @ mean
@@ -156,15 +160,16 @@ def designs(taps: int, upsamplings: Sequence[float], spectrum: Spectrum) -> list
 
 @functools.cache
 def _positions(taps: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Positions at which filters are fitted, the polynomials there, and their least-squares fit.
+    """Return the positions at which filters are fitted, polynomials there, and their fit.
 
-    Positions nu >= 0 are enough: E is even in nu, nu O odd. Polynomials are [part, positions,
-    powers] and their fit from values at the positions [part, powers, positions].
+    Positions nu >= 0 suffice, because E is even in nu and nu O is odd. The polynomials have the
+    shape [part, positions, powers]. The least-squares fit of powers to values at the positions has
+    the shape [part, powers, positions].
     """
     nu = np.linspace(0, 0.5, _POSITIONS // 2 + 1)
     even = nu[:, None] ** (2 * np.arange(taps // 2)[::-1])
     basis = np.stack([even, nu[:, None] * even])
-    # All but the middle stand for two positions.
+    # Every position except the middle represents two.
     weight = np.sqrt([1.0, *np.full(len(nu) - 1, 2.0)])
     fit = np.linalg.pinv(weight[:, None] * basis, rcond=_SINGULAR) * weight
     return nu, basis, fit.astype(np.float64, copy=False)
@@ -182,9 +187,9 @@ def choose(
 ) -> Interpolator:
     """Return the fastest interpolator that keeps the error below `accuracy_db`.
 
-    A margin of half a decibel allows for the scatter of measured errors around the predicted one.
-    It is up to four decibels larger if the power lies at few frequencies, since errors then do not
-    average out.
+    A margin of half a decibel allows for the scatter of measured errors around predicted ones. If
+    the power lies at few frequencies, errors do not average out, and the margin is larger by
+    `Spectrum.scatter`.
 
     Parameters
     ----------
@@ -193,19 +198,20 @@ def choose(
     accuracy_db : float
         Requested relative rms error, dB, negative.
     taps, upsampling : int, float, optional
-        Fix one or both. With both, `accuracy_db` has no effect.
+        Fixed values for one or both. If both are fixed, `accuracy_db` has no effect.
     other_error : float
         Relative rms error from other causes, which adds in power.
     pixels_per_sample : float
-        Pixels over samples of a line. The more pixels, the less the time of upsampling matters.
+        Number of pixels over number of samples of a line. The more pixels there are, the less the
+        time of upsampling matters.
     lookup_cost : callable, optional
-        Relative time of a pixel and channel, as a function of taps and upsampling.
+        Relative time per pixel and channel as a function of taps and upsampling.
 
     Raises
     ------
     ValueError
-        If `taps` is not one of 2, 4, 6, 8, `upsampling` is below 1, or `accuracy_db` cannot be
-        reached with the fixed one.
+        If `taps` is not one of 2, 4, 6, 8, `upsampling` is outside 1 to 64, or `accuracy_db` cannot
+        be reached with the fixed value.
     """
     if taps is not None:
         taps = validate.one_of("taps", taps, TAPS)
@@ -239,22 +245,22 @@ def choose(
 
 @dataclass(frozen=True)
 class Resampling:
-    """Map from samples of a line to samples shifted to the spectral centre and upsampled.
+    """Map from samples of a line to upsampled samples about the spectral centre.
 
-    A line is zero beyond its ends. Upsampled sample m corresponds to index
-    (m + first) / ratio - lead of the line, with its phase changed by
-    -centre_cycles_per_sample (index + lead) cycles.
+    A line is zero beyond its ends. Upsampled sample m lies at the index (m + first) / ratio - lead
+    of the line. Its phase is changed by -centre_cycles_per_sample (index + lead) cycles.
 
     Attributes
     ----------
     lead : int
-        Zeros before a line.
+        Number of zeros before a line.
     period, upsampled_period : int
-        Number of samples before and after upsampling; with an FFT its lengths.
+        Number of samples before and after upsampling. These are the lengths of the FFTs, where FFTs
+        are used.
     shift : int
-        Frequency shift in cycles per period.
+        Frequency shift, cycles per period.
     first, length : int
-        First upsampled sample that is kept, and number of those.
+        First upsampled sample that is kept, and the number of samples kept.
     """
 
     lead: int
@@ -292,7 +298,7 @@ class Resampling:
         samples: NDArray[np.complexfloating],
         gain: NDArray[np.float64] | None = None,
     ) -> NDArray[np.complexfloating]:
-        """Return lines [channels, n] upsampled by FFT, [channels, length], in their own precision.
+        """Return lines [channels, n], upsampled by FFT to [channels, length], in their precision.
 
         `gain` is a factor for the spectrum at every `frequency`.
         """
@@ -314,13 +320,13 @@ class Resampling:
         return result[:, self.first : self.first + self.length]
 
 
-# Zeros at either end of a line during its FFT, in samples. A band-limited line rings beyond its
-# ends; the ringing must decay before it wraps around to the other end.
+# Zeros at either end of a line during its FFT. A band-limited line rings beyond its ends, and the
+# ringing must decay before it wraps around to the other end.
 _GUARD = 64
 
 
 def resampling(length: int, interpolator: Interpolator, spectrum: Spectrum) -> Resampling:
-    """Return the resampling of lines of `length` samples by FFT for an interpolator."""
+    """Return the resampling by FFT of lines of `length` samples, as an interpolator needs it."""
     fft_length = scipy.fft.next_fast_len(length + 2 * _GUARD)
     upsampled_length = scipy.fft.next_fast_len(round(np.ceil(fft_length * interpolator.upsampling)))
     ratio = upsampled_length / fft_length
@@ -335,22 +341,24 @@ PHASES = 32
 """Number of polyphase filters of an `Upsampler`."""
 UPSAMPLING_TAPS = (8, 12, 16, 20, 24, 28, 32)
 _FINE = 4096  # frequency shifts are multiples of 1/(4096 step) cycles per sample
-_SAME = 0.5 / 256  # cycles per sample: half the resolution of a measured spectrum
+# Spectral centre, cycles per sample, up to which lines are not shifted. It is half the resolution
+# of a measured spectrum.
+_SAME = 0.5 / 256
 
 
 @dataclass(frozen=True, eq=False)
 class Upsampler:
-    """Polyphase filters that upsample lines by a ratio of whole numbers, and shape their spectrum.
+    """Polyphase filters that upsample lines by a ratio of whole numbers and shape their spectrum.
 
     Attributes
     ----------
     step : int
-        Upsampled samples are step / PHASES samples apart.
+        Distance between upsampled samples, in samples divided by `PHASES`.
     coefficients : float64 [PHASES, taps]
-        Filters for positions p/PHASES after a sample. Their taps are the taps/2 samples up to that
-        sample, and as many after it.
+        Filters for positions p/PHASES after a sample. Half of the taps are the samples up to and
+        including that sample, the other half the samples after it.
     error_db : float
-        Relative rms error of upsampled lines, dB.
+        Predicted relative rms error of upsampled lines, dB.
     """
 
     step: int
@@ -379,22 +387,23 @@ class Upsampler:
 def upsampler(
     spectrum: Spectrum, step: int, gain: Gain, wanted_db: float, most_db: float | None = None
 ) -> Upsampler | None:
-    """Return the shortest filters that upsample by PHASES / step with an error up to `wanted_db`.
+    """Return the shortest filters that upsample by PHASES / step with errors up to `wanted_db`.
 
-    If there are none, because the lines fill nearly the whole sampled band, return the longest,
-    provided that they err by no more than `most_db` (by default `wanted_db`). Otherwise None.
+    If there are none, because the lines fill nearly the whole sampled band, return the longest
+    filters, provided that their error is at most `most_db` (by default `wanted_db`). Otherwise
+    return None.
 
     Notes
     -----
-    Least-squares fit for every phase: sum_t h_t exp(j 2 pi f x_t) ~ gain(f), weighted by the power
-    at f, with x_t the position of a tap relative to the upsampled sample. The normal equations are
-    exact enough: rounding adds less than 1e-15 of the power, whatever their condition, since their
-    errors lie where lines hold next to nothing.
+    For every phase, sum_t h_t exp(j 2 pi f x_t) is fitted to gain(f) by least squares, weighted by
+    the power at f, where x_t is the position of a tap relative to the upsampled sample. Solving the
+    normal equations is accurate enough. Whatever their condition, rounding adds less than 1e-15 of
+    the power, because its errors lie at frequencies where the lines have almost no power.
     """
     most_db = wanted_db if most_db is None else most_db
     aim = gain(spectrum.frequency)
     weight = spectrum.power + _NOISE_FLOOR
-    # cos(2 pi f x) at multiples of 1/PHASES samples. Sines cancel between positive and negative f.
+    # Values of cos(2 pi f x) at multiples of 1/PHASES samples. Sines cancel between f and -f.
     table = _cosines(spectrum.frequency.tobytes())
     of_taps, of_aim = weight @ table.T[:, ::PHASES], (weight * aim) @ table.T
     wanted = float(weight @ aim**2)
@@ -403,9 +412,10 @@ def upsampler(
         # Position of every tap relative to the upsampled sample, in phases.
         position = np.abs(PHASES * (np.arange(taps) + 1 - taps // 2)[:, None] - first_half)
         right = of_aim[position]
-        # The normal equations have one matrix for all phases: it depends on distances of taps only.
+        # The matrix of the normal equations depends only on the distances between taps, so it is
+        # the same for all phases.
         coefficients = cho_solve(cho_factor(toeplitz(of_taps[:taps])), right).T
-        # Power that the best fit leaves, by phase.
+        # Power of the residual of the best fit, by phase.
         residual = np.maximum(wanted - np.einsum("pt,tp->p", coefficients, right), 0.0)
         total = (residual.sum() + residual[1:-1].sum()) / PHASES / (spectrum.power @ aim**2)
         error_db = 10 * np.log10(max(float(total), 1e-30))
@@ -418,6 +428,6 @@ def upsampler(
 
 @functools.lru_cache(maxsize=4)
 def _cosines(frequency: bytes) -> NDArray[np.float64]:
-    """Cosines at the frequencies of a spectrum, [multiples of 1/PHASES samples, frequencies]."""
+    """Return cosines at multiples of 1/PHASES samples, [multiples, frequencies of a spectrum]."""
     positions = np.arange(max(UPSAMPLING_TAPS) * PHASES) / PHASES
     return np.cos(2 * np.pi * np.outer(positions, np.frombuffer(frequency)))

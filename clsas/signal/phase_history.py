@@ -1,4 +1,4 @@
-"""Range lines from samples over frequency: phase histories of stepped or dechirped pulses."""
+"""Range lines from samples over frequency, such as phase histories of dechirped pulses."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from clsas.core import validate
+from clsas.core.extras import needed
 from clsas.core.lines import RangeLines
 from clsas.signal.compression import Window, band_window
 
 _BLOCK = 1 << 22  # complex128 samples of the channels that are transformed together
 _LEAST_OF_BAND = 1e-2
-"""Lowest frequency over the width of the band, below which a unit is wrong. Radars that look into
-the ground have 0.03; GHz taken for Hz make 1e-9 of it."""
-_EQUAL_STEPS = 1e-6  # cycles at a line's ends by which one common step may be wrong: -104 dB
+"""Lowest frequency over the width of the band, below which a unit is probably wrong. The ratio is
+0.03 for radars that look into the ground, and 1e-9 of the right one for GHz mistaken for Hz."""
+# Phase error, cycles, at the ends of a line up to which one common frequency step is used. The
+# error of the image is then -104 dB.
+_EQUAL_STEPS = 1e-6
 
 
 def from_phase_history(
@@ -34,36 +37,37 @@ def from_phase_history(
 ) -> RangeLines:
     """Return range lines of samples over frequency, such as those of motion-compensated radar.
 
-    A point of amplitude A at range rho gives A exp(sign j 4 pi f (rho - r0)/c) at the frequency f,
-    where r0 is the channel's reference range: range and phase are both relative to it.
+    A point of amplitude A at range rho gives A exp(sign j 4 pi f (rho - r0)/c) at the frequency f.
+    Range and phase are both relative to r0, the reference range of the channel.
 
     Parameters
     ----------
     samples : array_like of complex, [channels, frequencies]
-        Frequency response of every channel. At least 2 frequencies.
+        Frequency response of every channel, with at least 2 frequencies.
     first_frequency_hz, frequency_step_hz : float or array_like, [channels]
-        Frequency of the first sample, as transmitted, and the step between samples; one number
-        applies to all channels.
+        Frequency of the first sample, as transmitted, and the step between samples, hertz. One
+        number applies to all channels.
     reference_range_m : float or array_like, [channels]
-        Range r0 (half the two-way path) that each channel is referenced to; 0 if phases are
+        Reference range r0 (half the two-way path) of each channel, metres; 0 if phases are
         absolute.
     tx_m, rx_m : array_like, [channels, 3] or [3]
-        Transmitter and receiver positions.
+        Transmitter and receiver positions, metres.
     sound_speed_m_s : float
-        Speed of the waves; 299 792 458 m/s for radar.
+        Speed of the waves, metres per second; 299 792 458 m/s for radar.
     window : str, float or tuple
         Window over the frequencies: "none", or a window of `scipy.signal.get_window`.
     oversampling : float
-        Samples per line over samples per frequency response, 1 to 10 000; zeros pad the spectrum.
+        Number of samples per line over number of frequencies, 1 to 10 000. The spectrum is padded
+        with zeros.
     sign : {-1, +1}
-        Sign of the phase with growing range in `samples`.
+        Sign of the phase in `samples` as range grows.
 
     Returns
     -------
     RangeLines
-        Lines of one period c/(2 step), centred on the reference range, at the mean frequency as
-        their carrier. Amplitudes are those of the samples. A conjugate is taken where sign is +1,
-        so that A becomes its conjugate.
+        Lines of one period c/(2 step), centred on the reference range. Their carrier is the mean
+        frequency. Amplitudes are those of the samples. With a sign of +1 the samples are
+        conjugated, so that A becomes its conjugate.
 
     Raises
     ------
@@ -79,18 +83,32 @@ def from_phase_history(
 
     Notes
     -----
-    With the centre frequency fc and weights w of sum 1,
+    With the centre frequency fc, and weights w with the sum 1, the lines are
 
         s(r) = exp(-j 4 pi fc r0/c) sum_m w_m S_m exp(j 4 pi (f_m - fc)(r - r0)/c),
 
     so that a point gives A p(r - rho) exp(-j 2 k rho), k = 2 pi fc/c. Phases of reference ranges
     are computed in float64. A line is periodic: echoes from beyond one end appear at the other.
-    `RangeLines.tapered_ends` fades the ends, which interpolate poorly.
+    `RangeLines.tapered_ends` fades the ends, where lines cannot be interpolated well.
+
+    Examples
+    --------
+    64 frequencies, 1 MHz apart, make lines of 150 m, here centred on a range of 1 km:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> lines = clsas.from_phase_history(
+    ...     np.ones((2, 64), complex), first_frequency_hz=9.5e9, frequency_step_hz=1e6,
+    ...     reference_range_m=1000.0, tx_m=[0, 0, 1000], rx_m=[0, 0, 1000],
+    ...     sound_speed_m_s=299_792_458,
+    ... )
+    >>> lines.samples.shape, f"{lines.first_range_m[0]:.1f} to {lines.last_range_m[0]:.1f} m"
+    ((2, 128), '925.1 to 1073.8 m')
     """
     samples = validate.array("samples", samples, np.complex64, (None, None))
     channels, count = samples.shape
     if count < 2:
-        raise ValueError(f"samples must hold at least 2 frequencies, got {count}")
+        raise ValueError(f"samples must have at least 2 frequencies, got {count}")
     try:
         sign = validate.one_of("sign", sign, (-1, 1))
     except ValueError:
@@ -108,7 +126,7 @@ def from_phase_history(
     validate.memory("oversampling", 8 * channels * oversampling * count)
     length = fft.next_fast_len(math.ceil(oversampling * count))
     equal = np.ptp(step_hz) * count <= _EQUAL_STEPS * step_hz.min()
-    # The longest line that no channel's period is shorter than.
+    # The longest line that is not longer than the period of any channel.
     range_step_m = float(speed / (2 * length * step_hz.max()))
     offset_m = (np.arange(length) - length // 2) * range_step_m
     carrier_hz = float(np.mean(first_hz + (count - 1) / 2 * step_hz))
@@ -143,7 +161,7 @@ def from_phase_history(
 def _warn_of_slips(
     first_hz: NDArray[np.float64], band_hz: NDArray[np.float64], reference_m: NDArray[np.float64]
 ) -> None:
-    """Warn of frequencies and ranges that are possible, and hardly ever meant."""
+    """Warn of frequencies and ranges that are possible but hardly ever intended."""
     low = int(np.argmin(first_hz / band_hz))
     if first_hz[low] < _LEAST_OF_BAND * band_hz[low]:
         validate.warn(
@@ -159,10 +177,10 @@ def _warn_of_slips(
 
 
 def _weights(window: Window, count: int) -> NDArray[np.float64]:
-    """Return weights of the frequencies, of sum 1."""
+    """Return weights of the frequencies, with the sum 1."""
     weights = band_window(window, 1.0)(np.linspace(-0.5, 0.5, count))
     if not abs(weights.sum()) > 0:
-        raise ValueError(f"window must not have the sum 0, got {validate.shown(window)}")
+        raise ValueError(f"window must have a sum other than 0, got {validate.shown(window)}")
     return weights / weights.sum()
 
 
@@ -179,8 +197,9 @@ def _frequencies(name: str, value: ArrayLike, channels: int) -> NDArray[np.float
 def _at_own_steps(
     spectrum: NDArray[np.complex128], ratio: NDArray[np.float64], length: int
 ) -> NDArray[np.complex128]:
-    """Sum of S_m exp(j 2 pi m n ratio/length) over m, for n from -length/2, per channel."""
-    import finufft  # slow to import
+    """Return the sum over m of S_m exp(j 2 pi m n ratio/length), n from -length/2, per channel."""
+    with needed("channels that differ in their frequency step"):
+        import finufft  # slow to import
 
     number = np.arange(length) - length // 2
     middle = spectrum.shape[1] // 2

@@ -1,4 +1,4 @@
-"""Range lines read at any range, on the host."""
+"""Interpolation of range lines at any range, on the host."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from clsas.signal.spectrum import Spectrum, measure_spectrum
 _Complex = TypeVar("_Complex", np.complex64, np.complex128)
 
 ACCURACY_DB = -70.0
-"""Default relative rms error of what is read."""
-_MOST_KEPT = (
-    1 << 29
-)  # bytes of upsampled lines, which are read many times; larger ones are made anew
-_UPSAMPLED_AT_ONCE = 256  # lines: bounds the memory of their FFTs
+"""Relative rms error of the values by default, dB."""
+# Upsampled lines of up to so many bytes are kept, because they are read many times. Larger ones are
+# upsampled again for every reading.
+_MOST_KEPT = 1 << 29
+_UPSAMPLED_AT_ONCE = 256  # lines; bounds the memory of their FFTs
 
 
 @dataclass(frozen=True, eq=False)
 class Readout:
-    """Lines, and how they are interpolated.
+    """Range lines with the filter that interpolates them.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Readout:
 
     @classmethod
     def of(cls, lines: RangeLines, accuracy_db: float = ACCURACY_DB) -> Readout:
-        """Return lines with the fastest interpolator of an accuracy, dB."""
+        """Return the readout of lines with the fastest interpolator for an accuracy, dB."""
         spectrum = measure_spectrum(lines)
         interpolator = choose(spectrum, accuracy_db)
         of_filter = resampling(lines.length, interpolator, spectrum)
@@ -51,7 +51,7 @@ class Readout:
     def read(
         self, channels: NDArray[np.int64], range_m: NDArray[np.float64]
     ) -> NDArray[np.complex64]:
-        """Return the lines of some channels at ranges of their own, 0 beyond their ends.
+        """Return the lines of some channels, each at its own ranges; 0 beyond their ends.
 
         Parameters
         ----------
@@ -61,7 +61,7 @@ class Readout:
         Returns
         -------
         complex64 [n, m]
-            Values as the samples have them, without their carrier.
+            Interpolated samples. The carrier that was mixed out is not restored.
         """
         lines = self.lines
         index = (range_m - lines.first_range_m[channels, None]) / lines.range_step_m
@@ -73,7 +73,7 @@ class Readout:
 
     @cached_property
     def _upsampled(self) -> NDArray[np.complex64] | None:
-        """All lines upsampled, None if they are too large to be kept."""
+        """All lines, upsampled; None if they are too large to be kept."""
         lines = self.lines
         if 8 * lines.channels * self.resampling.length > _MOST_KEPT:
             return None
@@ -96,7 +96,7 @@ def interpolated(
     ----------
     samples : complex [n, length]
     index : float64 [n, m]
-        Places in samples; beyond the ends lines fade out as their interpolation does.
+        Positions in samples. Beyond its ends a line falls to zero within the taps of the filter.
     interpolator, resampling : Interpolator, Resampling
     """
     upsampled = cast("NDArray[_Complex]", resampling.apply(samples))
@@ -109,7 +109,7 @@ def between(
     interpolator: Interpolator,
     resampling: Resampling,
 ) -> NDArray[_Complex]:
-    """Return lines between their samples, as `interpolated`, from lines already upsampled."""
+    """Return lines between their samples, like `interpolated`, from lines already upsampled."""
     index = index + resampling.lead
     position = index * resampling.ratio - resampling.first
     lower = np.floor(position)

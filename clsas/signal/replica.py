@@ -9,33 +9,46 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
+from clsas.core.extras import needed
 
 
 @dataclass(frozen=True, eq=False)
 class Replica:
-    """Pulse as it was measured: in a tank, at a hydrophone, or through a loop of the electronics.
+    """Pulse as measured in a tank, at a hydrophone, or through a loop of the electronics.
 
-    Sample n was taken n/sample_rate_hz after the start of transmission. A point of amplitude A in
-    the compressed lines is an echo of A times these samples.
+    Sample n was taken n/sample_rate_hz after the start of transmission. An echo of A times these
+    samples becomes a point of amplitude A in the compressed lines.
 
     Parameters
     ----------
     samples : array_like of complex, [length]
         Complex baseband, relative to the carrier of the echoes.
     sample_rate_hz : float
-        Samples per second; may differ from that of the echoes.
+        Sample rate, hertz. It may differ from that of the echoes.
 
     Raises
     ------
     TypeError, ValueError
         If the samples are real (form the analytic signal and mix it down first), not finite, all
         zero or fewer than two, or the rate is not positive.
+
+    See Also
+    --------
+    compress : Compression of echoes, which accepts a replica.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> import numpy as np
+    >>> pulse = clsas.Pulse(carrier_hz=100e3, bandwidth_hz=20e3, duration_s=1e-3)
+    >>> clsas.Replica(pulse.envelope(np.arange(50) / 50e3), 50e3)
+    Replica(50 samples at 50 kHz)
     """
 
     samples: NDArray[np.complex128]
     sample_rate_hz: float
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(self, samples: ArrayLike, sample_rate_hz: float) -> None: ...
 
@@ -50,14 +63,14 @@ class Replica:
         if len(samples) < 2 or not samples.any():
             raise ValueError(
                 "samples must be at least 2 and not all zero, "
-                f"got {len(samples)} with the maximum {np.abs(samples).max():g}"
+                f"got {len(samples)} with a largest amplitude of {np.abs(samples).max():g}"
             )
         object.__setattr__(self, "samples", samples)
         rate = validate.positive("sample_rate_hz", self.sample_rate_hz, "Hz")
         object.__setattr__(self, "sample_rate_hz", rate)
 
     def __repr__(self) -> str:
-        """Return length and rate: the array is long."""
+        """Return length and rate, because the array is long."""
         return reprs.summary(
             self,
             f"{len(self.samples)} samples at {reprs.quantity(self.sample_rate_hz, 'Hz')}",
@@ -65,20 +78,24 @@ class Replica:
 
     @property
     def duration_s(self) -> float:
-        """Time from the first to the last sample."""
+        """Time from the first to the last sample, seconds."""
         return (len(self.samples) - 1) / self.sample_rate_hz
 
     def spectrum(self, frequency_hz: ArrayLike) -> NDArray[np.complex128]:
-        """Return P(f), the sum of p_n exp(-j 2 pi f t_n) over the sample rate, in seconds.
+        """Return P(f), the sum of p_n exp(-j 2 pi f t_n) divided by the sample rate, seconds.
 
-        Frequencies are relative to the carrier, within half the sample rate.
+        Parameters
+        ----------
+        frequency_hz : array_like
+            Frequencies relative to the carrier, within half the sample rate, hertz.
 
         Raises
         ------
         TypeError, ValueError
             If the frequencies are not finite real numbers.
         """
-        import finufft  # slow to import
+        with needed("pulse compression"):
+            import finufft  # slow to import
 
         frequency = validate.array("frequency_hz", frequency_hz, np.float64, None)
         cycles = frequency.ravel() / self.sample_rate_hz

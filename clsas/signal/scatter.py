@@ -1,7 +1,7 @@
-"""Scatter of an image's power about what is expected of it.
+"""Scatter of the relative error of images with few resolution cells.
 
-The power of an image of few resolution cells may by chance be far less than that of all channels
-together, and errors far more: their ratio is that of two means over few independent values.
+By chance, the power of such an image may be far below its expected value, and the power of its
+errors far above. Their ratio is a ratio of two means over few independent values.
 """
 
 from __future__ import annotations
@@ -13,21 +13,24 @@ from numpy.typing import NDArray
 from clsas.core.decibels import power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
-from clsas.core.lines import GOLDEN, RangeLines, antennas_of, wavelength_m
-from clsas.signal.spectrum import Spectrum, cycles_per_m_at, representative_channels
+from clsas.core.lines import GOLDEN, RangeLines, antennas_of
+from clsas.core.wavelengths import cycles_per_m_at, wavelength_m
+from clsas.signal.spectrum import Spectrum, representative_channels
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
-_PIXELS = 256  # sampled; images of more independent ones scatter by less than `_SPARE_DB`
-_CHANNELS = 256  # sampled, besides the loudest: a beam passes some of them
-_TERMS = 256  # of the sums that pixels are; twice as many change nothing
-_KEPT = 0.995  # share of the images that keep their accuracy
-_SPARE_DB = 1.0  # by which errors of most images fall short of their predictions
-_LEAST_WEIGHT = 1e-3  # mean weight of channels, up to which normalising beams raise pixels
+_PIXELS = 256  # pixels sampled; with more independent pixels, the scatter is below `_SPARE_DB`
+_CHANNELS = 256  # channels sampled in addition to the loudest; a beam passes some of them
+_TERMS = (
+    256  # terms sampled of the sums over channels and frequencies; twice as many change nothing
+)
+_KEPT = 0.995  # share of images that must meet their accuracy
+_SPARE_DB = 1.0  # by which the errors of most images stay below their predictions
+_LEAST_WEIGHT = 1e-3  # mean weight of channels down to which normalising beams amplify pixels
 
 
 def scatter(independent: float) -> float:
-    """Return a factor of relative error power that 99.5 % of images of noise do not exceed.
+    """Return the factor of relative error power that 99.5 % of noise images do not exceed.
 
     Parameters
     ----------
@@ -51,20 +54,20 @@ def independent_pixels(
     beam: BeamWindow | None,
     along: NDArray[np.float64] | None,
 ) -> float:
-    """Return how many pixels of an image of noise are independent, from 1 to 256.
+    """Return the number of independent pixels of a noise image, from 1 to 256.
 
     Parameters
     ----------
     lines, grid, spectrum, beam, along
-        As of `clsas.signal.ambiguity.ambiguity`.
+        As for `clsas.signal.ambiguity.ambiguity`.
     energy : float64 [channels]
         Energy of every line, in any unit.
 
     Notes
     -----
-    A pixel is a sum of many terms, each of a channel and a frequency. N is the inverse of the mean
-    squared correlation of two pixels, over all pairs. Terms are sampled as often as they have
-    power. Even random phases would correlate sums of so few terms by 1/`_TERMS`. This is
+    A pixel is a sum of many terms, one for every channel and frequency. N is the inverse of the
+    mean squared correlation of two pixels, over all pairs. Terms are sampled in proportion to their
+    power. Sums of so few terms are correlated by 1/`_TERMS` even if the phases are random. This is
     subtracted, which overestimates N by up to a third for N up to 60.
     """
     is_whole = grid.size <= _PIXELS

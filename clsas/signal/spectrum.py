@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -13,28 +13,31 @@ from scipy.ndimage import uniform_filter1d
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
+from clsas.core.wavelengths import cycles_per_m_at
 
 MEASURED_CHANNELS = 256
-"""Channels sampled for a spectrum. Half and twice as many move predicted errors by less than
-0.05 dB; with half as many, filters depend a little on the order of channels."""
+"""Channels sampled for a spectrum. Half or twice as many change predicted errors by less than
+0.05 dB. With half as many, filters depend a little on the order of channels."""
 FEW_CHANNELS = 32
 """Channels sampled for a quick estimate of the power outside a band."""
 NEEDED_OVERSAMPLING = 1.05
-"""Sample rate over occupied bandwidth above which a guard band separates the band's edges."""
-_LEAST_CYCLES = 0.02  # per sample, at the middle of a band that shows the carrier
-_FREQUENCIES = 128  # bins; with half as many measured errors move by 0.2 dB, with twice by 0.1 dB
+"""Sample rate over occupied bandwidth above which a guard band separates the edges of the band."""
+# Bins of a spectrum. Half as many change measured errors by 0.2 dB, twice as many by 0.1 dB.
+_FREQUENCIES = 128
 _FLOOR_WIDTH = 1 / 64  # cycles per sample; the quietest part of this width is taken as noise
 _FLOOR_MARGIN = 2.0  # scatter of the mean of a few periodograms
-_NOISE_LEFT = 0.1  # share of the noise's power in peaks above that margin
+_NOISE_LEFT = 0.1  # share of the noise power in peaks above that margin
 OUTSIDE = 0.1
 """Share of the allowed error power that may come from outside the nominal band."""
-_OUTSIDE_BAND = (1e-8, 1e-6, 1e-4)  # of the signal's power, in tails of windows and finite lines
-_CLOSING = 1 / 300  # cycles per sample around the opposite of the centre, which may alias
+# Shares of the signal power that may lie outside the band, in tails of windows and finite lines.
+_OUTSIDE_BAND = (1e-8, 1e-6, 1e-4)
+_CLOSING = 1 / 300  # cycles per sample around the point opposite the centre, which may alias
 _COHERENT_CYCLES = 2.0  # phase over the aperture up to which common parts add coherently
 _COHERENT_POINTS = 3  # sampled along either side of the grid; twice as many change nothing
-_COHERENT_FREQUENCIES = 256  # the strongest of those that may add up; half change nothing
-_FEW_FREQUENCIES = 4.0  # errors of a single frequency are up to 5 times the predicted power
-_LOUDEST = 16  # channels, sampled in addition to those spread evenly: clicks are in few lines
+# Number of the strongest coherent frequencies that are evaluated; half as many change nothing.
+_COHERENT_FREQUENCIES = 256
+_FEW_FREQUENCIES = 4.0  # errors of a single frequency have up to 5 times the predicted power
+_LOUDEST = 16  # loudest channels, sampled as well because clicks occur in few lines
 _SUMMABLE = (1e-20, 1e38)  # energies that float32 squares and sums without loss
 _RESOLVED = 1024  # samples that resolve the edges of a band; shorter lines are padded
 _LINES_TOGETHER = 8  # transformed together, so that they stay in the processor's caches
@@ -51,14 +54,14 @@ class Spectrum:
     frequency : float64 [n]
         Distance from the centre, cycles per sample, 0 to 0.5.
     power : float64 [n]
-        Weight of errors at that distance, on both sides together: the share of the lines' power or
-        of the image's power, whichever is larger. The sum is 1 to 2.
+        Weight of errors at that distance, on both sides together. It is the share of the power of
+        the lines or of the image, whichever is larger. The sum is 1 to 2.
     oversampling : float
         Sample rate over the width of the occupied band.
     aliasing : float
         Relative error power from aliasing, if the band fills the whole sampled band.
     line_power : float64 [n] or None
-        Share of the lines' power, if `power` includes the image's.
+        Share of the power of the lines, if `power` includes that of the image.
     """
 
     centre: float
@@ -70,15 +73,15 @@ class Spectrum:
 
     @property
     def scatter(self) -> float:
-        """Factor by which measured error power may exceed its mean, >= 1.
+        """Factor by which measured error power may exceed its mean, 1 to 5.
 
-        At few frequencies errors do not average out.
+        It is largest if the power lies at few frequencies, where errors do not average out.
         """
         return 1 + _FEW_FREQUENCIES * float(np.sum(self.share**2))
 
     @property
     def share(self) -> NDArray[np.float64]:
-        """Share of the power of the lines at every distance, float64 [n]; sums to 1."""
+        """Share of the power of the lines at every distance, float64 [n]; the sum is 1."""
         return self.power if self.line_power is None else self.line_power
 
     @property
@@ -87,9 +90,9 @@ class Spectrum:
         return float(self.frequency[1] - self.frequency[0])
 
     def shifted(self, shares: NDArray[np.float64]) -> Spectrum:
-        """Return the spectrum of lines of which parts are shifted to either side.
+        """Return the spectrum after parts of the lines are shifted in frequency.
 
-        Its frequencies may exceed half a cycle per sample.
+        Frequencies of the result may exceed half a cycle per sample.
 
         Parameters
         ----------
@@ -115,10 +118,10 @@ class Spectrum:
 def measure_spectrum(
     lines: RangeLines, grid: Grid | None = None, energy: NDArray[np.float64] | None = None
 ) -> Spectrum:
-    """Mean power spectrum of the lines, about the middle of their occupied band.
+    """Return the mean power spectrum of lines, relative to the middle of their occupied band.
 
-    With a grid, frequencies that add up coherently in its image weigh as much as they do there.
-    `energy` is the `line_energy` of the lines, if it is known.
+    With a grid, frequencies that add up coherently in its image get the weight that they have
+    there. `energy` is the `line_energy` of the lines, if it is known.
     """
     frequency, power, faded = _mean_power(*_sampled_lines(lines, MEASURED_CHANNELS, energy))
     centre, width, left_out = _occupied_band(frequency, faded)
@@ -137,9 +140,9 @@ def measure_spectrum(
 
 
 def power_spectrum(lines: RangeLines) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Ascending frequencies, cycles per sample in [-0.5, 0.5), and the share of power at each.
+    """Return frequencies, cycles per sample, ascending in [-0.5, 0.5), and their power shares.
 
-    Lines are faded towards both ends, which keeps the leakage of cut lines out.
+    Lines are faded towards both ends, which removes the leakage of cut lines.
     """
     frequency, _, power = _mean_power(*_sampled_lines(lines, MEASURED_CHANNELS))
     order = np.argsort(frequency)
@@ -149,12 +152,12 @@ def power_spectrum(lines: RangeLines) -> tuple[NDArray[np.float64], NDArray[np.f
 def _occupied_band(
     frequency: NDArray[np.float64], power: NDArray[np.float64]
 ) -> tuple[float, float, float]:
-    """Middle and width of the occupied band, cycles per sample, and the share of power outside.
+    """Return middle and width of the occupied band, cycles per sample, and the power outside.
 
     Frequencies farther than half a cycle per sample from the middle alias. The band is therefore
-    the narrowest arc of the frequency circle with nearly all power above the noise floor. The
-    opposite point is then in the middle of the guard band, whatever the shape of the spectrum. The
-    share outside is the smallest one that leaves a guard band.
+    the narrowest arc of the frequency circle that contains nearly all power above the noise floor.
+    The opposite point then lies in the middle of the guard band, whatever the shape of the
+    spectrum. The share of power outside is the smallest one for which there is a guard band.
     """
     count = len(power)
     smoothed = uniform_filter1d(power, max(round(_FLOOR_WIDTH * count), 1), mode="wrap")
@@ -178,12 +181,14 @@ def _occupied_band(
 def shares_of_bins(
     position: NDArray[np.float64], share: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the shares that lie at -n, ..., n, [2 n + 1]; between two of these they are divided.
+    """Return the shares in the bins -n, ..., n, [2 n + 1].
+
+    A share that lies between two bins is divided between them.
 
     Parameters
     ----------
     position, share : float64 [...]
-        Any positions, in bins, and the share at each.
+        Positions in bins, which may be fractions, and the share at each.
     """
     most = int(np.ceil(np.abs(position).max()))
     from_first = position.ravel() + most
@@ -195,24 +200,24 @@ def shares_of_bins(
 
 
 def _histogram(distance: NDArray[np.float64], power: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Power at the `frequency` of a `Spectrum`, shared between the two nearest bins.
+    """Return the power at the `frequency` of a `Spectrum`, divided between the two nearest bins.
 
-    With all power in the nearest bin, a filter could fit that frequency and miss a narrow line
-    beside it.
+    With all power in the nearest bin, a filter could fit that frequency and miss a narrow spectral
+    line beside it.
     """
     position = np.clip(2 * _FREQUENCIES * distance - 0.5, 0, _FREQUENCIES - 1)
     lower = np.minimum(position.astype(np.int64), _FREQUENCIES - 2)
     above = power * (position - lower)
-    # NumPy's types do not know that weights make it float64.
+    # NumPy's type stubs do not know that weights make the result float64.
     found: Any = np.bincount(lower, power - above, _FREQUENCIES)
     return found + np.bincount(lower + 1, above, _FREQUENCIES)
 
 
 def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: float) -> float:
-    """Error power if the power opposite of the centre has aliased, as it may in a full band.
+    """Return the error power due to aliasing of the power opposite the centre, in a full band.
 
-    It is then missing on one side and wrong on the other, so it counts twice. With a guard band it
-    is noise, equal on both sides.
+    Aliased power is missing on one side and wrong on the other, so it counts twice. With a guard
+    band there is only noise, equal on both sides.
     """
     if width <= 1 / NEEDED_OVERSAMPLING:
         return 0.0
@@ -221,29 +226,29 @@ def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: 
 
 
 def occupied_band(spectrum: Spectrum, outside: float) -> tuple[float, float]:
-    """Return the centre and half width of the band that holds all but a share of the power."""
+    """Return centre and half width of the band that contains all but a share of the power."""
     bins = np.searchsorted(np.cumsum(spectrum.share), 1 - outside)
     return spectrum.centre, float(min((bins + 1) / (2 * len(spectrum.power)), 0.5))
 
 
 def power_outside(lines: RangeLines, centre: float, half_width: float, most_channels: int) -> float:
-    """Share of the power of sampled lines outside a band, in cycles per sample."""
+    """Return the share of the power of sampled lines outside a band, given in cycles per sample."""
     frequency, power, _ = _mean_power(*_sampled_lines(lines, most_channels))
     return float(power[_distance(frequency, centre) > half_width].sum())
 
 
 def _distance(frequency: NDArray[np.float64], centre: float) -> NDArray[np.float64]:
-    """Distance of frequencies from a centre, cycles per sample, 0 to 0.5."""
+    """Return the distance of frequencies from a centre, cycles per sample, 0 to 0.5."""
     return np.abs((frequency - centre + 0.5) % 1.0 - 0.5)
 
 
 def representative_channels(
     lines: RangeLines, most: int, energy: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return up to `most` channels spread evenly and the loudest, and a factor for each.
+    """Return up to `most` evenly spread channels and the loudest ones, and a factor for each.
 
-    With these factors the channels have the power of all. `energy` is the `line_energy` of the
-    lines, if it is known.
+    Multiplied by these factors, the channels have the power of all. `energy` is the `line_energy`
+    of the lines, if it is known.
     """
     some = some_channels(lines.channels, most)
     if len(some) == lines.channels:
@@ -266,7 +271,7 @@ def _sampled_lines(
 
 
 def line_energy(samples: NDArray[np.complex64]) -> NDArray[np.float64]:
-    """Return the energy of every line, in another unit if squares would leave float32's range."""
+    """Return the energy of every line, scaled if squares would leave the range of float32."""
     parts = samples.view(np.float32)
     with np.errstate(over="ignore"):
         energy = np.einsum("ij,ij->i", parts, parts)
@@ -279,10 +284,10 @@ def line_energy(samples: NDArray[np.complex64]) -> NDArray[np.float64]:
 def _mean_power(
     samples: NDArray[np.complex64], factor: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Frequencies, cycles per sample; share of the power at each; the same for faded lines.
+    """Return frequencies, cycles per sample, and power shares of the lines and of faded lines.
 
-    Lines that fade towards both ends show the band without the leakage of cut lines. `factor`
-    multiplies every line.
+    Lines that are faded towards both ends show the band without the leakage of cut lines. Every
+    line is multiplied by its `factor`.
     """
     largest = _largest_part(samples) or samples.real.dtype.type(1)
     padding = 1 if samples.shape[1] >= _RESOLVED else 2
@@ -294,7 +299,7 @@ def _mean_power(
         np.array_split(parts, blocks), np.array_split(factor, blocks), strict=True
     ):
         amplitude = scipy.fft.fft((block / largest * scale[:, None]).view(samples.dtype), length)
-        # A Hann window over the part of the FFT's length where the lines lie.
+        # Apply a Hann window over the part of the FFT in which the lines lie.
         ends = amplitude[:, -padding:], amplitude[:, :padding]
         around = np.concatenate([ends[0], amplitude, ends[1]], axis=1)
         windowed = (around[:, : -2 * padding] + around[:, 2 * padding :]) * np.float32(-0.5)
@@ -310,7 +315,7 @@ def _mean_power(
 
 
 def _column_power(amplitude: NDArray[np.complexfloating]) -> NDArray[np.float64]:
-    """Power of every column; overwrites the amplitudes of a few lines."""
+    """Return the power of every column; the amplitudes are overwritten."""
     parts = amplitude.view(amplitude.real.dtype)
     squares = np.multiply(parts, parts, out=parts).sum(axis=0)
     return squares.astype(np.float64).reshape(-1, 2).sum(axis=1)
@@ -319,12 +324,13 @@ def _column_power(amplitude: NDArray[np.complexfloating]) -> NDArray[np.float64]
 def _image_power(
     lines: RangeLines, grid: Grid, frequency: NDArray[np.float64], power: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Share of an image's power from every frequency of its lines.
+    """Return the share of the power of an image that each frequency of the lines contributes.
 
-    Signals that are common to all channels near 0 Hz, such as a constant offset in lines on their
+    Signals near 0 Hz that are common to all channels, such as a constant offset in lines on their
     carrier, add up coherently in the whole image. Their power grows with the square of the number
-    of channels, that of echoes from all over the scene with the number. The gain is measured by
-    coherent summation of some channels at some pixels, and extrapolated to all channels.
+    of channels, while that of echoes from all over the scene grows with the number. The gain is
+    measured by coherent summation of some channels at some pixels, and extrapolated to all
+    channels.
     """
     some = some_channels(lines.channels)
     if len(some) < 2:
@@ -362,43 +368,6 @@ def _image_power(
 
 
 def _largest_part(samples: NDArray[np.complex64]) -> np.float32:
-    """Largest real or imaginary part. Magnitudes might overflow."""
+    """Return the largest magnitude of a real or imaginary part. Amplitudes could overflow."""
     parts = samples.view(samples.real.dtype)
     return max(parts.max(initial=0.0), -parts.min(initial=0.0))
-
-
-def band_wavelength_m(lines: RangeLines, centre: float) -> float:
-    """Return the wavelength in the middle of the band that lines occupy, metres.
-
-    Lengths are compared with it, whether the carrier was mixed out or not. Lines about 0 Hz do not
-    show their carrier: the wavelength is then that of the highest frequency sampled.
-
-    Parameters
-    ----------
-    lines : RangeLines
-    centre : float
-        Middle of the band, cycles per sample: `Spectrum.centre`, or that of a plan's lines.
-    """
-    if is_about_zero(lines, centre):
-        return 4 * lines.range_step_m
-    return 2 / abs(cycles_per_m_at(lines, centre))
-
-
-def is_about_zero(lines: RangeLines, centre: float) -> bool:
-    """Return whether a band is so near to 0 Hz that it does not show the carrier of its lines."""
-    return abs(cycles_per_m_at(lines, centre)) * lines.range_step_m <= _LEAST_CYCLES
-
-
-@overload
-def cycles_per_m_at(lines: RangeLines, frequency: float) -> float: ...
-
-
-@overload
-def cycles_per_m_at(lines: RangeLines, frequency: NDArray[np.float64]) -> NDArray[np.float64]: ...
-
-
-def cycles_per_m_at(
-    lines: RangeLines, frequency: float | NDArray[np.float64]
-) -> float | NDArray[np.float64]:
-    """Return the phase per metre of range, cycles, at a frequency in cycles per sample."""
-    return lines.carrier_cycles_per_m + frequency / lines.range_step_m

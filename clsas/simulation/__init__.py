@@ -1,1 +1,1 @@
-"""Simulation: scenes, and the echoes or range lines that a sonar receives from them."""
+"""Simulation of scenes, and of the echoes or range lines that a sonar receives from them."""

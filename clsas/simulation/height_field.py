@@ -1,4 +1,4 @@
-"""Heights on a regular lattice, and which points above them a sonar can see."""
+"""Heights on a regular lattice, and the points on and above them that are in view of a sonar."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 
 from clsas.core import validate
 
-_CLEAR = -1e30  # elevation beyond the lattice, where nothing casts shadows
+_CLEAR = -1e30  # height beyond the lattice, where nothing casts shadows
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +31,13 @@ class HeightField:
 
     @property
     def steps_m(self) -> tuple[float, float]:
-        """Distance between columns, and between rows."""
+        """Distance between columns and between rows, metres."""
         rows, columns = self.heights_m.shape
         return (self.x_m[1] - self.x_m[0]) / (columns - 1), (self.y_m[1] - self.y_m[0]) / (rows - 1)
 
     @property
     def cell_areas_m2(self) -> NDArray[np.float64]:
-        """Surface of every cell between four lattice points, [rows - 1, columns - 1]."""
+        """Surface area of every cell between four lattice points, [rows - 1, columns - 1]."""
         dx, dy = self.steps_m
         h = self.heights_m
         along_x = (h[:-1, 1:] - h[:-1, :-1] + h[1:, 1:] - h[1:, :-1]) / (2 * dx)
@@ -45,7 +45,7 @@ class HeightField:
         return dx * dy * np.sqrt(1 + along_x**2 + along_y**2)
 
     def height_m(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
-        """Return the heights at positions, which broadcast; NaN beyond the lattice."""
+        """Return the heights at positions, which broadcast. Beyond the lattice they are NaN."""
         x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
         dx, dy = self.steps_m
         where = [((y - self.y_m[0]) / dy).ravel(), ((x - self.x_m[0]) / dx).ravel()]
@@ -53,10 +53,10 @@ class HeightField:
         return heights.reshape(x.shape)
 
     def lit(self, offsets_m: NDArray[np.float64], eye_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which points have a clear line of sight to a position, bool [points].
+        """Return a mask of the points with a clear line of sight to a position, bool [points].
 
-        A polar fan of rays surrounds the position. A point is lit if its elevation is not below
-        the largest one on the nearest ray up to one or two lattice steps before it.
+        A polar fan of rays surrounds the position. A point is lit if its elevation is not below the
+        largest elevation on the nearest ray, up to one or two lattice steps before the point.
 
         Parameters
         ----------
@@ -70,13 +70,14 @@ class HeightField:
         if not x.size or (lowest >= self._level_m and not self._relative_heights.any()):
             return np.ones(x.size, bool)
         step = min(self.steps_m)
-        # Azimuth is measured from the direction to the lattice's middle: then no ray of a lattice
-        # to one side of the sonar is at +-180 degrees.
+        # Azimuth is measured from the direction to the middle of the lattice. Then no ray to a
+        # lattice on one side of the sonar is at +-180 degrees.
         centre = np.arctan2(sum(self.y_m) / 2 - eye_m[1], sum(self.x_m) / 2 - eye_m[0])
         cosine, sine = np.cos(centre), np.sin(centre)
         ground = np.sqrt(x**2 + y**2)
         azimuth = np.arctan2(cosine * y - sine * x, cosine * x + sine * y)
-        # The rays must not depend on the points, or a point's shadow would depend on the others.
+        # The rays must not depend on the points. Otherwise whether a point is lit would depend on
+        # the other points.
         away = np.abs([np.subtract(self.x_m, eye_m[0]), np.subtract(self.y_m, eye_m[1])])
         ray_step = step / max(np.hypot(*away.max(axis=1)), step)
         first_ray = np.floor(azimuth.min() / ray_step)
@@ -109,7 +110,7 @@ class HeightField:
 
     @property
     def _level_m(self) -> float:
-        """The lowest height, to which `_relative_heights` refer."""
+        """Lowest height, to which `_relative_heights` refer."""
         return float(self.heights_m.min())
 
     @cached_property

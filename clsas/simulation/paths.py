@@ -1,7 +1,7 @@
-"""Acoustic paths: for every channel the visible points of a scene, block by block.
+"""Acoustic paths: the points of a scene that are visible to every channel, block by block.
 
-Visibility is found once for a group of neighbouring channels of a ping. Point targets are always
-visible; of a seabed only what is lit and within the beam.
+Visibility is determined once for a group of neighbouring channels of a ping. Point targets are
+always visible. Scatterers of a seabed are visible if they are lit and within the beam.
 """
 
 from __future__ import annotations
@@ -20,22 +20,24 @@ from clsas.simulation.patterns import ElementPatterns
 from clsas.simulation.scenes import Observer, PointTargets, Scene, Seabed
 from clsas.sonar.track import Channels
 
-# Points of a block without and with element patterns. Blocks fit into a processor's caches, and are
-# large enough that summing them costs more than the FFT.
+# Points of a block without and with element patterns. Blocks fit into the caches of a processor,
+# but are large enough that summing them takes longer than the FFT.
 _BLOCK = 1 << 17
 _PATTERN_BLOCK = 1 << 15
-# Channels of a ping for which visibility is found together. The Notes of `simulate` give the error.
+# Channels of a ping whose visibility is determined together. The Notes of `simulate` give the
+# resulting error.
 _GROUP = 8
 
 
 class PointBlock(NamedTuple):
-    """Some of the points that a group of channels receives from.
+    """Block of points that a group of channels receives from.
 
     Attributes
     ----------
     points_m : float64 [points, 3]
-        Positions relative to the observer, along the elements' axes; each coordinate contiguous.
-    amplitudes : [points]
+        Positions relative to the observer, along the axes of the elements. Each coordinate is
+        contiguous in memory.
+    amplitudes : float or complex [points]
     error : float
         Relative error that the sum over these points may have.
     """
@@ -47,20 +49,20 @@ class PointBlock(NamedTuple):
 
 @dataclass(frozen=True)
 class Paths:
-    """A scene and the positions of all channels.
+    """Scene and positions of all channels.
 
     Attributes
     ----------
     parts : tuple of PointTargets or Seabed
-        From `scene_parts`.
+        Parts of the scene, from `scene_parts`.
     geometry : Channels
     sound_speed_m_s : float
     spreading : bool
         True if amplitudes fall as 1/(R_tx R_rx).
     patterns : ElementPatterns or None
-        None: every element is omnidirectional.
+        None if every element is omnidirectional.
     receivers : int
-        Channels of a ping.
+        Number of channels of a ping.
     """
 
     parts: tuple[PointTargets | Seabed, ...]
@@ -77,7 +79,7 @@ class Paths:
 
     @property
     def groups(self) -> list[range]:
-        """Channels for which visibility is found together."""
+        """Channels whose visibility is determined together."""
         return [
             range(first, min(first + _GROUP, ping + self.receivers))
             for ping in range(0, self.channels, self.receivers)
@@ -90,7 +92,7 @@ class Paths:
         return Channels(tx[channel], rx[channel], None if velocity is None else velocity[channel])
 
     def observer(self, group: range) -> Observer:
-        """Return the observer that stands for a group of channels."""
+        """Return the observer that represents a group of channels."""
         tx, rx, velocity = self.geometry
         tx, rx = tx[group], rx[group]
         middle = (tx.mean(axis=0) + rx.mean(axis=0)) / 2
@@ -99,7 +101,7 @@ class Paths:
             return Observer(middle)
         radius = max(np.linalg.norm(end - middle, axis=1).max() for end in (tx, rx))
         ping = group[0] // self.receivers
-        # The receivers move while the sound travels, which turns the direction of the return path.
+        # Receivers move while the sound travels, which turns the direction of the return path.
         turn = 0.0
         if velocity is not None:
             turn = 2 * float(np.linalg.norm(velocity[group[0]])) / self.sound_speed_m_s
@@ -110,9 +112,9 @@ class Paths:
         return Observer(middle, radius, gain)
 
     def visible(self, group: range) -> tuple[list[Channels], Iterator[PointBlock]]:
-        """Return the positions of a group's channels, and the visible points block by block.
+        """Return the positions of the channels of a group, and the visible points block by block.
 
-        Both are relative to the observer and along the elements' axes.
+        Both are relative to the observer and along the axes of the elements.
         """
         observer, patterns = self.observer(group), self.patterns
         axes = np.eye(3) if patterns is None else patterns.axes[group[0] // self.receivers]
@@ -138,8 +140,8 @@ class Paths:
         """Return the shortest and the longest delay of every channel, float64 [2, channels]."""
         velocity = self.geometry.rx_velocity_m_s
         speed = 0.0 if velocity is None else float(np.linalg.norm(velocity, axis=1).max())
-        # A point one metre farther away lengthens the path by two metres, and by what the receiver
-        # moves in the meantime.
+        # If a point moves away by one metre, the path becomes longer by two metres, and by the
+        # distance that the receiver moves in the meantime.
         per_metre = 2 / max(1 - speed / self.sound_speed_m_s, 1e-3)
 
         def limits(group: range) -> list[tuple[float, float]]:
@@ -162,7 +164,7 @@ class Paths:
 
 
 def scene_parts(scene: Scene) -> tuple[PointTargets | Seabed, ...]:
-    """Return the parts of a scene, point targets in blocks.
+    """Return the parts of a scene, with point targets divided into blocks.
 
     Raises
     ------
@@ -174,7 +176,7 @@ def scene_parts(scene: Scene) -> tuple[PointTargets | Seabed, ...]:
     for part in given:
         validate.instance("scene", part, PointTargets, Seabed)
     for part in given:
-        # `points` makes a seabed draw its scatterers: here once, instead of in every thread.
+        # `points` makes a seabed draw its scatterers here, once, and not in every thread.
         if part.points <= _BLOCK or isinstance(part, Seabed):
             parts.append(part)
             continue

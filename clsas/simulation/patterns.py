@@ -1,8 +1,8 @@
 """Element patterns in azimuth and elevation, expanded in frequency.
 
-The pattern sinc(L/lambda sin theta) of an element (Ødegaard 2004, the thesis, eqs. [9]-[12])
-depends on the point and on the frequency together. It is interpolated through Chebyshev nodes in
-frequency; a bound on the remainder gives their number.
+The pattern sinc(L/lambda sin theta) of an element (Ødegaard 2004, equations [9]-[12]) depends on
+the point and on the frequency together. It is interpolated through Chebyshev nodes in frequency,
+whose number follows from a bound on the remainder.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from clsas.sonar.track import Channels
 
 @dataclass(frozen=True)
 class ElementPatterns:
-    """Two-way pattern of a sonar's elements.
+    """Two-way pattern of the elements of a sonar.
 
     Attributes
     ----------
     sonar : Sonar
     axes : float64 [pings, 3, 3]
-        The elements' unit vectors at every ping, see `clsas.Pointing.axes`.
+        Unit vectors of the elements at every ping; see `clsas.Pointing.axes`.
     """
 
     sonar: Sonar
@@ -37,7 +37,7 @@ class ElementPatterns:
 
     @property
     def elements(self) -> list[tuple[float, int, int]]:
-        """Size (m), end of the path (0: tx, 1: rx) and axis of every one-way pattern."""
+        """Size (m), end of the path (0 for tx, 1 for rx) and axis of every one-way pattern."""
         sonar = self.sonar
         sizes = (
             (sonar.tx_length_m, 0, 0),
@@ -48,7 +48,7 @@ class ElementPatterns:
         return [(size, end, axis) for size, end, axis in sizes if size is not None]
 
     def bound(self, ping: int, directions: NDArray, slack: NDArray | float) -> NDArray:
-        """Return an upper bound of the two-way pattern; see `clsas.simulation.scenes.Observer`."""
+        """Return an upper bound on the two-way pattern; see `clsas.simulation.scenes.Observer`."""
         pulse = self.sonar.pulse
         lowest = max(pulse.carrier_hz - pulse.bandwidth_hz / 2, 0.0) / self.sonar.sound_speed_m_s
         components = directions @ self.axes[ping].T
@@ -61,21 +61,21 @@ class ElementPatterns:
     def sines(
         self, points: NDArray, elements: Channels, out: NDArray, back: NDArray
     ) -> tuple[NDArray[np.bool_], list[NDArray]]:
-        """Return which points lie in front of the elements, and the sines for `elements`.
+        """Return a mask of the points in front of the elements, and the sines of their directions.
 
         Parameters
         ----------
         points : float64 [points, 3]
         elements : Channels
-            Positions of one channel. All coordinates are along the elements' axes.
+            Positions of one channel. All coordinates are along the axes of the elements.
         out, back : float64 [points]
-            Path lengths, metres. The receiver is where it is when the echo arrives.
+            Path lengths, metres; `back` ends at the receiver's position when the echo arrives.
 
         Returns
         -------
         in_front : bool [points]
         sines : list of float64 [points]
-            sin theta for each of `elements`.
+            sin theta for each one-way pattern of `self.elements`.
         """
         tx, rx, velocity = elements
         at_reception = rx[:, None]
@@ -98,12 +98,12 @@ class ElementPatterns:
         sines : list of [points]
             From `sines`.
         error : float
-            Largest error of the interpolated pattern at any frequency. Half of it is left for
+            Largest error of the interpolated pattern at any frequency. Half of it is reserved for
             rounding to single precision.
         dtype : numpy.float32 or numpy.float64
-            Precision in which frequencies are held.
+            Precision of the frequencies.
         modes : int
-            Frequencies of the spectrum that will be summed, for the check of memory.
+            Number of frequencies of the spectrum to be summed, with which memory is checked.
 
         Raises
         ------
@@ -112,13 +112,13 @@ class ElementPatterns:
 
         Notes
         -----
-        With a_i = pi L_i sine_i/c, the derivatives of sinc(a_i f) of order k are below
-        a_i^k min(1/(k + 1), 2/(a_i f)). Those of order Q of the product of patterns are below
+        With a_i = pi L_i sine_i/c, derivatives of sinc(a_i f) of order k are below
+        a_i^k min(1/(k + 1), 2/(a_i f)). Derivatives of order Q of the product of patterns are below
 
             (sum_i a_i)^Q min(1/(Q + 1), prod_i min(1, 2/(a_i f_least))).
 
-        Interpolation through Q Chebyshev nodes over a band of +-h hertz leaves at most
-        2 (h/2)^Q/Q! times that.
+        The error of interpolation through Q Chebyshev nodes over a band of +-h hertz is at most
+        2 (h/2)^Q/Q! times this bound.
         """
         sonar = self.sonar
         half_band = sonar.sample_rate_hz / 2
@@ -131,7 +131,7 @@ class ElementPatterns:
         level: NDArray | float = 2.0
         for slope in slopes:
             level = level / np.maximum(slope * (lowest / 2), 1.0)
-        # By Stirling's formula (reach e/Q)^Q has fallen below the error with this many terms.
+        # By Stirling's formula, (reach e/Q)^Q falls below the error with at most this many terms.
         most = math.e * float(np.max(reach)) - math.log(error / 4)
         validate.memory("the sonar's element lengths", 8 * most * (most + len(reach) + 2 * modes))
         terms = needed_terms(reach, level, error / 2)
@@ -148,7 +148,7 @@ def needed_terms(reach: NDArray, level: NDArray | float, error: float) -> int:
     """Return the smallest Q with reach^Q/Q! min(2/(Q + 1), level) <= `error` everywhere."""
     with np.errstate(divide="ignore"):
         slope, cap = np.log(reach), np.log(level)
-    # In logarithms, since the powers for a long element overflow before Q! catches up.
+    # Computed with logarithms, because powers for a long element overflow before Q! catches up.
     terms, power = 1, slope
     while np.max(power + np.minimum(cap, math.log(2 / (terms + 1)))) > math.log(error):
         terms += 1
@@ -157,13 +157,13 @@ def needed_terms(reach: NDArray, level: NDArray | float, error: float) -> int:
 
 
 def _chebyshev_nodes(terms: int) -> NDArray[np.float64]:
-    """Chebyshev nodes on -1..1."""
+    """Return Chebyshev nodes on [-1, 1]."""
     return np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
 
 
 @lru_cache(maxsize=32)
 def interpolation_matrix(terms: int, modes: int) -> NDArray:
-    """Return the matrix [terms, modes] from values at Chebyshev nodes to the FFT's frequencies."""
+    """Return the matrix [terms, modes] from values at Chebyshev nodes to frequencies of the FFT."""
     to_coefficients = chebvander(_chebyshev_nodes(terms), terms - 1) * (2 / terms)
     to_coefficients[:, 0] /= 2
     return to_coefficients @ chebvander(2 * fft.fftfreq(modes), terms - 1).T

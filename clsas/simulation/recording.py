@@ -1,18 +1,17 @@
 """Samples that every channel records: delayed pulses of the visible points, summed in frequency.
 
-A channel records the pulse P, delayed, through the receiver's anti-alias filter G. The filter
-passes |f| <= 0.4 sample rates unchanged and falls as an integrated Gaussian to nothing at half the
-rate:
+A channel records the delayed pulse P through the receiver's anti-alias filter G, which passes
+|f| <= 0.4 sample rates unchanged and falls as an integrated Gaussian to zero at half the rate:
 
     X_i(f) = P(f) G(f) sum_s a_is(f) exp(-j 2 pi (f + fc) tau_is).
 
-a_is is the amplitude times, if asked for, 1/(R_tx R_rx) and the element patterns at frequency
-f + fc (Ødegaard 2004, the thesis, eqs. [8]-[12]). No delay is rounded. G rings for only 90 samples
-(to -145 dB), so an echo has an end, and a receive window that cuts it keeps exactly the part
-inside. A pulse without energy beyond 0.4 sample rates passes G unchanged.
+a_is is the amplitude, multiplied by 1/(R_tx R_rx) and by the element patterns at frequency f + fc
+if these are requested (Ødegaard 2004, equations [8]-[12]). Delays are not rounded. G rings for only
+90 samples (to -145 dB), so an echo has an end, and a receive window that cuts the echo keeps
+exactly the part inside. A pulse without energy beyond 0.4 sample rates passes G unchanged.
 
-The sum is one type-1 non-uniform FFT per channel (finufft). Scenes that allow their echoes an error
-are summed only to that accuracy, in single precision where that is enough.
+The sum is one type-1 non-uniform FFT per channel (finufft). Scenes that tolerate an error of their
+echoes are summed only to that accuracy, in single precision where that suffices.
 """
 
 from __future__ import annotations
@@ -40,7 +39,10 @@ Progress = Callable[[int, int], None] | None
 RINGING = math.ceil(EDGE_PRODUCT / ((1 - PASSBAND) / 2))
 """Samples for which the receiver's filter rings before and after an echo."""
 
-NO_ECHO = "no echo falls within the receive window, from where elements look: every sample is zero"
+NO_ECHO = (
+    "no echo arrives within the receive window and in front of the elements, so every sample is "
+    "zero"
+)
 
 _SUM_ERROR = 1e-9  # relative, of the non-uniform FFT
 _PATTERN_ERROR = 1e-6  # of interpolated element patterns
@@ -49,7 +51,7 @@ _TOUCHING_M = 1e-9  # a point closer to an element than this has no direction
 
 @dataclass(frozen=True)
 class ReceiveWindows:
-    """When every channel records.
+    """Times at which every channel records.
 
     Attributes
     ----------
@@ -62,7 +64,8 @@ class ReceiveWindows:
     kept_s : (float64 [channels], float64 [channels])
         Shortest and longest delay of the points that are summed.
     tail : int
-        Zeros behind the window, so that echoes that end later do not wrap around into it.
+        Number of zeros after the window, which keep echoes that end later from wrapping around into
+        it.
     """
 
     rate_hz: float
@@ -96,7 +99,7 @@ def record(
     Raises
     ------
     ValueError
-        If a point lies on an element while spreading or patterns are asked for.
+        If a point lies on an element while spreading or element patterns are applied.
 
     Warns
     -----
@@ -106,7 +109,7 @@ def record(
     modes = fft.next_fast_len(windows.length + windows.tail)
     frequency = fft.fftfreq(modes, 1 / windows.rate_hz)
     beyond = (2 * np.abs(frequency) / windows.rate_hz - PASSBAND) / (1 - PASSBAND)
-    # The FFT's sum stands for an integral over frequency, hence the factor of the sample rate.
+    # The sum of the FFT replaces an integral over frequency, hence the factor of the sample rate.
     transfer = windows.rate_hz * spectrum(frequency) * smooth_edge(beyond)
 
     def echoes(group: range) -> list[NDArray[np.complex64]]:
@@ -166,7 +169,8 @@ def _add(
             amplitudes, out, back, delay, *sines = (
                 part[in_front] for part in (amplitudes, out, back, delay, *sines)
             )
-    # float32 rounds an angle by up to 2^-25 of it, which is a phase error at frequency modes/2.
+    # float32 rounds an angle by up to 2^-25 of its value, which becomes a phase error that is
+    # largest at the frequency modes/2.
     single = block.error >= 1e-7 * modes
     real = np.float32 if single else np.float64
     cycles = carrier_hz * delay
@@ -189,8 +193,8 @@ def _add(
 
 
 def _point_sum(angles: NDArray, strengths: NDArray, modes: int, error: float) -> NDArray:
-    """Return sum_s strengths_s exp(-j k angle_s) for the FFT's frequencies k."""
-    # The frequency grid fits into caches, so sorting the points would not pay.
+    """Return sum_s strengths_s exp(-j k angle_s) for the frequencies k of the FFT."""
+    # The frequency grid fits into caches, so sorting the points would save no time.
     return finufft.nufft1d1(
         angles, strengths, modes, eps=error, isign=-1, modeord=1, nthreads=1, spread_sort=0
     )

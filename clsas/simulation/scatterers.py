@@ -1,4 +1,4 @@
-"""Random scatterers on a height field, which make the speckle of a seabed."""
+"""Random scatterers on a height field, which produce the speckle of a seabed."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from scipy.ndimage import map_coordinates
 
 from clsas.simulation.height_field import HeightField
 
-_TILE_M = 2.0  # side of the tiles that are kept or dropped as a whole by the beam
+_TILE_M = 2.0  # side of the tiles that are kept or left out as a whole, depending on the beam
 
 
 class Scatterers(NamedTuple):
-    """Scatterers sorted by tile, and the spheres that hold the tiles."""
+    """Scatterers sorted by tile, and the spheres that contain the tiles."""
 
     positions_m: NDArray[np.float64]  # [3, points]
     normals: NDArray[np.float32]  # [3, points], of the surface
@@ -27,7 +27,7 @@ class Scatterers(NamedTuple):
 def draw_scatterers(
     surface: HeightField, texture: NDArray[np.float64], density_m2: float, seed: int
 ) -> Scatterers:
-    """Return scatterers at random on a surface, with circular complex Gaussian amplitudes.
+    """Return random scatterers on a surface, with circular complex Gaussian amplitudes.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def draw_scatterers(
     Raises
     ------
     ValueError
-        If not one scatterer lies on the surface.
+        If no scatterer lies on the surface.
     """
     random = np.random.default_rng(seed)
     counts = random.poisson(density_m2 * surface.cell_areas_m2)
@@ -53,7 +53,7 @@ def draw_scatterers(
     cells = np.repeat(order, counts.ravel()[order])
     if not cells.size:
         raise ValueError(
-            f"density_m2 must put some scatterer on the seabed, got {density_m2:g} per m2"
+            f"density_m2 must put at least one scatterer on the seabed, got {density_m2:g} per m2"
         )
     row, column = np.divmod(cells, counts.shape[1])
     u, v = random.random((2, len(cells)))

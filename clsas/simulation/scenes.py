@@ -1,7 +1,7 @@
-"""Scenes: point targets and seabeds, which a simulated sonar receives echoes from.
+"""Scenes: point targets and seabeds, from which a simulated sonar receives echoes.
 
-A scene returns the points that are visible to an observer (`visible`), and spheres that hold them
-(`spheres`). Point targets are always visible. The scatterers of a seabed are visible where they are
+A scene returns the points that are visible to an observer (`visible`), and spheres that contain
+them (`spheres`). Point targets are always visible. Scatterers of a seabed are visible if they are
 lit and within the beam.
 """
 
@@ -19,11 +19,9 @@ from clsas.core import reprs, validate
 from clsas.simulation.height_field import HeightField
 from clsas.simulation.scatterers import Scatterers, draw_scatterers
 
-_FARTHEST_M = 1e9  # farthest coordinate of a point: float64 then resolves its range to 1e-7 m
-
 
 class Observer(NamedTuple):
-    """Position of some channels, and how their elements direct sound.
+    """Position of some channels, and the directivity of their elements.
 
     Attributes
     ----------
@@ -32,9 +30,9 @@ class Observer(NamedTuple):
     radius_m : float
         Largest distance of an element from this position.
     gain : callable or None
-        gain(directions [points, 3], slack [points]) is an upper bound of the two-way amplitude
+        gain(directions [points, 3], slack [points]) is an upper bound on the two-way amplitude
         pattern in all directions whose components differ from the given ones by up to `slack`.
-        None: every element is omnidirectional.
+        None if every element is omnidirectional.
     """
 
     position_m: NDArray[np.float64]
@@ -46,26 +44,37 @@ class Observer(NamedTuple):
 class PointTargets:
     """Point reflectors without multiple scattering (Born approximation).
 
-    Equation [8] of the thesis (Ødegaard 2004).
+    They follow equation [8] of Ødegaard (2004).
 
     Parameters
     ----------
     positions_m : array_like, [points, 3]
-        World positions.
+        World positions, metres.
     amplitudes : array_like, [points] or scalar
         Real or complex amplitudes; 1 by default.
 
     Raises
     ------
     TypeError, ValueError
-        If an array has the wrong type or shape, is empty or not finite, or a position is beyond
+        If an array has the wrong type or shape, is empty or not finite, or a coordinate exceeds
         1e9 m.
+
+    See Also
+    --------
+    Seabed : A seabed with shadows.
+    simulate, simulate_lines : Echoes and range lines of scenes.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> clsas.PointTargets([[0, 40, 0], [1, 42, 0]], amplitudes=[1, 0.5j])
+    PointTargets(2 points, x 0 to 1 m, y 40 to 42 m, z 0 m)
     """
 
     positions_m: NDArray[np.float64]
     amplitudes: NDArray[np.complex128] = 1.0  # type: ignore[assignment]
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,
@@ -77,7 +86,7 @@ class PointTargets:
         """Check every field and convert it."""
         positions = validate.array("positions_m", self.positions_m, np.float64, (None, 3))
         farthest_m = float(np.abs(positions).max())
-        validate.number("the farthest of positions_m", farthest_m, "m", most=_FARTHEST_M)
+        validate.number("the farthest of positions_m", farthest_m, "m", most=validate.FARTHEST_M)
         amplitudes = validate.real_or_complex(
             "amplitudes", self.amplitudes, np.complex128, (len(positions),), broadcast=True
         )
@@ -85,7 +94,7 @@ class PointTargets:
         object.__setattr__(self, "amplitudes", amplitudes.astype(np.complex128, copy=False))
 
     def __repr__(self) -> str:
-        """Return the number of points and where they lie."""
+        """Return the number of points and their extents."""
         place_m = self.positions_m
         return reprs.summary(
             self,
@@ -100,11 +109,11 @@ class PointTargets:
 
     @property
     def error(self) -> float:
-        """Relative error that an echo may have: 0, so only rounding."""
+        """Relative error that an echo may have: 0, apart from rounding."""
         return 0.0
 
     def spheres(self, observer: Observer) -> tuple[NDArray, NDArray]:
-        """Return the points as spheres, centres [points, 3] and radii [points] of zero."""
+        """Return the points as spheres: centres [points, 3], and radii [points] of zero."""
         validate.instance("observer", observer, Observer)
         return self.positions_m, np.zeros(self.points)
 
@@ -123,51 +132,72 @@ class PointTargets:
 class Seabed:
     """Patch of seabed: a height field covered with scatterers, which casts shadows on itself.
 
-    Heights are linear between the points of a regular lattice. Scatterers lie at random on the
-    surface, `density_m2` per m2, with circular complex Gaussian amplitudes. With several per
-    resolution cell the image is fully developed speckle. Averaged over the seeds, every m2 of the
-    surface returns the intensity (sum of squared amplitudes) of Lambert's law,
+    Heights are linear between the points of a regular lattice. Scatterers lie at random positions
+    on the surface, `density_m2` per m2, with circular complex Gaussian amplitudes. With several
+    scatterers per resolution cell, the image is fully developed speckle. Averaged over seeds, every
+    m2 of the surface returns the intensity (sum of squared amplitudes) of Lambert's law,
 
         texture^2 cos^2(angle of incidence).
 
-    Slopes that face away from the sonar return nothing, nor do points in a shadow.
+    Slopes that face away from the sonar, and points in shadow, return nothing.
 
     Parameters
     ----------
     x_m, y_m : (first, last)
-        World coordinates of the lattice's first and last columns and rows, ascending.
+        World coordinates of the first and last column and row of the lattice, metres, ascending.
     heights_m : array_like, [rows, columns]
-        Height (world z) of row y and column x; at least 2 x 2.
+        Heights (world z) for rows along y and columns along x, metres; at least 2 x 2.
     texture : array_like, [rows, columns], or scalar
-        Backscattered amplitude of 1 m2 at perpendicular incidence, at least 0; linear in between.
+        Backscattered amplitude of 1 m2 at perpendicular incidence, at least 0. It is linear between
+        the points of the lattice.
     density_m2 : float
-        Scatterers per m2 of surface. 600 are 3 per resolution cell of 5 cm by 10 cm.
+        Scatterers per m2 of surface. 600 per m2 are 3 per resolution cell of 5 cm by 10 cm.
     seed : int
         Seed of positions and amplitudes, at least 0.
     floor_db : float
-        -200 to -10 dB. Scatterers are left out, in tiles of about 2 m, where an upper bound of the
-        two-way element pattern is below this floor. Their echoes are below the floor, relative to
-        the same scatterer on the beam's axis. All other echoes have an error of at most a third
-        of the floor.
+        Floor of the two-way element pattern, -200 to -10 dB. Scatterers are left out, in tiles of
+        about 2 m, where an upper bound on the pattern is below the floor. Their echoes would be
+        below the floor relative to the same scatterer on the beam's axis. All other echoes have an
+        error of at most a third of the floor.
 
     Raises
     ------
     TypeError, ValueError
-        If a value has the wrong type or shape, is not finite or is outside its limits; or if there
-        are more scatterers than fit into memory.
+        If a value has the wrong type or shape, is not finite or is outside its limits, or if the
+        scatterers do not fit into memory.
+
+    See Also
+    --------
+    PointTargets : Single points.
+    simulate, simulate_lines : Echoes and range lines of scenes.
 
     Notes
     -----
-    For equal transmitter and receiver, long against the wavelength, the pattern sinc^2(u) is below
-    the floor F from u = 1/(pi sqrt(F)) on. A homogeneous seabed loses about 0.0038/u^3 of its
-    energy there: -47 dB for the default floor of -50 dB, where u = 5.7.
+    For a transmitter and a receiver of equal length, which is long compared with the wavelength,
+    the pattern sinc^2(u) is below the floor F for all u > 1/(pi sqrt(F)). A homogeneous seabed
+    loses about 0.0038/u^3 of its energy there. This is -47 dB for the default floor of -50 dB,
+    where u = 5.7.
 
     Shadows follow from the running maximum of the elevation along the rays of a polar fan around
     the sonar. A scatterer at ground range g is lit if its elevation (z - z_sonar)/g is not below
-    the maximum on the nearest ray, up to one or two lattice steps before it. Rays lie at most one
-    step apart. The sides of a shadow are therefore right to half a step. Its far end is right to
-    the shadow's change when the object that casts it is two steps shorter. Objects thinner than
-    two steps cast no reliable shadow.
+    the maximum on the nearest ray, up to one or two lattice steps before the scatterer. Rays lie at
+    most one step apart, so the sides of a shadow are accurate to half a step. The error of its far
+    end is the change that the shadow would have if the object were two steps shorter. Objects
+    thinner than two steps do not cast reliable shadows.
+
+    Examples
+    --------
+    A flat seabed with a wall 1 m high:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> heights_m = np.zeros((41, 21))
+    >>> heights_m[10:13] = 1.0
+    >>> seabed = clsas.Seabed((0, 2), (40, 44), heights_m)
+    >>> seabed.steps_m
+    (0.1, 0.1)
+    >>> seabed.lit([[1, 40.5, 0], [1, 42, 0]], eye_m=[1, 0, 10])
+    array([ True, False])
     """
 
     x_m: tuple[float, float]
@@ -178,7 +208,7 @@ class Seabed:
     seed: int = 0
     floor_db: float = -50.0
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,
@@ -219,7 +249,7 @@ class Seabed:
         validate.memory("density_m2", 100 * self.density_m2 * area_m2)
 
     def __repr__(self) -> str:
-        """Return extents, the lattice's step and the density of scatterers."""
+        """Return the extents, the step of the lattice and the density of scatterers."""
         heights_m = self.heights_m.min(), self.heights_m.max()
         low_m, high_m = zip(self.x_m, self.y_m, heights_m, strict=True)
         steps = " x ".join(reprs.quantity(step, "m") for step in self.steps_m)
@@ -232,7 +262,7 @@ class Seabed:
 
     @property
     def steps_m(self) -> tuple[float, float]:
-        """Distance between the lattice's columns, and between its rows."""
+        """Distance between the columns and between the rows of the lattice, metres."""
         return self._surface.steps_m
 
     @property
@@ -246,7 +276,17 @@ class Seabed:
         return 10 ** (self.floor_db / 20) / 3
 
     def height_m(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
-        """Return the heights at positions on the patch, which broadcast; NaN beside the patch.
+        """Return the heights of the seabed at some positions, metres.
+
+        Parameters
+        ----------
+        x_m, y_m : array_like
+            World coordinates, metres, which broadcast.
+
+        Returns
+        -------
+        float64 array
+            Heights, NaN outside the patch.
 
         Raises
         ------
@@ -264,14 +304,16 @@ class Seabed:
         return self._surface.height_m(x_m, y_m)
 
     def lit(self, points_m: ArrayLike, eye_m: ArrayLike) -> NDArray[np.bool_]:
-        """Return which points are not in shadow for a position, bool [points]; see the Notes.
+        """Return a mask of the points that are not in shadow from a position, bool [points].
+
+        The Notes of `Seabed` describe how shadows are determined.
 
         Parameters
         ----------
         points_m : array_like, [points, 3]
-            Points on the seabed or above it.
+            Points on the seabed or above it, metres.
         eye_m : array_like, [3]
-            Position of the sonar.
+            Position of the sonar, metres.
 
         Raises
         ------
@@ -283,10 +325,10 @@ class Seabed:
         return self._surface.lit(np.ascontiguousarray((points - eye).T), eye)
 
     def spheres(self, observer: Observer) -> tuple[NDArray, NDArray]:
-        """Return spheres that hold all visible points, centres [spheres, 3] and radii [spheres]."""
+        """Return spheres around all visible points: centres [spheres, 3], and radii [spheres]."""
         validate.instance("observer", observer, Observer)
         kept = self._in_beam(observer)
-        # A receive window is needed even if no echo arrives.
+        # The receive window follows from the spheres, and is needed even if no echo arrives.
         kept = kept if len(kept) else np.arange(len(self._scatterers.radii_m))
         return self._scatterers.centres_m[kept], self._scatterers.radii_m[kept]
 
@@ -310,14 +352,14 @@ class Seabed:
         return positions[:, lit].T, scatterers.amplitudes[chosen[lit]] * facing[lit]
 
     def _in_beam(self, observer: Observer) -> NDArray[np.intp]:
-        """Tiles in which the pattern may exceed the floor, those near the beam's axis first."""
+        """Return the tiles in which the pattern may exceed the floor, nearest to the axis first."""
         scatterers = self._scatterers
         if observer.gain is None:
             return np.arange(len(scatterers.radii_m))
         offsets = scatterers.centres_m - observer.position_m
         distance = np.maximum(np.linalg.norm(offsets, axis=1), np.finfo(float).tiny)
         near = scatterers.radii_m + observer.radius_m
-        # Upper bound of how much the directions from any element to any point of a tile differ.
+        # Upper bound on the difference of directions from any element to any point of a tile.
         slack = np.where(distance > near, near / np.maximum(distance - near, 1e-9 * near), np.inf)
         gains = observer.gain(offsets / distance[:, None], slack)
         order = np.argsort(-observer.gain(offsets / distance[:, None], 0.0), kind="stable")
@@ -329,7 +371,7 @@ class Seabed:
 
     @cached_property
     def _scatterers(self) -> Scatterers:
-        """The scatterers, drawn when first asked for."""
+        """The scatterers, which are drawn at first use."""
         return draw_scatterers(self._surface, self.texture, self.density_m2, self.seed)
 
 

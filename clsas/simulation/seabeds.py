@@ -12,7 +12,7 @@ from scipy import fft
 from clsas.core import validate
 from clsas.simulation.scenes import Seabed, checked_extent
 
-_MOST_BOULDERS = 100_000  # of about 1 m2 each: many times the field of some 3000 m2
+_MOST_BOULDERS = 100_000  # boulders of about 1 m2 each, many times the default patch of 2560 m2
 _LARGEST_CELL_M = 1.0  # coarser height fields do not show a wreck
 _HIGHEST_MAST_M = 100.0
 
@@ -31,38 +31,39 @@ def wreck(
 ) -> Seabed:
     """Return a fishing vessel of 25 m by 7 m that stands upright on sand.
 
-    It is modelled on the wreck in chapter 6 of the thesis (Ødegaard 2004). The seabed lies at
-    z = 0 with ripples of 2 cm. The hull is 2.4 m high and higher at the bow. It has a bulwark, an
-    open hold, a wheelhouse aft (4.4 m above the seabed) and in front of that a mast, 0.6 m thick.
-    To a sonar 20 m above the seabed at a ground range of 60 m, the hull casts a shadow of 8 m and
-    the mast one of 29 m.
+    It is modelled on the wreck in chapter 6 of Ødegaard (2004). The seabed lies at z = 0 and has
+    ripples of 2 cm. The hull is 2.4 m high and rises towards the bow. It has a bulwark, an open
+    hold, a wheelhouse aft (4.4 m above the seabed) and, in front of that, a mast 0.6 m thick. For a
+    sonar 20 m above the seabed at a ground range of 60 m, the hull casts a shadow of 8 m and the
+    mast one of 29 m.
 
     Parameters
     ----------
     x_m, y_m : (first, last)
-        World coordinates of the patch of seabed.
+        World coordinates of the patch of seabed, metres.
     position_m : array_like, [2]
-        Middle of the hull, world x and y.
+        Middle of the hull, world x and y, metres.
     heading_deg : float
-        Direction of the bow, from x towards y.
+        Direction of the bow, degrees from x towards y.
     mast_m : float
-        Height of the mast's top above the seabed, at least 0.
+        Height of the top of the mast above the seabed, metres, 0 to 100.
     cell_m : float
-        Approximate step of the height field; the patch is divided into whole steps.
+        Approximate step of the height field, metres, at most 1. The patch is divided into whole
+        steps.
     density_m2, seed, floor_db
-        As for `Seabed`. The sand depends on the seed, too.
+        As for `Seabed`. The sand also depends on the seed.
 
     Raises
     ------
     TypeError, ValueError
-        If a value has the wrong type or is outside its limits, or the position is off the patch.
+        If a value has the wrong type or is outside its limits, or the position is not on the patch.
     """
     mast = validate.number("mast_m", mast_m, "m", least=0.0, most=_HIGHEST_MAST_M)
     sand = _Sand.draw(x_m, y_m, cell_m, seed)
     ahead, aside = sand.around(position_m, heading_deg)
     length, width = 25.0, 7.0
 
-    # Half the breadth of the hull: 70 % at the transom, full amidships, zero at the bow.
+    # Half the breadth of the hull. It is 70 % at the transom, full amidships and zero at the bow.
     aft = np.clip(-(ahead + length / 10) / (0.4 * length), 0, 1)
     fore = np.clip((ahead - length / 10) / (0.4 * length), 0, None)
     breadth = width / 2 * np.clip(1 - 0.3 * aft**2 - fore**2, 0, 1) * (np.abs(ahead) <= length / 2)
@@ -73,7 +74,7 @@ def wreck(
     hull[_box(ahead - 3.5, aside, 4.5, 2.6)] = 0.9
     hull[_box(ahead + 7.0, aside, 5.0, 3.8)] = 4.4
     hull = np.where(_box(ahead - 0.2, aside, 0.6, 0.6), np.maximum(hull, mast), hull)
-    # Overgrown steel returns several times as much as sand.
+    # Overgrown steel has several times the backscatter of sand.
     return sand.seabed(hull, 4.0, density_m2, floor_db)
 
 
@@ -88,21 +89,22 @@ def pipeline(
     seed: int = 0,
     floor_db: float = -50.0,
 ) -> Seabed:
-    """Return a pipeline of 0.9 m diameter, a third of it sunk into sand.
+    """Return a pipeline of 0.9 m diameter, a third of which is sunk into sand.
 
-    It bends with a radius of 400 m, so the width of its shadow must vary.
+    The pipeline bends with a radius of 400 m, so the width of its shadow varies.
 
     Parameters
     ----------
     position_m, heading_deg
-        A point on the pipeline and the pipeline's direction there, from x towards y.
+        Point on the pipeline, metres, and direction of the pipeline there, degrees from x towards
+        y.
     x_m, y_m, cell_m, density_m2, seed, floor_db
         As for `wreck`.
 
     Raises
     ------
     TypeError, ValueError
-        As `wreck` does.
+        As for `wreck`.
     """
     sand = _Sand.draw(x_m, y_m, cell_m, seed)
     ahead, aside = sand.around(position_m, heading_deg)
@@ -128,16 +130,16 @@ def rocks(
     Parameters
     ----------
     position_m : array_like, [2]
-        Middle of the field of boulders, whose density falls off over about 12 m.
+        Middle of the field of boulders, whose density falls off over about 12 m, metres.
     count : int
         Number of boulders, 1 to 100 000.
     x_m, y_m, cell_m, density_m2, seed, floor_db
-        As for `wreck`. The boulders depend on the seed, too.
+        As for `wreck`. The boulders also depend on the seed.
 
     Raises
     ------
     TypeError, ValueError
-        As `wreck` does.
+        As for `wreck`.
     """
     count = validate.count("count", count, most=_MOST_BOULDERS)
     sand = _Sand.draw(x_m, y_m, cell_m, seed)
@@ -147,7 +149,7 @@ def rocks(
     for x, y in 12 * random.standard_normal((count, 2)):
         half = np.clip(0.5 * np.exp(0.5 * random.standard_normal()), 0.25, 2.0)
         stretch, turn = random.uniform(1.0, 1.6), random.uniform(0, np.pi)
-        # Work on the rows and columns that the boulder covers.
+        # Only the rows and columns that the boulder covers are computed.
         rows = np.flatnonzero(np.abs(north[:, 0] - y) < half * stretch)
         columns = np.flatnonzero(np.abs(east[0] - x) < half * stretch)
         some = np.ix_(rows, columns)
@@ -160,7 +162,7 @@ def rocks(
 
 
 class _Sand(NamedTuple):
-    """Rippled sand on a lattice, on which objects stand."""
+    """Rippled sand on a lattice, onto which objects are placed."""
 
     x_m: tuple[float, float]
     y_m: tuple[float, float]
@@ -172,7 +174,7 @@ class _Sand(NamedTuple):
     def draw(
         cls, x_m: tuple[float, float], y_m: tuple[float, float], cell_m: float, seed: int
     ) -> _Sand:
-        """Check the arguments and return sand of a seed."""
+        """Check the arguments and return random sand."""
         x_m, y_m = checked_extent("x_m", x_m), checked_extent("y_m", y_m)
         cell = validate.number("cell_m", cell_m, "m", above=0.0, most=_LARGEST_CELL_M)
         seed = validate.count("seed", seed, least=0)
@@ -191,7 +193,7 @@ class _Sand(NamedTuple):
         return cls(x_m, y_m, heights, texture, seed)
 
     def around(self, position_m: ArrayLike, heading_deg: float) -> tuple[NDArray, NDArray]:
-        """Return the lattice's coordinates ahead and to port of a position with a heading."""
+        """Return the coordinates of the lattice ahead and to port of a position with a heading."""
         position = validate.array("position_m", position_m, np.float64, (2,))
         heading = math.radians(validate.number("heading_deg", heading_deg, "degrees"))
         for value, extent in zip(position, (self.x_m, self.y_m), strict=True):
@@ -209,7 +211,7 @@ class _Sand(NamedTuple):
     def seabed(
         self, top: NDArray[np.float64], texture: float, density_m2: float, floor_db: float
     ) -> Seabed:
-        """Return the sand with objects up to the heights `top` (0: no object there)."""
+        """Return the sand with objects up to the heights `top`, which are 0 where there is none."""
         above = top > np.maximum(self.heights, 0.0)
         return Seabed(
             self.x_m,
@@ -223,14 +225,14 @@ class _Sand(NamedTuple):
 
 
 def _box(ahead: NDArray, aside: NDArray, length: float, width: float) -> NDArray[np.bool_]:
-    # Half a millimetre more, so that rounding does not decide about cells at the edge.
+    # The box is half a millimetre larger, so that rounding does not decide about cells at the edge.
     return (np.abs(ahead) <= length / 2 + 5e-4) & (np.abs(aside) <= width / 2 + 5e-4)
 
 
 def _smooth_noise(
     random: np.random.Generator, shape: tuple[int, ...], cell_m: float, scale_m: float
 ) -> NDArray[np.float64]:
-    """Return Gaussian noise of unit power, correlated over about `scale_m`, periodic."""
+    """Return periodic Gaussian noise of unit power, correlated over about `scale_m`."""
     spectrum = fft.rfft2(random.standard_normal(shape))
     k = 2 * np.pi * np.hypot(fft.fftfreq(shape[0], cell_m)[:, None], fft.rfftfreq(shape[1], cell_m))
     noise = fft.irfft2(spectrum * np.exp(-((k * scale_m) ** 2) / 4), shape)

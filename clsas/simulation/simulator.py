@@ -1,4 +1,4 @@
-"""Raw echoes of a sonar on a track, or range lines directly, from a scene of reflectors."""
+"""Simulation of the raw echoes of a sonar on a track, or directly of range lines."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from clsas.simulation.scenes import Scene
 from clsas.sonar.system import PASSBAND, Sonar
 from clsas.sonar.track import Channels, Pointing, Track, channels
 
-_LEAST_BAND_HZ = 1e-6  # a pulse of twelve days: arbitrary, but its inverse must be a number
+_LEAST_BAND_HZ = 1e-6  # arbitrary (a pulse of twelve days), but its inverse must be finite
 
 
 def simulate(
@@ -41,38 +41,41 @@ def simulate(
 ) -> Echoes:
     """Return the echoes that a sonar on a track receives from a scene.
 
-    Equations in brackets are those of the thesis (Ødegaard 2004).
+    Equations in brackets are those of Ødegaard (2004).
 
     Parameters
     ----------
-    sonar, track
-        Sonar and its track. Element patterns [9]-[12] apply where the sonar's elements have sizes.
-        Such elements are baffled: they neither transmit nor receive behind the plane of their
-        face.
+    sonar : Sonar
+        Element patterns [9]-[12] apply to elements that have sizes. Such elements are baffled: they
+        neither transmit nor receive behind the plane of their face.
+    track : Track
+        Track of the sonar.
     scene : PointTargets, Seabed, or tuple of them
-        Reflectors; the echoes of several parts add. Point targets cast no shadow, lie in none, and
-        are never left out.
+        Reflectors. The echoes of several parts add. Point targets neither cast shadows nor lie in
+        them, and are never left out.
     pointing : Pointing, optional
-        Direction of the elements; broadside by default. Only for a sonar with element sizes.
+        Direction of the elements, by default broadside. Allowed only for a sonar with element
+        sizes.
     spreading : bool
-        Divide each echo by the path lengths in metres, 1/(R_tx R_rx) [8].
+        If True, divide each echo by the path lengths in metres, 1/(R_tx R_rx) [8].
     motion_in_flight : bool
-        Move the receivers at the track's velocity while the sound travels. The default is
-        stop-and-hop.
+        If True, the receivers move at the velocity of the track while the sound travels. The
+        default is stop-and-hop.
     element_pattern : bool
-        Apply the patterns of elements that have sizes. If False every element is omnidirectional
-        and not baffled.
+        If True, apply the patterns of elements that have sizes. If False, every element is
+        omnidirectional and not baffled.
     phase_centres : bool
-        Put transmitter and receiver of every channel at their phase centre, as for a monostatic
-        sonar with as many channels.
+        If True, put transmitter and receiver of every channel at their phase centre, as for a
+        monostatic sonar with as many channels.
     range_m : (near, far), optional
-        Receive window of every channel: from the delay of range `near` to that of `far` plus the
-        pulse's duration [22], [23]. Echoes outside are cut. By default each channel's window
-        starts just before its first echo (for a seabed: before its nearest part within the beam),
-        and all windows are long enough for every echo.
+        Receive window of every channel, metres: from the delay of range `near` to that of `far`
+        plus the duration of the pulse [22], [23]. Echoes outside are cut. By default the window of
+        each channel starts just before its first echo (for a seabed, before the echo of the nearest
+        part within the beam), and all windows are long enough for every echo.
     snr_db : float, optional
-        Add complex white Gaussian noise. The SNR is the power of the strongest noise-free sample
-        of all channels over the noise's mean power per sample, before compression; -200 to 300 dB.
+        Signal-to-noise ratio of complex white Gaussian noise that is added, -200 to 300 dB. It is
+        the power of the strongest noise-free sample of all channels over the mean power of the
+        noise per sample, before compression.
     seed : int
         Seed of the noise, at least 0.
     workers : int, optional
@@ -88,22 +91,43 @@ def simulate(
     Raises
     ------
     TypeError, ValueError
-        If an argument has the wrong type or is outside its limits; if `pointing` is given for
-        omnidirectional elements; if a point lies on an element while spreading or patterns are
-        asked for; if `snr_db` is given and there is no echo; or if the echoes, or the patterns of
-        very long elements, do not fit into memory.
+        If an argument has the wrong type or is outside its limits, `pointing` is given for
+        omnidirectional elements, a point lies on an element while spreading or patterns are
+        applied, `snr_db` is given but there is no echo, or the echoes, or the patterns of very long
+        elements, do not fit into memory.
 
     Warns
     -----
     ClsasWarning
-        If no echo at all falls into the receive window.
+        If no echo arrives within the receive window.
+
+    See Also
+    --------
+    simulate_lines : Range lines of a scene, without a pulse or beams.
+    compress : Range lines of echoes.
 
     Notes
     -----
-    The visible part of a seabed is found once per eight channels of a ping, from the middle between
-    their transmitter and the mean of their receivers. For an element at a distance e from that
-    middle, the edge of a shadow is displaced by e d/r, with r the range of the object that casts
-    the shadow and d the distance of the edge behind it.
+    The visible part of a seabed is determined once per eight channels of a ping, from the middle
+    between their transmitter and the mean of their receivers. For an element at a distance e from
+    that middle, the edge of a shadow is displaced by e d/r, where r is the range of the object that
+    casts the shadow and d the distance of the edge behind it.
+
+    References
+    ----------
+    Ødegaard, "Fast time domain beamforming for synthetic aperture sonar", thesis, University of
+    Oslo, 2004: equations in brackets.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> pulse = clsas.Pulse(carrier_hz=100e3, bandwidth_hz=20e3, duration_s=1e-3)
+    >>> sonar = clsas.Sonar(pulse, rx_m=[[0, 0, 0]])
+    >>> track = clsas.Track.straight([0, 0, 0], [2, 0, 0], pings=20, ping_interval_s=0.1)
+    >>> scene = clsas.PointTargets([[2, 40, 0]])
+    >>> echoes = clsas.simulate(sonar, track, scene, range_m=(39, 41))
+    >>> echoes
+    Echoes(20 channels of 148 samples at 40 kHz, carrier 100 kHz)
     """
     validate.instance("sonar", sonar, Sonar)
     validate.instance("track", track, Track)
@@ -120,7 +144,7 @@ def simulate(
         patterns = ElementPatterns(sonar, (pointing or Pointing.broadside()).axes(track))
     elif pointing is not None:
         why = "the sonar's elements have no sizes" if element_pattern else "element_pattern is off"
-        raise ValueError(f"pointing has nothing to act on: {why}")
+        raise ValueError(f"pointing must be left out: {why}")
     pulse, rate, sound = sonar.pulse, sonar.sample_rate_hz, sonar.sound_speed_m_s
     geometry = channels(sonar, track, motion_in_flight=motion_in_flight)
     if phase_centres:
@@ -146,7 +170,7 @@ def simulate(
         rate,
         start,
         length,
-        # Every echo that may lie partly in the window.
+        # Keep every echo that may lie partly in the window.
         kept_s=(start - pulse.duration_s - ringing, start + length / rate + ringing),
         tail=math.ceil(pulse.duration_s * rate) + 2 * RINGING,
     )
@@ -218,32 +242,26 @@ def simulate_lines(
 ) -> RangeLines:
     """Return range lines of a scene directly, without a pulse, echoes or beams.
 
-    This is the linear operator from amplitudes a_s to compressed lines,
-
-        s_i(n) = sum_s a_s p(r_n - rho_is) exp(-j 2 k rho_is).
-
-    p is the response of the windowed band with p(0) = 1; for window "none" it is sinc(2 B r/c). The
-    sum is over the points whose range lies within the line.
-
     Parameters
     ----------
     tx_m, rx_m : array_like, [channels, 3] or [3]
-        Transmitter and receiver position of each channel.
+        Transmitter and receiver position of each channel, metres.
     scene : PointTargets, Seabed, or tuple of them
-        Reflectors, as for `simulate`. A seabed's visibility is found for every channel.
+        Reflectors, as for `simulate`. The visibility of a seabed is determined for every channel.
     carrier_hz, bandwidth_hz : float
-        Centre and width of the band.
+        Centre and width of the band, hertz.
     window, oversampling
-        As for `clsas.compress`; the range step is exactly c/(2 oversampling bandwidth).
+        As for `compress`. The range step is exactly c/(2 oversampling bandwidth).
     sound_speed_m_s : float
-        Speed of sound.
+        Speed of sound, metres per second.
     first_range_m : array_like, [channels] or scalar, optional
-        Range of each line's first sample, metres; with `length`. By default the lines hold every
-        point and at least 90 more samples at either end.
+        Range of the first sample of each line, metres; requires `length`. By default the lines
+        contain every point and at least 90 more samples at either end.
     length : int, optional
-        Samples of every line; with `first_range_m`.
+        Number of samples of every line; requires `first_range_m`.
     rx_velocity_m_s : array_like, [channels, 3] or [3], optional
-        Velocity of the receivers during flight; None is stop-and-hop.
+        Velocity of the receivers while the sound travels, metres per second. None means
+        stop-and-hop.
     workers, progress
         As for `simulate`.
 
@@ -260,7 +278,30 @@ def simulate_lines(
     Warns
     -----
     ClsasWarning
-        If no point's range lies within a line.
+        If no point lies within the range of a line.
+
+    See Also
+    --------
+    simulate : Echoes of a sonar on a track.
+
+    Notes
+    -----
+    This is the linear operator from amplitudes a_s to compressed lines,
+
+        s_i(n) = sum_s a_s p(r_n - rho_is) exp(-j 2 k rho_is).
+
+    p is the response of the windowed band, with p(0) = 1. For window "none" it is sinc(2 B r/c).
+    The sum is over the points whose range lies within the line.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> tx_m = [[0, 0, 0], [0.5, 0, 0]]
+    >>> scene = clsas.PointTargets([[0, 40, 0]])
+    >>> clsas.simulate_lines(
+    ...     tx_m, tx_m, scene, carrier_hz=100e3, bandwidth_hz=30e3, first_range_m=39, length=161
+    ... )
+    RangeLines(2 channels of 161 samples, range 39 to 41 m in steps of 12.5 mm, carrier 100 kHz)
     """
     carrier = validate.number("carrier_hz", carrier_hz, "Hz", least=0.0, most=validate.MOST_HZ)
     band = validate.number(
@@ -291,7 +332,7 @@ def simulate_lines(
         )
         length = validate.count("length", length)
         validate.memory("length", 8 * every * paths.channels * length)
-        with np.errstate(over="ignore"):  # refused below
+        with np.errstate(over="ignore"):  # an overflow is refused below
             nearest = 2 * first / sound
         farthest = nearest + (length - 1) * step
     validate.phase(carrier, sound, sound / 2 * float(np.abs([nearest, farthest]).max()))
@@ -321,7 +362,7 @@ def simulate_lines(
 
 
 def _channels(tx_m: ArrayLike, rx_m: ArrayLike, rx_velocity_m_s: ArrayLike | None) -> Channels:
-    """Check positions and return those of every channel; a single position is repeated."""
+    """Return the positions of every channel, checked; a single position is repeated."""
     parts = (tx_m, rx_m) if rx_velocity_m_s is None else (tx_m, rx_m, rx_velocity_m_s)
     given = [
         validate.array(name, part, np.float64, None)
@@ -336,10 +377,10 @@ def _channels(tx_m: ArrayLike, rx_m: ArrayLike, rx_velocity_m_s: ArrayLike | Non
 
 
 def _add_noise(samples: NDArray[np.complex64], snr_db: float, seed: int) -> None:
-    """Add white noise in place, relative to the strongest sample."""
+    """Add white noise relative to the strongest sample, in place."""
     peak = np.max([np.abs(line).max() for line in samples])
     if peak == 0:
-        raise ValueError(f"snr_db needs an echo to refer to: {NO_ECHO}")
+        raise ValueError(f"snr_db must be left out without an echo: {NO_ECHO}")
     # Standard deviation of the real and of the imaginary part.
     deviation = np.float32(peak * 10 ** (-snr_db / 20) / np.sqrt(2))
     random = np.random.default_rng(int(seed))

@@ -1,1 +1,1 @@
-"""Sonars: pulse and elements, tracks, sampling limits, beam weights and visibility."""
+"""Sonars: pulses and elements, tracks, sampling limits, beam weights and visibility."""

@@ -1,4 +1,4 @@
-"""Beam weights: how much a channel adds to a pixel, as a function of the aspect angle."""
+"""Beam weights: the weight of a channel in a pixel as a function of the aspect angle."""
 
 from __future__ import annotations
 
@@ -22,20 +22,22 @@ INTERVALS = 1024
 LEAST_WEIGHT_SUM = 0.01
 """Normalised pixels whose weights sum to less than this fade to 0."""
 
-_NARROWEST = 1e-3  # degrees: float32 resolves a hundredth of this
-_END_FIRE = 2.0  # limit for beams that reach end-fire: rounding never makes a sine this large
-_HALF_POWER = 0.442946  # sinc^2 is 1/2 here
-_MOST_WEIGHT = 100.0  # 40 dB
-_TAYLOR_TERMS, _TAYLOR_SIDE_LOBES_DB = 4, 30.0  # SciPy's choice
-_STEEP_TAPER = 0.1  # with a taper up to this the errors of "tukey" are those of a step
+_NARROWEST = 1e-3  # narrowest beam, degrees; float32 resolves a hundredth of it
+# Limit of beams that reach end-fire. Rounding never makes a sine this large.
+_END_FIRE = 2.0
+_HALF_POWER = 0.442946  # argument at which sinc^2 is 1/2
+_MOST_WEIGHT = 100.0  # largest weight of an inverse beam: 40 dB
+_TAYLOR_TERMS, _TAYLOR_SIDE_LOBES_DB = 4, 30.0  # as in SciPy
+_STEEP_TAPER = 0.1  # largest taper with which the errors of "tukey" are those of a step
 
 
 @dataclass(frozen=True, eq=False)
 class BeamWindow:
     """Weights of the channels by aspect angle, which restrict an image to part of the beam.
 
-    The weight of a channel in a pixel x is a function of theta - squint. The aspect angle theta
-    from broadside follows from the channel's phase centre p and the track's unit direction t,
+    The weight of a channel in a pixel x is a function of theta - squint. The aspect angle theta,
+    measured from broadside, follows from the phase centre p of the channel and the unit direction t
+    of the track:
 
         sin(theta) = t . (x - p)/|x - p|,   p = (tx + rx)/2.
 
@@ -47,31 +49,44 @@ class BeamWindow:
         "rectangular", "hann", "hamming", "taylor" (4 terms, side lobes at -30 dB), "tukey" or
         "inverse". All but "inverse" depend on (theta - squint)/width and are 1 in the middle.
         "inverse" divides by the two-way pattern sinc^2(L/lambda sin(theta - squint)) of elements
-        of length L at the lines' carrier.
+        of length L, at the carrier of the lines.
     squint_deg : float
-        Squint angle of the beam's axis, positive forward. The whole beam lies within +-90 degrees.
+        Squint angle of the beam's axis, positive forward. The whole beam must lie within +-90
+        degrees.
     taper : float
         For "tukey": fraction of the width, 0 to 1, that the two raised-cosine edges take together.
         Below 1/512 there are no edges.
     element_length_m : float, optional
-        For "inverse": L. The weights may amplify by 40 dB at most.
+        For "inverse": element length L, metres. The weights may amplify by 40 dB at most.
     along : array_like, [3] or [channels, 3], optional
-        Direction of the track, a vector of any length. By default the direction of a smooth curve
-        through the lines' phase centres, see `directions`.
+        Direction of the track, as a vector of any length. The default is the direction of a smooth
+        curve through the phase centres of the lines; see `directions`.
     track_pings : int, optional
-        Pings over which the track's direction is smoothed, at least 5. By default a quarter of
-        all pings, and at most 101.
+        Number of pings over which the direction of the track is smoothed, at least 5. The default
+        is a quarter of all pings, and at most 101.
     normalise : bool
-        Multiply every pixel by channels / sum_i w_i(x), with w_i the weights. A point then has the
-        amplitude that it would have without a beam, also near the ends of the aperture, where
-        fewer channels receive from it. Noise grows there by the square root of that factor. The
-        sum includes channels whose lines do not reach the pixel. Pixels with a sum below 0.01
+        If True, multiply every pixel by channels / sum_i w_i(x), with w_i the weights. A point then
+        has the amplitude that it would have without a beam, even near the ends of the aperture,
+        where fewer channels receive from it. Noise grows there by the square root of that factor.
+        The sum includes channels whose lines do not reach the pixel. Pixels with a sum below 0.01
         fade to 0.
 
     Raises
     ------
     TypeError, ValueError
         If a value has the wrong type or is outside its limits.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> beam = clsas.BeamWindow(20, "hann")
+    >>> beam.weights([0.0, 0.1, 0.2]).round(3)
+    array([1.   , 0.385, 0.   ])
+
+    A beam as wide as the half-power beam of an element of 15 mm at a wavelength of 1.5 mm:
+
+    >>> f"{clsas.BeamWindow.of_element(15e-3, 1.5e-3).width_deg:.2f} degrees"
+    '5.08 degrees'
     """
 
     width_deg: float
@@ -83,7 +98,7 @@ class BeamWindow:
     normalise: bool = False
     track_pings: int | None = None
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,
@@ -116,14 +131,14 @@ class BeamWindow:
             length = validate.positive("element_length_m", self.element_length_m, "m")
             fields["element_length_m"] = length
         elif self.shape == "inverse":
-            raise ValueError("element_length_m must be given for the shape 'inverse'")
+            raise ValueError("element_length_m must be given for shape 'inverse'")
         if self.along is not None:
             along = validate.array("along", self.along, np.float64, None)
             shape = (3,) if along.ndim == 1 else (None, 3)
             along = validate.array("along", along, np.float64, shape)
             largest = np.abs(along).max(axis=-1, keepdims=True)
             if not largest.all():
-                raise ValueError("along must hold directions of some length, got zeros")
+                raise ValueError("along must not have a direction of length zero")
             along = along / largest  # avoids overflow and underflow in the norm
             fields["along"] = along / np.linalg.norm(along, axis=-1, keepdims=True)
         if self.track_pings is not None:
@@ -136,28 +151,28 @@ class BeamWindow:
     def of_element(
         cls, length_m: float, wavelength_m: float, shape: str = "rectangular", **others: Any
     ) -> BeamWindow:
-        """Return weights as wide as an element's half-power beam.
+        """Return weights as wide as the half-power beam of an element.
 
-        Their edges lie where the pattern of one element is at -3 dB and the two-way pattern at
-        -6 dB, sin(width/2) = 0.443 wavelength/length. This is the textbook beamwidth of 0.886
-        wavelength/length, whose azimuth resolution is half an element. An element shorter than
-        0.443 wavelengths has no such edge: the beam is then 180 degrees wide.
+        The edges lie where the pattern of one element is -3 dB, and the two-way pattern -6 dB:
+        sin(width/2) = 0.443 wavelength/length. This is the textbook beamwidth of 0.886
+        wavelength/length, which gives an azimuth resolution of half an element. An element shorter
+        than 0.443 wavelengths has no such edge, and the beam is then 180 degrees wide.
 
         Parameters
         ----------
         length_m : float
-            Length of the element along the track.
+            Length of the element along the track, metres.
         wavelength_m : float
-            Wavelength at the carrier.
+            Wavelength of the carrier, metres.
         shape : str
-            See `BeamWindow`.
+            Shape, as for `BeamWindow`.
         **others
-            Further parameters of `BeamWindow`; `element_length_m` is `length_m` unless given.
+            Further parameters of `BeamWindow`. `element_length_m` is `length_m` unless given.
 
         Raises
         ------
         TypeError, ValueError
-            As `BeamWindow` does.
+            As for `BeamWindow`.
         """
         length = validate.positive("length_m", length_m, "m")
         wavelength = validate.positive("wavelength_m", wavelength_m, "m")
@@ -171,7 +186,7 @@ class BeamWindow:
 
     @property
     def limits_rad(self) -> tuple[float, float]:
-        """Aspect angles at which the beam begins and ends."""
+        """Aspect angles at which the beam begins and ends, radians."""
         return (
             math.radians(self.squint_deg - self.width_deg / 2),
             math.radians(self.squint_deg + self.width_deg / 2),
@@ -179,13 +194,13 @@ class BeamWindow:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Sines of `limits_rad`, between which weights are not 0; -+2 for a limit at end-fire."""
+        """Sines of `limits_rad`, between which weights are not 0. A limit at end-fire is -+2."""
         low, high = (math.sin(angle) for angle in self.limits_rad)
         return (low if low > -1 + 1e-12 else -_END_FIRE), (high if high < 1 - 1e-12 else _END_FIRE)
 
     @property
     def edge(self) -> float:
-        """Approximate extent in sine over which the weights rise from 0 to 1."""
+        """Approximate extent, in sine, over which the weights rise from 0 to 1."""
         low, high = np.clip(self.limits, -1, 1)
         return (high - low) / 2 * (max(self.taper, 0.02) if self.shape == "tukey" else 1.0)
 
@@ -196,14 +211,14 @@ class BeamWindow:
 
     @property
     def _has_taper(self) -> bool:
-        """True for the shape "tukey" with edges at least as wide as a table interval."""
+        """True for the shape "tukey" if its edges are at least as wide as a table interval."""
         return self.shape == "tukey" and self.taper * INTERVALS >= 2
 
     def block_error(self, reach: float) -> float:
-        """Relative rms error of weights that are one cubic over a block of pixels.
+        """Return the relative rms error if one cubic replaces the weights over a block of pixels.
 
-        `reach` is the largest change of the sine from the block's middle. The edges of "tukey"
-        begin with a kink that no cubic follows; the other shapes are smooth between the limits.
+        `reach` is the largest change of the sine from the middle of the block. The edges of "tukey"
+        begin with a kink that no cubic follows. The other shapes are smooth between the limits.
         """
         reach = validate.number("reach", reach, least=0.0)
         low, high = np.clip(self.limits, -1, 1)
@@ -214,11 +229,11 @@ class BeamWindow:
         return 0.04 * x**2 * math.sqrt(min(8 * reach / width, 1.0))
 
     def plane_error(self, reach: float, wavelength_m: float = math.inf) -> float:
-        """Relative rms error of a sine that is interpolated bilinearly over a longer block.
+        """Return the relative rms error if the sine is interpolated bilinearly over a longer block.
 
-        Over a block of half length r at distance R the sine deviates from linear by at most
-        0.6 (r/R)^2 (`reach` is r/R). That shifts the beam's edges. Where the weights begin with a
-        step, the shift adds or drops channels.
+        Over a block of half length r at distance R, the sine deviates from linear by at most
+        0.6 (r/R)^2, where r/R is `reach`. This shifts the edges of the beam. Where the weights
+        begin with a step, the shift adds or drops channels.
         """
         reach = validate.number("reach", reach, least=0.0, most=1e6)
         square = self._all(wavelength_m) ** 2
@@ -229,19 +244,20 @@ class BeamWindow:
     def fullness(
         self, sine: NDArray[np.float64], wavelength_m: float = math.inf, share: float = 1.0
     ) -> float:
-        """Rms of the weights that an image uses over the rms of all weights, at most 1.
+        """Return the rms of the weights that an image uses over the rms of all weights, at most 1.
 
-        Relative errors grow by its inverse. It is small for an image that only the edge of the
-        beam covers. Normalising lowers it further, since it amplifies poorly covered pixels.
+        Relative errors grow by the inverse of the fullness. It is small for an image that only the
+        edge of the beam covers. Normalising lowers it further, because it amplifies poorly covered
+        pixels.
 
         Parameters
         ----------
         sine : float64 [channels, points]
             Sines of the aspect angles at which some channels receive from some points.
         wavelength_m : float
-            For "inverse".
+            Wavelength of the carrier, metres; used by "inverse".
         share : float
-            Fraction of all channels that `sine` has.
+            Number of channels in `sine` over the number of all channels.
         """
         share = validate.positive("share", share)
         sine = validate.array("sine", sine, np.float64, None)
@@ -253,25 +269,37 @@ class BeamWindow:
         result = float(min(rms / of_all, 1.0))
         if self.normalise:
             sums = weights.sum(axis=0) / share
-            # If any point is not covered at all, pixels on the way to it have every small sum.
+            # If a point is not covered at all, the sums of pixels between it and covered ones take
+            # all small values.
             least = [] if sums.all() else [LEAST_WEIGHT_SUM]
             amplified = sums.max() / np.maximum(np.append(sums[sums > 0], least), LEAST_WEIGHT_SUM)
             result /= float(np.sqrt(np.mean(amplified**2)))
         return result
 
     def _all(self, wavelength_m: float) -> NDArray[np.float64]:
-        """Weights at 65 sines, evenly over the whole beam."""
+        """Return the weights at 65 sines, spread evenly over the whole beam."""
         wavelength_m = _positive_or_infinite(wavelength_m)
         low, high = np.clip(self.limits, -1, 1)
         return self._inside(np.linspace(float(low), float(high), 65), wavelength_m)
 
     def weights(self, q: ArrayLike, wavelength_m: float = math.inf) -> NDArray[np.float64]:
-        """Return the weights at sines `q` of the aspect angle; `wavelength_m` is for "inverse".
+        """Return the weights at sines of the aspect angle.
+
+        Parameters
+        ----------
+        q : array_like
+            Sines of the aspect angle.
+        wavelength_m : float
+            Wavelength of the carrier, metres; used by "inverse".
+
+        Returns
+        -------
+        float64 array of the shape of `q`
 
         Raises
         ------
         TypeError, ValueError
-            If `q` does not hold finite real numbers, or the wavelength is not positive.
+            If `q` does not consist of finite real numbers, or the wavelength is not positive.
         """
         q = validate.array("q", q, np.float64, None)
         wavelength_m = _positive_or_infinite(wavelength_m)
@@ -282,16 +310,16 @@ class BeamWindow:
         return weights
 
     def table(self, wavelength_m: float = math.inf) -> NDArray[np.float32]:
-        """Return the weights as cubics, float32 [INTERVALS, 4], constant terms first.
+        """Return the weights as a table of cubics, float32 [INTERVALS, 4], constant terms first.
 
-        The cubics cover equal intervals of the sine between `limits` (or -1 and 1); the argument
-        of each runs from 0 to 1. Blocks of pixels also evaluate a cubic beyond its interval.
-        Therefore the cubic of an interval with a kink follows the side on which its middle lies.
+        The cubics cover equal intervals of the sine between `limits` (or -1 and 1). The argument of
+        each cubic runs from 0 to 1. Blocks of pixels also evaluate a cubic beyond its interval, so
+        the cubic of an interval with a kink follows the side on which its middle lies.
 
         Raises
         ------
         ValueError
-            If "inverse" would have to amplify by more than 40 dB.
+            If "inverse" would amplify by more than 40 dB.
         """
         wavelength_m = _positive_or_infinite(wavelength_m)
         low, high = np.clip(self.limits, -1, 1)
@@ -313,23 +341,23 @@ class BeamWindow:
     def directions(self, lines: RangeLines) -> NDArray[np.float64]:
         """Return the unit direction of the track at every channel, float64 [channels, 3].
 
-        This is `along` where it was given. Otherwise the lines' phase centres give it, smoothed
-        over `track_pings` pings; see `clsas.sonar.directions.track_directions`.
+        This is `along` if it was given. Otherwise it follows from the phase centres of the lines,
+        smoothed over `track_pings` pings; see `clsas.sonar.directions.track_directions`.
 
         Raises
         ------
         TypeError
             If `lines` is not a RangeLines.
         ValueError
-            If `along` has another number of channels; or if `along` is missing and there is only
-            one ping, or the track stands still.
+            If `along` has another number of channels than the lines. If `along` is None, and there
+            is only one ping or the platform stands still.
         """
         validate.instance("lines", lines, RangeLines)
         if self.along is None:
             return track_directions(lines, self.track_pings)
         if self.along.ndim == 2 and len(self.along) != lines.channels:
             raise ValueError(
-                f"along must hold one direction or one for each of {lines.channels} channels, "
+                f"along must have one direction, or one for each of {lines.channels} channels, "
                 f"got {len(self.along)}"
             )
         return np.broadcast_to(self.along, (lines.channels, 3))
@@ -337,9 +365,9 @@ class BeamWindow:
     def _inside(
         self, q: NDArray[np.float64], wavelength_m: float, around: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Weights at sines `q`, continued smoothly beyond the limits.
+        """Return the weights at sines `q`, continued smoothly beyond the limits.
 
-        With `around`, they are also continued beyond the kinks of "tukey", from the side of each
+        With `around`, they are also continued beyond the kinks of "tukey", from the side of the
         kink on which `around` lies.
         """
         angle, u = self._from_axis(q)
@@ -358,29 +386,29 @@ class BeamWindow:
             )
             return np.sin(np.pi * np.where(of_side < 0.5, share, 0.5)) ** 2
         if self.shape == "inverse":
-            assert self.element_length_m is not None  # as checked when this was made
+            assert self.element_length_m is not None  # as __post_init__ checked
             one_way = element_pattern(self.element_length_m, np.sin(angle), 1.0, wavelength_m)
             return 1 / np.maximum(one_way**2, 1e-30)
         return np.ones_like(q)
 
     def _from_axis(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Angles from the beam's axis at sines `q`, in radians and in widths of the beam."""
+        """Return the angles from the beam's axis at sines `q`, in radians and in beam widths."""
         angle = np.arcsin(np.clip(q, -1, 1)) - math.radians(self.squint_deg)
         return angle, angle / math.radians(self.width_deg)
 
 
 def _positive_or_infinite(wavelength_m: float) -> float:
-    """Return a checked wavelength, infinite for lines on their carrier."""
+    """Return a wavelength, checked; lines that are still on their carrier have an infinite one."""
     if isinstance(wavelength_m, float) and wavelength_m == math.inf:
         return math.inf
     return validate.positive("wavelength_m", wavelength_m, "m")
 
 
 def _taylor(u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Taylor window at u from -0.5 to 0.5, scaled to 1 in the middle.
+    """Return the Taylor window at u from -0.5 to 0.5, scaled to 1 in the middle.
 
-    It is 1 + sum_m F_m cos(2 pi m u). Taylor's factors F_m give the nearest side lobes one height
-    (Carrara, Goodman and Majewski 1995, pages 512-513).
+    The window is 1 + sum_m F_m cos(2 pi m u). Taylor's factors F_m give the nearest side lobes
+    equal heights (Carrara, Goodman and Majewski 1995, pages 512-513).
     """
     terms = np.arange(1, _TAYLOR_TERMS)
     a = math.acosh(10 ** (_TAYLOR_SIDE_LOBES_DB / 20)) / np.pi
@@ -396,5 +424,5 @@ def _taylor(u: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def normalising(sums: NDArray[np.floating], channels: int) -> NDArray[np.floating]:
-    """Return the factors by which a normalising beam multiplies pixels with these weight sums."""
+    """Return the factors by which a normalising beam multiplies pixels with given weight sums."""
     return (channels / np.maximum(sums, LEAST_WEIGHT_SUM)).astype(sums.dtype)

@@ -1,4 +1,4 @@
-"""Coverage: whether any line and the beam reach a grid, and the warning if none does."""
+"""Coverage: whether the beam and the range of any line reach a grid, and a warning if not."""
 
 from __future__ import annotations
 
@@ -14,24 +14,26 @@ from clsas.core.lines import RangeLines, antennas_of, some_channels, steepest
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import BeamTrack, Boxes, sines
 
-_SAMPLED_CHANNELS = 64  # a quick test that finds nearly every grid covered
-_SAMPLED_PIXELS = 16  # along either side of the grid, in the quick test
+# Channels, and pixels along either side of the grid, in the quick test, which finds that nearly
+# every grid is covered.
+_SAMPLED_CHANNELS = 64
+_SAMPLED_PIXELS = 16
 _BLOCKS = 8  # along either side of the grid; smaller blocks would find smaller gaps
-_TAPS = 8  # an interpolated line extends this many samples beyond its ends
+_TAPS = 8  # samples by which an interpolated line extends beyond its ends
 
 _Span = tuple[float, float]  # nearest and farthest range, metres
 
 
 class UnreachedWarning(validate.ClsasWarning):
-    """No line contributes to any pixel, so that the image is zero."""
+    """Warning that no line contributes to any pixel, so that the image is zero."""
 
 
 def reaches(
     lines: RangeLines, grid: Grid, beam: BeamWindow | None, along: NDArray[np.float64] | None
 ) -> bool:
-    """Return False only if certainly no pixel lies within the range of any line and the beam.
+    """Return False only if certainly no pixel lies in the beam and within the range of any line.
 
-    `along` holds the track's unit directions for a beam, [channels, 3].
+    `along` contains the unit directions of the track, [channels, 3]; it is None without a beam.
     """
     if _reached_at_points(lines, grid, beam, along):
         return True
@@ -41,7 +43,7 @@ def reaches(
 def _reached_at_points(
     lines: RangeLines, grid: Grid, beam: BeamWindow | None, along: NDArray[np.float64] | None
 ) -> bool:
-    """Quick test: return True if any sampled channel receives from any sampled pixel."""
+    """Return True if any sampled channel receives from any sampled pixel: the quick test."""
     some = some_channels(lines.channels, _SAMPLED_CHANNELS)
     points_m = grid.spread(_SAMPLED_PIXELS)
     range_m = _ranges_m(lines, points_m, some)
@@ -60,9 +62,10 @@ def _reached_in_boxes(
     beam: BeamWindow | None,
     along: NDArray[np.float64] | None,
 ) -> bool:
-    """Full test: return False only if certainly no channel receives from any box.
+    """Return False only if certainly no channel receives from any box: the full test.
 
-    `centres_m` and `half_m` hold the boxes' centres and half sides along x, y and z, [boxes, 3].
+    `centres_m` are the centres of the boxes, and `half_m` half their sides along x, y and z,
+    [boxes, 3].
     """
     beyond_m = _TAPS * lines.range_step_m
     track = None
@@ -83,7 +86,7 @@ def _reached_in_boxes(
 
 
 def _boxes(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Centres and half sides, [boxes, 3], of boxes that together hold all pixels of a grid."""
+    """Return centres and half sides, [boxes, 3], of boxes that contain all pixels of a grid."""
     parts = [
         [slice(first, last) for first, last in itertools.pairwise(_cuts(count))]
         for count in grid.shape[:2]
@@ -100,7 +103,7 @@ def _boxes(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _cuts(count: int) -> NDArray[np.int64]:
-    """Edges that divide a side of a grid into blocks."""
+    """Return the edges that divide a side of a grid into blocks."""
     return np.unique(np.linspace(0, count, min(count, _BLOCKS) + 1).astype(np.int64))
 
 
@@ -111,10 +114,10 @@ def warn_unreached(
     along: NDArray[np.float64] | None,
     lines_m: _Span | None = None,
 ) -> None:
-    """Warn that no line contributes to a grid: with the distances, and the likely cause.
+    """Warn that no line contributes to a grid; name the distances and the likely cause.
 
-    Lines that are all zero cause no warning. For lines that are geometry alone, `lines_m` is their
-    nearest and farthest range.
+    Lines that are all zero cause no warning. `lines_m` is the nearest and the farthest range of
+    lines that are geometry without samples.
     """
     if lines_m is None:
         if not lines.samples.any():
@@ -146,22 +149,22 @@ def warn_unreached(
 def _ranges_m(
     lines: RangeLines, points_m: NDArray[np.float64], some: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Ranges of points from some channels, [points, channels]."""
+    """Return the ranges of points from some channels, [points, channels]."""
     return pairwise_range_m(points_m, *antennas_of(lines, some))
 
 
 def _likely_cause(
     lines: RangeLines, points_m: NDArray[np.float64], some: NDArray[np.int64], lines_m: _Span
 ) -> str:
-    """Return what probably went wrong, by what the grid would look like in other units."""
+    """Return the probable mistake, found by assuming that the grid is in other units."""
 
     def fits(factor: float) -> bool:
         range_m = _ranges_m(lines, factor * points_m, some)
         return bool(((range_m >= lines_m[0]) & (range_m <= lines_m[1])).any())
 
     if fits(1.0):
-        return "Check the beam's width and squint, and the grid's place along the track"
+        return "Check the width and squint of the beam, and the grid's position along the track"
     for factor, unit in ((1e3, "km"), (1e-3, "mm")):
         if fits(factor):
-            return f"In {unit} the grid would be reached: lengths must be given in m"
+            return f"The grid would be reached if it were in {unit}: lengths must be given in m"
     return "Check the grid, the positions of the antennas and first_range_m, all in m"

@@ -11,37 +11,37 @@ from clsas.core.lines import RangeLines
 MOST_TRACK_PINGS = 101
 """Most pings over which the track's direction is smoothed by default."""
 
-_SMOOTHED_SHARE = 4  # by default cubics are fitted to this part (a quarter) of the pings
-_NEW_LEG = 10.0  # a step between pings this many times the median one begins a new leg
-_SHORTEST_LEG = 5  # pings; a cubic and one to spare
+_SMOOTHED_SHARE = 4  # by default a cubic is fitted to a quarter of the pings
+_NEW_LEG = 10.0  # step between pings, in median steps, from which on a new leg of the track begins
+_SHORTEST_LEG = 5  # pings: those that a cubic needs, and one more
 
 
 def track_directions(lines: RangeLines, pings: int | None = None) -> NDArray[np.float64]:
     """Return the unit direction of the track at every channel, float64 [channels, 3].
 
-    Local cubics are fitted to the pings' mean phase centres by least squares (Savitzky-Golay).
-    Their tangents are interpolated to each channel. Consecutive channels with one transmitter
-    position are a ping. Legs of a track, which are far apart, are smoothed one by one.
+    Local cubics are fitted to the mean phase centres of the pings by least squares (Savitzky and
+    Golay 1964). Their tangents are interpolated to each channel. Legs of a track that are far apart
+    are smoothed separately.
 
     Parameters
     ----------
     lines : RangeLines
     pings : int, optional
-        Pings that each fit spans; by default a quarter of all, between 5 and 101.
+        Number of pings that each fit spans. The default is a quarter of all pings, between 5 and
+        101.
 
     Raises
     ------
     ValueError
-        If there is only one ping, or the track stands still.
+        If there is only one ping, or the platform stands still.
     """
-    first, channels_m = lines.ping_starts, lines.phase_centres_m
-    count = len(first)
+    channels_m = lines.phase_centres_m
+    count = len(lines.ping_starts)
     if count < 2:
         raise ValueError(
-            f"along must be given: {lines.channels} channels of one transmitter position have "
+            f"along must be given: {lines.channels} channels with one transmitter position have "
             f"no track"
         )
-    receivers = np.diff(np.append(first, lines.channels))
     centres_m = lines.ping_centres_m
     span = pings or min(max(count // _SMOOTHED_SHARE, 5), MOST_TRACK_PINGS)
     tangent = np.concatenate([_tangents(leg_m, span) for leg_m in _legs(centres_m)])
@@ -49,13 +49,12 @@ def track_directions(lines: RangeLines, pings: int | None = None) -> NDArray[np.
     extent_m = np.linalg.norm(np.ptp(centres_m, axis=0))
     if not speed.min() > 1e-3 * extent_m / count:
         raise ValueError(
-            "along must be given: the lines' phase centres stand still about ping "
-            f"{speed.argmin()}; "
-            "lines.without_still_pings() drops such pings"
+            "along must be given: the phase centres of the lines stand still around ping "
+            f"{speed.argmin()}; lines.without_still_pings() drops such pings"
         )
     tangent /= speed[:, None]
-    # The front channels of a long array lie where the middles of later pings will be.
-    ping = np.repeat(np.arange(count), receivers)
+    # The front channels of a long array lie where the middle of later pings will be.
+    ping = lines.ping_numbers
     steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
     travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
     ahead_m = channels_m - centres_m[ping]
@@ -65,7 +64,7 @@ def track_directions(lines: RangeLines, pings: int | None = None) -> NDArray[np.
 
 
 def _legs(centres_m: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Pings' phase centres, [n, 3], split where the track continues somewhere else."""
+    """Return the phase centres of the pings, [n, 3], split where the track jumps."""
     steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
     median_m = np.median(steps_m)
     starts = [0]
@@ -76,18 +75,18 @@ def _legs(centres_m: NDArray[np.float64]) -> list[NDArray[np.float64]]:
 
 
 def _tangents(centres_m: NDArray[np.float64], pings: int) -> NDArray[np.float64]:
-    """Tangents of local cubics through `pings` pings of one leg, [n, 3]."""
+    """Return the tangents of local cubics through `pings` pings of one leg, [n, 3]."""
     count = len(centres_m)
     # The filter needs an odd number of pings, and a cubic at least four.
     window = min(2 * (pings // 2) + 1, count - 1 + count % 2)
     if window < 2:
         return np.diff(centres_m, axis=0).repeat(2, axis=0)
-    # scipy.signal has this filter, but takes longer to import than most images to plan.
+    # scipy.signal has this filter, but importing it takes longer than planning most images.
     half = window // 2
     powers = np.vander(np.arange(-half, half + 1), min(3, window - 1) + 1, increasing=True)
     fit = np.linalg.pinv(powers.astype(np.float64))  # coefficients of the cubic, from positions
     tangents = correlate1d(centres_m, fit[1], axis=0)
-    # The first and the last cubic also serve the pings before and after their middles.
+    # The first and the last cubic are also used for the pings before and after their middle.
     orders = np.arange(powers.shape[1])
     slopes = orders[1:] * np.vander(np.arange(-half, half + 1), len(orders) - 1, increasing=True)
     tangents[: half + 1] = slopes[: half + 1] @ (fit @ centres_m[:window])[1:]

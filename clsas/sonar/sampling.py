@@ -1,6 +1,6 @@
-"""Sampling limits of a survey, phase centres and far field.
+"""Sampling limits of a survey: spacing of phase centres, and ping rate.
 
-Equations in brackets are those of the thesis (Ødegaard 2004), [22]-[34].
+Equations in brackets are those of the thesis (Ødegaard 2004), [22]-[32].
 """
 
 from __future__ import annotations
@@ -10,33 +10,41 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
+from clsas.core import reprs, validate
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import wavelength_m as carrier_wavelength_m
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Track, channels
 
-_SLACK = 0.01  # relative; a sway of centimetres changes the spacing a little
+# Relative excess of the spacing that is tolerated. A sway of centimetres changes the spacing a
+# little.
+_SLACK = 0.01
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is wrong with a survey or a recording.
+    """A problem of a survey or a recording.
 
     Parameters
     ----------
     name : str
-        Which check found it, such as "along_track_spacing", "ping_rate" or "dead_channels".
+        Name of the check that found it, such as "along_track_spacing", "ping_rate" or
+        "dead_channels".
     message : str
-        Explanation with the numbers and their units.
+        Explanation, with numbers and units.
     value, limit : float
-        What was found and what is allowed, in the unit of the message.
+        Value found and value allowed, in SI units or decibels.
     remedy : str
         What to do about it.
     where : tuple of int
-        Pings or channels that it is about, from 0; the message says which of the two.
+        Numbers of the pings or channels concerned, from 0. The message says which of the two.
+
+    See Also
+    --------
+    check_sampling, inspect : Functions that return findings.
     """
 
     name: str
@@ -58,28 +66,25 @@ def check_sampling(
 ) -> list[Finding]:
     """Return the sampling limits that a survey of a grid violates.
 
-    Called as `check_sampling(sonar, track, grid)` before a survey, and as
-    `check_sampling(lines, grid)` for range lines, whose sonar and track need not be known.
-
-    The spacing of the phase centres along the track may exceed half an element by at most 1 %
-    [27], [31]. For elements without a length the limit keeps the grating lobes of every target
-    off the grid and out of the beam, whichever is narrower. The ping rate must leave time for the
-    last echo from the grid [24]; range lines do not tell it.
+    Call it as `check_sampling(sonar, track, grid)` before a survey, and as
+    `check_sampling(lines, grid)` for range lines, for which the sonar and the track need not be
+    known.
 
     Parameters
     ----------
     sonar : Sonar or RangeLines
+        The sonar, or recorded range lines.
     track : Track
-        Left out with range lines.
+        Track of the sonar. Leave it out with range lines.
     grid : Grid
-        Grid of the image. With range lines and a beam or an element length it may be left out.
+        Grid of the image. It may be left out for range lines with a beam or an element length.
     beam : BeamWindow, optional
-        Beam of the image: echoes from outside it add nothing.
+        Beam of the image. Echoes from outside it do not contribute.
     element_length_m : float, optional
-        Length of the elements, metres; by default that of the sonar.
+        Length of the elements, metres. The default is that of the sonar.
     wavelength_m : float, optional
-        Wavelength, metres; by default that of the carrier. Needed for lines that still have their
-        carrier.
+        Wavelength, metres. The default is that of the carrier. Required for lines that are still on
+        their carrier.
 
     Returns
     -------
@@ -89,8 +94,37 @@ def check_sampling(
     Raises
     ------
     TypeError, ValueError
-        If an argument has the wrong type or is outside its limits, or lines without `carrier_hz`
-        come without a wavelength.
+        If an argument has the wrong type or is outside its limits, or if lines with a `carrier_hz`
+        of 0 are given without a wavelength.
+
+    See Also
+    --------
+    inspect : Checks of a recording, which include this one.
+
+    Notes
+    -----
+    The spacing of the phase centres along the track may exceed half an element by at most 1 %
+    [27], [31]. For elements without a length the limit keeps the grating lobes of every target off
+    the grid or out of the beam, whichever allows the wider spacing. The ping rate must leave time
+    for the last echo from the grid [24]. It is not checked for range lines, which have no times.
+
+    References
+    ----------
+    Ødegaard, "Fast time domain beamforming for synthetic aperture sonar", thesis, University of
+    Oslo, 2004: equations in brackets.
+
+    Examples
+    --------
+    The phase centres of a sonar with 15 mm elements may be 7.5 mm apart. Those of the wide-beam
+    sonar in the thesis are farther apart:
+
+    >>> import clsas
+    >>> sonar = clsas.Sonar.thesis_wide_beam()
+    >>> track = clsas.Track.straight([0, 0, 0], [2.64, 0, 0], pings=10, ping_interval_s=0.2)
+    >>> grid = clsas.Grid.plane(x=(0, 5, 64), y=(40, 45, 64))
+    >>> finding, = clsas.check_sampling(sonar, track, grid)
+    >>> f"{finding.name}: {1e3 * finding.value:.2f} mm, at most {1e3 * finding.limit:.2f} mm"
+    'along_track_spacing: 8.25 mm, at most 7.50 mm'
     """
     if isinstance(sonar, RangeLines):
         if track is not None and grid is not None:
@@ -104,8 +138,8 @@ def check_sampling(
     else:
         if not isinstance(sonar, Sonar):
             raise TypeError(
-                f"sonar must be of type Sonar, got {type(sonar).__name__}; RangeLines may stand in "
-                "its place: check_sampling(lines, grid)"
+                f"sonar must be of type Sonar, got {type(sonar).__name__}; RangeLines may be given "
+                "instead: check_sampling(lines, grid)"
             )
         validate.instance("track", track, Track)
         validate.instance("grid", grid, Grid)
@@ -133,11 +167,16 @@ def _antennas_m(survey: Sonar | RangeLines, track: Track | Grid | None) -> tuple
 
 @dataclass(frozen=True)
 class _SpacingLimit:
-    """Largest spacing of phase centres by elements or beam, and the wavelength."""
+    """Wavelength, and the largest spacing of phase centres that the elements or the beam allow.
+
+    `reason` completes the sentence "phase centres should be at most so far apart". It is empty if
+    neither elements nor beam limit the spacing.
+    """
 
     wavelength_m: float
     spacing_m: float = np.inf
-    meaning: str = ""
+    reason: str = ""
+    of_element: bool = False
 
 
 def _spacing_limit(
@@ -146,7 +185,7 @@ def _spacing_limit(
     element_length_m: float | None,
     wavelength_m: float | None,
 ) -> _SpacingLimit:
-    """Return the limit of elements or, where their length is not known, of the beam."""
+    """Return the limit set by the elements or, if their length is not known, by the beam."""
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
     if wavelength_m is not None:
@@ -154,19 +193,19 @@ def _spacing_limit(
     elif isinstance(survey, Sonar):
         wavelength = survey.wavelength_m
     elif survey.carrier_hz:
-        wavelength = survey.sound_speed_m_s / survey.carrier_hz
+        wavelength = carrier_wavelength_m(survey)
     else:
         raise ValueError("wavelength_m must be given for lines with carrier_hz 0")
     if element_length_m is None and isinstance(survey, Sonar):
         element_length_m = survey.element_length_m
     if element_length_m is not None:
         length = validate.positive("element_length_m", element_length_m, "m")
-        meaning = f"half the element length of {length:.4g} m"
-        return _SpacingLimit(wavelength, length / 2, meaning)
+        reason = f", half the element length of {_rounded(length)}"
+        return _SpacingLimit(wavelength, length / 2, reason, of_element=True)
     if beam is not None:
         low, high = np.sin(np.radians(beam.squint_deg + np.array([-0.5, 0.5]) * beam.width_deg))
-        meaning = f"what keeps grating lobes out of the beam of {beam.width_deg:.4g} degrees"
-        return _SpacingLimit(wavelength, wavelength / (2 * float(high - low)), meaning)
+        reason = f" to keep grating lobes out of the beam of {beam.width_deg:.4g} degrees"
+        return _SpacingLimit(wavelength, wavelength / (2 * float(high - low)), reason)
     return _SpacingLimit(wavelength)
 
 
@@ -176,16 +215,16 @@ def _check_spacing(
     course = _course(centres)
     gaps = np.diff(np.sort(centres @ course))
     spacing = float(gaps.max(initial=0.0))
-    limit, meaning = known.spacing_m, known.meaning
-    if corners is not None and not meaning.startswith("half"):
+    limit, reason = known.spacing_m, known.reason
+    if corners is not None and not known.of_element:
         way = corners[:, None] - centres
         distance = np.linalg.norm(way, axis=-1)
         sine = np.divide(way @ course, distance, out=np.zeros_like(distance), where=distance > 0)
         spread = float(np.ptp(sine, axis=0).max())
         of_grid = known.wavelength_m / (2 * spread) if spread else np.inf
-        if of_grid > limit or not meaning:
-            limit, meaning = of_grid, "what keeps grating lobes off the grid"
-    # With a sway of centimetres the principal direction deviates a little from the course.
+        if of_grid > limit or not reason:
+            limit, reason = of_grid, " to keep grating lobes off the grid"
+    # With a sway of centimetres the principal direction differs a little from the course.
     if spacing <= limit * (1 + _SLACK):
         return []
     where = ""
@@ -193,20 +232,25 @@ def _check_spacing(
         near, far = ranges.min(), ranges.max()
         lobes = [grating_lobe_m(known.wavelength_m, spacing, distance) for distance in (near, far)]
         where = (
-            f": grating lobes {lobes[0]:.4g} m to {lobes[1]:.4g} m beside every "
+            f". Expect grating lobes {lobes[0]:.4g} m to {lobes[1]:.4g} m beside every "
             f"target (at the ranges of the grid's corners, {near:.4g} m to {far:.4g} m)"
         )
     return [
         Finding(
             "along_track_spacing",
-            f"phase centres are up to {spacing:.4g} m apart along the track, more than {limit:.4g} "
-            f"m, {meaning}{where}",
+            f"phase centres are up to {_rounded(spacing)} apart along the track, but should be at "
+            f"most {_rounded(limit)} apart{reason}{where}",
             spacing,
             limit,
-            "survey more slowly, ping faster or use a narrower beam; of lines as they are, image "
-            "with a beam (beam=clsas.BeamWindow) that leaves grating lobes out",
+            "survey more slowly, ping faster or use a narrower beam; for lines that are already "
+            "recorded, image with a beam (beam=clsas.BeamWindow) that leaves grating lobes out",
         )
     ]
+
+
+def _rounded(length_m: float) -> str:
+    """Return a length with four digits and its unit."""
+    return reprs.quantity(float(f"{length_m:.4g}"), "m")
 
 
 def _check_ping_rate(sonar: Sonar, track: Track, ranges: NDArray) -> list[Finding]:
@@ -221,7 +265,8 @@ def _check_ping_rate(sonar: Sonar, track: Track, ranges: NDArray) -> list[Findin
         Finding(
             "ping_rate",
             f"the ping rate of {rate:.4g} Hz is above {1 / last:.4g} Hz: the last echo, from "
-            f"{far:.4g} m, ends {last:.4g} s after its ping, when the next one has been sent",
+            f"{far:.4g} m, ends {last:.4g} s after its ping, when the next ping has already been "
+            "sent",
             rate,
             1 / last,
             "ping more slowly, or image a smaller range",
@@ -232,42 +277,12 @@ def _check_ping_rate(sonar: Sonar, track: Track, ranges: NDArray) -> list[Findin
 def phase_centres_m(tx_m: ArrayLike, rx_m: ArrayLike) -> NDArray[np.float64]:
     """Return the points midway between transmitters and receivers, [..., 3]; equation [32].
 
-    [32] is u = u_p + (u_rx - u_tx)/2. This is the midpoint if u_p is the transmitter's position and
-    u_rx, u_tx are positions on the platform.
+    Equation [32] is u = u_p + (u_rx - u_tx)/2. This is the midpoint if u_p is the position of the
+    transmitter, and u_rx and u_tx are positions on the platform.
     """
     tx = validate.array("tx_m", np.atleast_2d(tx_m), np.float64, (None, 3))
     rx = validate.array("rx_m", np.atleast_2d(rx_m), np.float64, (None, 3))
     return (tx + rx) / 2
-
-
-def phase_centre_error_m(separation_m: float, beam_width_rad: float, range_m: float) -> float:
-    """Return the error of the phase-centre approximation within the beam, as two-way path.
-
-    For tx and rx a distance D apart, the path is D^2 cos^2(theta)/(4 R) longer than the path from
-    and to their midpoint. Over a beam of full width W it varies by D^2/(4 R) (1 - cos^2(W/2)). The
-    approximation holds if that is well below the wavelength, for instance below an eighth of it as
-    in [34]. This is equation [33], D^2/(4 lambda) (1 - cos^2(W/2)) << R. The thesis calls the
-    right-hand side the distance from phase centre to receiver, but it is the range.
-
-    Parameters
-    ----------
-    separation_m : float
-        Distance between transmitter and receiver.
-    beam_width_rad : float
-        Full azimuth beam width, at most pi.
-    range_m : float
-        Distance to the target.
-    """
-    separation = validate.number("separation_m", separation_m, "m", least=0.0)
-    width = validate.number("beam_width_rad", beam_width_rad, "rad", least=0.0, most=np.pi)
-    distance = validate.positive("range_m", range_m, "m")
-    return separation**2 / (4 * distance) * float(np.sin(width / 2)) ** 2
-
-
-def far_field_m(half_aperture_m: float, wavelength_m: float) -> float:
-    """Return the range 4 u^2/lambda beyond which waves are plane over +-u; equation [34]."""
-    half = validate.number("half_aperture_m", half_aperture_m, "m", least=0.0)
-    return 4 * half**2 / validate.positive("wavelength_m", wavelength_m, "m")
 
 
 def receive_interval_s(
@@ -281,55 +296,11 @@ def receive_interval_s(
     return 2 * near / sound, 2 * far / sound + duration
 
 
-def ping_advance_m(sonar: Sonar) -> float:
-    """Return the largest advance per ping that leaves no gap between phase centres, metres.
-
-    It is the length of the phase-centre array, half that of the receiver array: N d/2 for N
-    receivers d apart (the thesis, section 2.5), and half the element's length for one receiver
-    [31].
-
-    Raises
-    ------
-    TypeError
-        If `sonar` is not a Sonar.
-    ValueError
-        If the sonar has one receiver and no element length.
-    """
-    validate.instance("sonar", sonar, Sonar)
-    if sonar.receivers > 1:
-        return float(np.ptp(sonar.rx_m[:, 0]) / (sonar.receivers - 1) * sonar.receivers / 2)
-    if sonar.element_length_m is None:
-        raise ValueError("sonar must have an element length or several receivers, got neither")
-    return sonar.element_length_m / 2
-
-
-def ping_rate_limits_hz(
-    speed_m_s: float, advance_m: float, last_echo_s: float
-) -> tuple[float, float]:
-    """Return the lowest and highest ping rate, v/advance <= PRF <= 1/Tf; [24], [30].
-
-    With an advance of L/2 the lower limit is the thesis's 2 v/L. If the lower limit exceeds the
-    upper one, no ping rate satisfies both.
-
-    Parameters
-    ----------
-    speed_m_s : float
-        Platform speed.
-    advance_m : float
-        Largest advance per ping (`ping_advance_m`).
-    last_echo_s : float
-        End of the last echo, Tf (`receive_interval_s`).
-    """
-    speed = validate.number("speed_m_s", speed_m_s, "m/s", least=0.0)
-    advance = validate.positive("advance_m", advance_m, "m")
-    return speed / advance, 1 / validate.positive("last_echo_s", last_echo_s, "s")
-
-
 def grating_lobe_m(wavelength_m: float, spacing_m: float, range_m: float) -> float:
     """Return the distance along the track from a target to its first grating lobe.
 
-    The two-way phase of phase centres d apart repeats at sin theta = lambda/(2 d). At range R this
-    is R lambda/(2 d) along the track [26].
+    The two-way phase of phase centres with the spacing d repeats at sin theta = lambda/(2 d). At
+    range R this is R lambda/(2 d) along the track [26].
     """
     wavelength = validate.positive("wavelength_m", wavelength_m, "m")
     spacing = validate.positive("spacing_m", spacing_m, "m")
@@ -337,12 +308,12 @@ def grating_lobe_m(wavelength_m: float, spacing_m: float, range_m: float) -> flo
 
 
 def _course(centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit vector along which the phase centres spread most."""
+    """Return the unit vector along which the phase centres extend farthest."""
     return np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)[2][0]
 
 
 def _corners_m(grid: Grid) -> NDArray[np.float64]:
-    """Corners [n, 3] of a plane, or of the box around any other grid."""
+    """Return the corners of a plane, or of the box around any other grid, [n, 3]."""
     if grid.is_planar:
         ends = (slice(None, None, max(1, count - 1)) for count in grid.shape)
         return grid.positions_m(*ends).reshape(-1, 3)

@@ -1,11 +1,11 @@
-"""Simplification of a geometry: effects with an error far below the accuracy are left out.
+"""Simplification of a geometry: effects far below the requested accuracy are left out.
 
 Modelling an effect costs time for every pixel and channel. Before an image is formed, `simplify`
-replaces, if the error permits:
+makes these replacements if the error permits:
 
-- transmitter and receiver, or a moving receiver, by one antenna at rest. Its position fits the
-  ranges to the grid by least squares: the phase centre, shifted by what is common to all pixels;
-- a grid with negligible relief by a plane.
+- A transmitter and a receiver, or a moving receiver, become one antenna at rest. Its position is a
+  least-squares fit of the ranges to the grid, close to the phase centre.
+- A grid with negligible relief becomes a plane.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from clsas.core.decibels import power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
+from clsas.core.wavelengths import wavelength_m
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
@@ -31,19 +32,25 @@ RELIEF = "relief of the grid"
 EFFECTS = (MOTION, APART, RELIEF)
 
 SHARE = 1 / 20
-"""Share of the allowed error power that all effects left out may add."""
+"""Share of the allowed error power that all omitted effects together may add."""
 
 LEAST_PIXELS = 1 << 18
-"""Smallest image for which antennas are fitted. With 640 moving receivers the fit takes 5 ms of
-processor time and saves 10 % of the exact image. For 65 000 pixels it saves less than it takes."""
+"""Number of pixels of the smallest image for which antennas are fitted. With 640 moving receivers
+the fit takes 5 ms of processor time and saves 10 % of the time of an exact image. For 65 000 pixels
+it saves less time than it takes."""
 
 _POINTS = 5  # sample points along either side of the grid, to which all antennas are fitted
 _CHECKED_POINTS = 20  # sample points along either side, at which some channels are checked first
-_CHECKED_CHANNELS = 32  # spread evenly; the widest separation and the fastest are checked, too
-_LEAST_STEPS = 2.0  # least range over the spacing of sample points; closer, ranges bend in between
-_BEYOND_BEAM = 0.75  # half the diagonal between sample points: no pixel near the beam is missed
+# Evenly spread channels that are checked first, together with the ends of the track, the widest
+# separation and the fastest receiver.
+_CHECKED_CHANNELS = 32
+# Least range over the spacing of sample points. At closer range, ranges bend between the points.
+_LEAST_STEPS = 2.0
+# Distance from the beam, in spacings of sample points, up to which a sample point is checked. It is
+# half the diagonal between sample points, so that no pixel in the beam is missed.
+_BEYOND_BEAM = 0.75
 _RIDGE = 1e-6  # keeps antennas in place along directions that the ranges do not determine
-_ITERATIONS = 2  # of least squares; a third one changed nothing
+_ITERATIONS = 2  # of the least-squares fit; a third one changed nothing
 _CHANNELS_AT_ONCE = 4096  # bounds memory
 _ROWS_AT_ONCE = 256  # of a grid; bounds memory
 _WEIGHTS = 1024  # sines at which the slope of beam weights is evaluated
@@ -56,15 +63,15 @@ class Model:
     Attributes
     ----------
     lines : RangeLines
-        The given lines, or their samples with simpler antennas.
+        The given lines, with simpler antennas where antennas were fitted.
     grid : Grid
         The given grid, or a plane of the same shape.
     beam : BeamWindow or None
-        The given beam. If antennas were moved, it has the directions of the original track.
+        The given beam. If antennas were fitted, it has the directions of the original track.
     left_out : tuple of str
-        Some of `MOTION`, `APART` and `RELIEF`.
+        Omitted effects: some of `MOTION`, `APART` and `RELIEF`.
     error : float
-        Upper bound of the relative error power that this adds.
+        Upper bound of the relative error power that the omissions add.
     """
 
     lines: RangeLines
@@ -77,7 +84,7 @@ class Model:
 def simplify(
     lines: RangeLines, grid: Grid, beam: BeamWindow | None, allowed_db: float | None
 ) -> Model:
-    """Return the simplest model whose error is a small share of the allowed one.
+    """Return the simplest model whose error is a small share of the allowed error.
 
     Parameters
     ----------
@@ -88,12 +95,12 @@ def simplify(
 
     Notes
     -----
-    A range error d changes the phase by 2 pi f d. f is the highest frequency in the sampled band,
-    in cycles per metre of range. The bound uses the largest range error: of every channel at sample
-    points all over the grid, corners included, and of some channels at many more points. All pixels
-    of a grid's relief are checked. Antennas are not simplified if pixels come as close to them as
-    the sample points are to each other. The amplitudes of all effects add up; their power stays
-    within `SHARE` of the allowed error power.
+    A range error d changes the phase by 2 pi f d, where f is the highest frequency in the sampled
+    band in cycles per metre of range. The bound uses the largest range error of every channel at
+    sample points all over the grid, corners included, and of some channels at many more points. The
+    relief is checked at all pixels. Antennas are not simplified if pixels lie within two spacings
+    of the sample points from them. The error amplitudes of all effects are added. The power of
+    their sum stays within `SHARE` of the allowed error power.
     """
     full = Model(lines, grid, beam)
     apart = not np.array_equal(lines.tx_m, lines.rx_m)
@@ -103,7 +110,7 @@ def simplify(
     highest = lines.carrier_cycles_per_m + 1 / lines.range_step_m
     most = math.sqrt(SHARE * power(allowed_db))
     if not flat and (apart or lines.rx_velocity_m_s is not None):
-        most /= 2  # their amplitudes add up
+        most /= 2  # because the amplitudes of antennas and relief add up
     model, amplitude = full, 0.0
     if grid.size >= LEAST_PIXELS:
         for effects in _removable(lines):
@@ -141,7 +148,7 @@ def leave_out(
 
 
 def relief_of(grid: Grid) -> NDArray[np.float64]:
-    """Return the largest deviation of pixels from the plane that fits a grid, [3], metres."""
+    """Return the largest deviation of pixels from the plane fitted to a grid, [3], metres."""
     corner, rows, columns = _lattice(grid)
     largest = np.zeros(3)
     for first in range(0, grid.shape[0], _ROWS_AT_ONCE):
@@ -154,10 +161,10 @@ def relief_of(grid: Grid) -> NDArray[np.float64]:
 
 
 def _removable(lines: RangeLines) -> list[tuple[str, ...]]:
-    """Effects of antennas that may be left out together, the simplest model first."""
+    """Return the sets of antenna effects that may be left out, the simplest model first."""
     moving = (MOTION,) if lines.rx_velocity_m_s is not None else ()
     if np.array_equal(lines.tx_m, lines.rx_m):
-        # The position at rest that fits a moving receiver differs from its transmitter's.
+        # The position at rest fitted to a moving receiver differs from that of its transmitter.
         return [moving] if moving else []
     return [(*moving, APART), moving] if moving else [(APART,)]
 
@@ -166,8 +173,8 @@ def _removable(lines: RangeLines) -> list[tuple[str, ...]]:
 class _SampledRanges:
     """Ranges of some channels to sample points of a grid in the full model, [points, channels].
 
-    `step_m` is the spacing of the points. `visible` marks the points with a pixel around them in
-    the beam.
+    `step_m` is the spacing of the points. `visible` is True for points with a pixel around them
+    that may lie in the beam.
     """
 
     lines: RangeLines
@@ -186,7 +193,7 @@ class _SampledRanges:
         along: NDArray[np.float64] | None,
         points_m: NDArray[np.float64],
     ) -> _SampledRanges:
-        """Return the ranges; `along` holds the track's unit directions for a beam."""
+        """Return the ranges; `along` are the unit directions of the track, None without a beam."""
         antennas = lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
         range_m = pairwise_range_m(points_m, *antennas)
         step_m = float(np.ptp(points_m, axis=0).max() / max(math.sqrt(len(points_m)) - 1, 1.0))
@@ -200,9 +207,9 @@ class _SampledRanges:
     def antennas_m(
         self, effects: tuple[str, ...]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Fitted transmitters and receivers at rest without some effects, [channels, 3].
+        """Return transmitters and receivers at rest, fitted without some effects, [channels, 3].
 
-        Without `APART` both are one antenna; otherwise the transmitter stays.
+        If `effects` include `APART`, both are one antenna. Otherwise the transmitter stays.
         """
         lines = self.lines
         if APART in effects or np.array_equal(lines.tx_m, lines.rx_m):
@@ -214,7 +221,7 @@ class _SampledRanges:
         return lines.tx_m, _fit_positions(self.points_m, back_m, self.visible, lines.rx_m)
 
     def errors(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> tuple[float, float]:
-        """Largest error of ranges (metres) and of sines of aspect angles with other antennas."""
+        """Return the largest errors of ranges, metres, and of aspect sines with other antennas."""
         error_m = pairwise_range_m(self.points_m, tx_m, rx_m) - self.range_m
         largest_m = float(np.abs(error_m).max(where=self.visible, initial=0.0))
         if self.beam is None or self.along is None:
@@ -234,9 +241,9 @@ def _fitted(
     highest: float,
     most: float,
 ) -> tuple[RangeLines, float] | None:
-    """Lines with simpler antennas and the amplitude of their error, or None if it exceeds `most`.
+    """Return lines with simpler antennas and their error amplitude; None if it exceeds `most`.
 
-    Some channels are checked first, which rules out most geometries.
+    Some channels are checked first, which rules out most geometries quickly.
     """
     along = None if beam is None else beam.directions(lines)
     points_m, dense_m = grid.spread(_POINTS), grid.spread(_CHECKED_POINTS)
@@ -244,7 +251,7 @@ def _fitted(
     if beam is not None and along is not None:
         some = some_channels(lines.channels, 4 * _CHECKED_CHANNELS)
         sine = sines(dense_m, lines.phase_centres_m[some], along[some])
-        fullness = beam.fullness(sine, _wavelength_m(lines), len(some) / lines.channels)
+        fullness = beam.fullness(sine, wavelength_m(lines), len(some) / lines.channels)
 
     def amplitude(range_m: float, sine: float) -> float:
         weights = 0.0 if beam is None else math.sqrt(_shift_error(beam, sine, lines)) / fullness
@@ -274,7 +281,7 @@ def _fitted(
 
 
 def _checked_channels(lines: RangeLines) -> NDArray[np.int64]:
-    """Channels spread evenly, both ends of the track, the widest separation and the fastest."""
+    """Return channels to check: evenly spread, the ends, the widest separation, the fastest."""
     distance_m = np.linalg.norm(lines.rx_m - lines.tx_m, axis=1)
     extreme = [0, lines.channels - 1, int(distance_m.argmax())]
     if lines.rx_velocity_m_s is not None:
@@ -288,9 +295,9 @@ def _fit_positions(
     visible: NDArray[np.bool_],
     start_m: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Positions whose distances from points fit ranges by least squares, [channels, 3].
+    """Return positions whose distances from points fit ranges by least squares, [channels, 3].
 
-    Gauss-Newton iterations from `start_m`, over the visible points [points, channels].
+    Gauss-Newton iterations start from `start_m` and use the visible points, [points, channels].
     """
     position_m = start_m.T.copy()
     weights = visible.astype(np.float64)
@@ -311,26 +318,22 @@ def _fit_positions(
 
 
 def _shift_error(beam: BeamWindow, shift: float, lines: RangeLines) -> float:
-    """Relative error power of a beam's weights whose sines are shifted."""
+    """Return the relative error power of beam weights whose sines are shifted."""
     low, high = np.clip(beam.limits, -1, 1)
     sine = np.linspace(low, high, _WEIGHTS + 2)[1:-1]
-    weights = beam.weights(sine, _wavelength_m(lines))
+    weights = beam.weights(sine, wavelength_m(lines))
     smooth = np.mean((np.gradient(weights, sine) * shift) ** 2)
     jumps = (weights[0] ** 2 + weights[-1] ** 2) * abs(shift) / (high - low)
     return float((smooth + jumps) / np.mean(weights**2))
 
 
-def _wavelength_m(lines: RangeLines) -> float:
-    return lines.sound_speed_m_s / lines.carrier_hz if lines.carrier_hz else math.inf
-
-
 def _with_directions(beam: BeamWindow | None, lines: RangeLines) -> BeamWindow | None:
-    """Return a beam with the directions of the lines' track."""
+    """Return a beam with the track directions of the lines."""
     return None if beam is None else replace(beam, along=beam.directions(lines))
 
 
 def _relief_m(lines: RangeLines, grid: Grid, most_m: float) -> float:
-    """Largest range error without a grid's relief, or infinity if it is far above `most_m`.
+    """Return the largest range error without relief; infinity if it is far above `most_m`.
 
     Heights change ranges by the sine of the depression angle.
     """
@@ -344,7 +347,7 @@ def _relief_m(lines: RangeLines, grid: Grid, most_m: float) -> float:
             steepest = max(
                 steepest, float((down_m / np.maximum(cdist(points_m, ends_m), 1e-30)).max())
             )
-        share[2] = min(1.1 * steepest + 1e-3, 1.0)  # with a margin for pixels in between
+        share[2] = min(1.1 * steepest + 1e-3, 1.0)  # with a margin for pixels between the points
     # A few pixels are enough to rule out most grids with relief.
     few = grid.window(*(slice(None, None, max(n // 32, 1)) for n in grid.shape))
     if np.linalg.norm(share * relief_of(few)) > 4 * most_m:
@@ -353,7 +356,7 @@ def _relief_m(lines: RangeLines, grid: Grid, most_m: float) -> float:
 
 
 def _coordinates(grid: Grid) -> list[tuple[int, NDArray[np.float64]]]:
-    """Axes and coordinates of pixels that may lie off a plane, [rows, columns] each."""
+    """Return axes and coordinates of pixels that may lie off a plane, [rows, columns] each."""
     if grid.height_m is not None:
         return [(2, grid.height_m)]
     assert grid.points_m is not None
@@ -362,10 +365,10 @@ def _coordinates(grid: Grid) -> list[tuple[int, NDArray[np.float64]]]:
 
 
 def _lattice(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Corner and steps of the plane that fits a grid's coordinates by least squares, [3] each.
+    """Return corner and steps of the plane fitted to a grid by least squares, [3] each.
 
-    For a height map they add to those of the plane below it. Since rows and columns are regular,
-    the two slopes are independent of each other.
+    For a height map they add to the vectors of the plane below it. Because rows and columns are
+    regular, the two slopes are independent of each other.
     """
     corner, steps = np.zeros(3), np.zeros((2, 3))
     for axis, values in _coordinates(grid):
@@ -378,7 +381,7 @@ def _lattice(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64], NDAr
 
 
 def _plane(grid: Grid) -> Grid | None:
-    """Return the plane that fits a grid, or None if its pixels would coincide."""
+    """Return the plane fitted to a grid, or None if its pixels would coincide."""
     corner, rows, columns = _lattice(grid)
     if grid.height_m is not None:
         origin_m, row_step_m, column_step_m = grid.vectors_m

@@ -17,7 +17,7 @@ from clsas.core.fourier import fourier_integral
 BARKER_13 = (1, 1, 1, 1, 1, -1, -1, 1, 1, -1, 1, -1, 1)
 
 PASSBAND = 0.8
-"""Share of the sampled band that the receiver passes unchanged. Above it the anti-alias filter
+"""Share of the sampled band that the receiver passes unchanged. Above it, the anti-alias filter
 falls smoothly to zero at half the sample rate."""
 
 
@@ -26,26 +26,36 @@ class Pulse:
     """Transmitted pulse: a linear chirp or a binary phase code.
 
     The pulse lasts from t = 0 to `duration_s`. Its complex envelope p(t), relative to the carrier,
-    has amplitude 1 ([5] and section 2.1).
+    has amplitude 1 (Ødegaard 2004, equation [5] and section 2.1).
 
     Parameters
     ----------
     carrier_hz : float
-        Centre frequency.
+        Centre frequency, hertz.
     bandwidth_hz : float
-        Bandwidth of a chirp; chips/duration of a phase code. At most 2 `carrier_hz`.
+        Bandwidth of a chirp, or chips/duration of a phase code, hertz. At most twice `carrier_hz`.
     duration_s : float
-        Length of the pulse.
+        Length of the pulse, seconds.
     code : {"up", "down"} or tuple of +1 and -1
         Chirp with rising or falling frequency, or the chips of a binary phase code.
     taper : float
-        Fraction 0..1 of the duration with a cosine (Tukey) taper, half of it at each end; 0 is
-        rectangular.
+        Fraction of the duration, 0 to 1, with a cosine (Tukey) taper, half of it at each end. With
+        0 the envelope is rectangular.
 
     Raises
     ------
     TypeError, ValueError
         If a value is not a number or is outside its limits, or chips are not +1 and -1.
+
+    Examples
+    --------
+    A chirp of 1 ms and 20 kHz on 100 kHz, and a Barker code of the same length:
+
+    >>> import clsas
+    >>> clsas.Pulse(carrier_hz=100e3, bandwidth_hz=20e3, duration_s=1e-3)
+    Pulse(carrier 100 kHz, bandwidth 20 kHz, duration 1 ms, code 'up', taper 0)
+    >>> clsas.Pulse.phase_code(100e3, 1e-3).bandwidth_hz
+    13000.0
     """
 
     carrier_hz: float
@@ -89,7 +99,24 @@ class Pulse:
         *,
         taper: float = 0.0,
     ) -> Pulse:
-        """Return a binary phase code whose chips divide the duration evenly."""
+        """Return a binary phase code whose chips divide the duration evenly.
+
+        Parameters
+        ----------
+        carrier_hz : float
+            Centre frequency, hertz.
+        duration_s : float
+            Length of the pulse, seconds.
+        chips : tuple of +1 and -1
+            The code; by default the Barker code of 13 chips.
+        taper : float
+            As for `Pulse`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As for `Pulse`, or if a chip is shorter than half a period of the carrier.
+        """
         duration = validate.positive("duration_s", duration_s, "s")
         chips = _chips("chips", chips)
         carrier = validate.positive("carrier_hz", carrier_hz, "Hz")
@@ -101,7 +128,12 @@ class Pulse:
         return cls(carrier, len(chips) / duration, duration, chips, taper)
 
     def envelope(self, time_s: ArrayLike) -> NDArray[np.complex128]:
-        """Return the complex envelope p(t); zero before t = 0 and after the duration.
+        """Return the complex envelope p(t), which is zero before t = 0 and after the duration.
+
+        Parameters
+        ----------
+        time_s : array_like
+            Times from the start of the pulse, seconds.
 
         Raises
         ------
@@ -124,16 +156,23 @@ class Pulse:
         return np.where(inside, value, 0)
 
     def spectrum(self, frequency_hz: ArrayLike) -> NDArray[np.complex128]:
-        """Return P(f), the integral of p(t) exp(-j 2 pi f t) dt, in seconds.
+        """Return the spectrum P(f), the integral of p(t) exp(-j 2 pi f t) dt, seconds.
 
-        Frequencies are relative to the carrier. The quadrature between the edges of chips and taper
-        is accurate to 1e-12 of the largest value returned.
+        Parameters
+        ----------
+        frequency_hz : array_like
+            Frequencies relative to the carrier, hertz.
 
         Raises
         ------
         TypeError, ValueError
-            If the frequencies are not finite real numbers, or so high that the quadrature does not
-            fit into memory.
+            If the frequencies are not finite real numbers, or are so high that the quadrature does
+            not fit into memory.
+
+        Notes
+        -----
+        The quadrature runs between the edges of chips and taper. It is accurate to 1e-12 of the
+        largest value returned.
         """
         frequency = validate.array("frequency_hz", frequency_hz, np.float64, None)
         chips = 1 if isinstance(self.code, str) else len(self.code)
@@ -155,31 +194,39 @@ class Pulse:
 class Sonar:
     """Transmitter and receivers of a platform.
 
-    Positions are in the platform's frame: x forward, y to port (the side of a broadside beam), z
-    up.
+    Positions are in the frame of the platform: x forward, y to port (the side of a broadside beam),
+    z up.
 
     Parameters
     ----------
     pulse : Pulse
         Transmitted pulse.
     rx_m : array_like, [receivers, 3]
-        Receiver positions.
+        Receiver positions, metres.
     tx_m : array_like, [3]
-        Transmitter position; by default the origin.
+        Transmitter position, metres; by default the origin.
     sample_rate_hz : float, optional
-        Rate of the complex baseband samples; by default twice the pulse's bandwidth. It must be at
-        least 1.25 bandwidths, so that the receiver's filter passes the band unchanged.
+        Rate of the complex baseband samples, hertz. The default is twice the bandwidth of the
+        pulse. It must be at least 1.25 bandwidths, so that the filter of the receiver passes the
+        band unchanged.
     sound_speed_m_s : float
-        Speed of sound.
+        Speed of sound, metres per second.
     tx_length_m, rx_length_m : float, optional
-        Element lengths along x. None: the element is omnidirectional in azimuth.
+        Element lengths along x, metres. An element without a length is omnidirectional in azimuth.
     tx_height_m, rx_height_m : float, optional
-        Element heights. None: the element is omnidirectional in elevation.
+        Element heights, metres. An element without a height is omnidirectional in elevation.
 
     Raises
     ------
     TypeError, ValueError
         If a value has the wrong type or shape, is not finite or is outside its limits.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> pulse = clsas.Pulse(carrier_hz=100e3, bandwidth_hz=20e3, duration_s=1e-3)
+    >>> clsas.Sonar(pulse, rx_m=[[-0.1, 0, 0], [0.1, 0, 0]], rx_length_m=0.2)
+    Sonar(2 receivers over 0.2 m, carrier 100 kHz, bandwidth 20 kHz, elements of 0.2 m)
     """
 
     pulse: Pulse
@@ -192,7 +239,7 @@ class Sonar:
     tx_height_m: float | None = None
     rx_height_m: float | None = None
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,
@@ -212,7 +259,7 @@ class Sonar:
             raise TypeError(f"pulse must be a clsas.Pulse, got {type(self.pulse).__name__}")
         band = self.pulse.bandwidth_hz
         rate = 2 * band if self.sample_rate_hz is None else self.sample_rate_hz
-        # A rate of exactly 1.25 bandwidths may have a rounding error.
+        # A rate of exactly 1.25 bandwidths may be rounded down.
         least = band / PASSBAND * (1 - 1e-12)
         fields = {
             "rx_m": validate.array("rx_m", self.rx_m, np.float64, (None, 3)),
@@ -246,7 +293,7 @@ class Sonar:
 
     @property
     def wavelength_m(self) -> float:
-        """Wavelength at the carrier."""
+        """Wavelength of the carrier, metres."""
         return self.sound_speed_m_s / self.pulse.carrier_hz
 
     @property
@@ -263,23 +310,24 @@ class Sonar:
 
     @classmethod
     def thesis_wide_beam(cls) -> Sonar:
-        """Return the thesis's wide-beam sonar (chapter 5).
+        """Return the wide-beam sonar of Ødegaard (2004, chapter 5).
 
-        1 MHz (wavelength 1.5 mm), 15 mm elements, 64 receivers. The 640 phase centres of 10 pings
-        over 5.28 m are 8.25 mm apart. Receivers are therefore 16.5 mm apart, and the platform
-        advances 0.528 m per ping. The thesis gives neither bandwidth nor pulse. This sonar has a
-        chirp of 1 ms and 100 kHz, which resolves 7.5 mm in range as in azimuth.
+        It has 64 receivers of 15 mm at 1 MHz (wavelength 1.5 mm). The 640 phase centres of 10 pings
+        over 5.28 m are 8.25 mm apart, so receivers are 16.5 mm apart and the platform advances
+        0.528 m per ping. The thesis gives neither bandwidth nor pulse. A chirp of 1 ms and 100 kHz
+        is chosen here, which resolves 7.5 mm in range, as the elements do in azimuth.
         """
         pulse = Pulse(carrier_hz=1e6, bandwidth_hz=100e3, duration_s=1e-3)
         return cls(pulse, line_array(64, 16.5e-3), tx_length_m=15e-3, rx_length_m=15e-3)
 
     @classmethod
     def edgetech(cls) -> Sonar:
-        """Return the Edgetech SAS on HUGIN (chapter 6).
+        """Return the Edgetech SAS on HUGIN (Ødegaard 2004, chapter 6).
 
-        125 kHz, 15 kHz bandwidth, 6 receivers of together 1.2012 m, which resolve 10 cm by 10 cm.
-        The thesis does not give the 5 ms chirp, nor the transmitter, here as long as a receiver and
-        in the middle of the array.
+        It has 6 receivers with a total length of 1.2012 m at 125 kHz, and a bandwidth of 15 kHz.
+        The resolution is 10 cm by 10 cm. The thesis gives neither the pulse nor the transmitter.
+        The chirp of 5 ms, and a transmitter as long as a receiver in the middle of the array, are
+        choices.
         """
         pulse = Pulse(carrier_hz=125e3, bandwidth_hz=15e3, duration_s=5e-3)
         length = 1.2012 / 6
@@ -287,12 +335,12 @@ class Sonar:
 
     @classmethod
     def sensotek(cls) -> Sonar:
-        """Return one receiver bank of the SENSOTEK SAS for HUGIN (chapter 6).
+        """Return one receiver bank of the SENSOTEK SAS for HUGIN (Ødegaard 2004, chapter 6).
 
-        96 elements of one wavelength. The thesis does not give the carrier. 100 kHz follows from
-        "270 m range at 1.5 m/s with an overlap of 24 elements": 72 phase centres of half a
-        wavelength in 2 * 270/1500 s. The bandwidth is "up to 50 kHz"; 37.5 kHz gives the quoted
-        resolution of 2 cm. The 5 ms chirp and a transmitter like a receiver are choices.
+        It has 96 elements of one wavelength. The thesis does not give the carrier. 100 kHz follows
+        from "270 m range at 1.5 m/s with an overlap of 24 elements", that is 72 phase centres of
+        half a wavelength in 2 * 270/1500 s. The bandwidth is "up to 50 kHz"; 37.5 kHz gives the
+        quoted resolution of 2 cm. The chirp of 5 ms and a transmitter like a receiver are choices.
         """
         pulse = Pulse(carrier_hz=100e3, bandwidth_hz=37.5e3, duration_s=5e-3)
         length = 1500.0 / 100e3
@@ -315,7 +363,7 @@ def _chips(name: str, value: object) -> tuple[int, ...]:
 
 
 def line_array(receivers: int, spacing_m: float) -> NDArray[np.float64]:
-    """Return positions [receivers, 3] along x, centred on the origin."""
+    """Return the positions of equally spaced receivers along x, centred on the origin, [n, 3]."""
     receivers = validate.count("receivers", receivers)
     validate.memory("receivers", 240 * receivers)  # including the paths of one ping
     spacing = validate.positive("spacing_m", spacing_m, "m")
@@ -336,22 +384,24 @@ def element_pattern(
     Parameters
     ----------
     size_m : float
-        Length L of the element along an axis.
+        Length L of the element along an axis, metres.
     sine : array_like
-        sin theta, the direction's component along this axis.
+        sin theta, the component of the direction along this axis.
     frequency_hz : array_like
-        Acoustic frequency (carrier included); broadcasts with `sine`.
+        Acoustic frequency (carrier included), hertz; broadcasts with `sine`.
     sound_speed_m_s : float
-        Speed of sound.
+        Speed of sound, metres per second.
     dtype : numpy.float64 or numpy.float32
-        Type of the result. Single precision is several times faster; its error is at most 1e-7.
+        Type of the result. Single precision is several times faster, with errors of at most 1e-7.
 
     Returns
     -------
-    array of `dtype`, 1 on the beam axis, negative in every other side lobe.
+    array of `dtype`
+        1 on the beam axis, negative in every other side lobe.
     """
     phase = np.multiply(np.pi * size_m / sound_speed_m_s * np.asarray(frequency_hz), sine)
-    # Rounded here and not before: the rounding error of sin(x) grows with x, that of sin(x)/x does
-    # not. The smallest positive number in place of 0 gives exactly 1.
+    # The phase is rounded only here, where sine and denominator have the same x: the error of
+    # sin(x) due to rounding x grows with x, that of sin(x)/x does not. The smallest positive number
+    # replaces 0 and gives exactly 1.
     x = np.maximum(np.abs(phase).astype(dtype), np.finfo(dtype).tiny)
     return np.sin(x) / x

@@ -1,4 +1,4 @@
-"""Tracks: the platform's pose at every ping, the channels' positions and the beams' directions."""
+"""Tracks: poses of the platform, positions of the channels, and directions of the beam."""
 
 from __future__ import annotations
 
@@ -18,29 +18,42 @@ Motion = float | ArrayLike | Callable[[NDArray[np.float64]], ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Pose of the platform at the time of every ping.
+    """Pose of the platform at every ping.
 
-    World coordinates are x along-track, y across-track, z up. The platform's frame is x forward, y
-    to port, z up. Yaw about z, then pitch about the turned y, then roll about the turned x
-    (intrinsic z-y'-x'') rotate it into the world. All are right-handed: positive yaw turns the bow
-    to port, positive pitch lowers the bow, positive roll lifts port.
+    World coordinates are x along-track, y across-track, z up. In the frame of the platform x is
+    forward, y to port, z up. Yaw about z, then pitch about the turned y, then roll about the turned
+    x (intrinsic z-y'-x'') rotate this frame into the world. All rotations are right-handed:
+    positive yaw turns the bow to port, positive pitch lowers the bow, positive roll lifts the port
+    side.
 
     Parameters
     ----------
     positions_m : array_like, [pings, 3]
-        Position of the platform's origin at transmission.
+        Position of the platform's origin at transmission, metres.
     time_s : array_like, [pings]
-        Time of each transmission, strictly ascending.
+        Time of each transmission, seconds, strictly ascending.
     velocity_m_s : array_like, [pings, 3] or [3]
-        Velocity of the platform during each echo's flight; zero by default. It is used only with
-        motion during flight.
+        Velocity of the platform while the sound of each ping travels, metres per second; zero by
+        default. It is used only with motion during flight.
     yaw_rad, pitch_rad, roll_rad : array_like, [pings] or scalar
-        Attitude; zero by default.
+        Attitude, radians; zero by default.
 
     Raises
     ------
     TypeError, ValueError
-        If an array has the wrong type or shape or is not finite, or time does not ascend.
+        If an array has the wrong type or shape or is not finite, or the times do not ascend.
+
+    Examples
+    --------
+    A straight course at 2 m/s with 10 pings, and a sway of 2 cm:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> clsas.Track.straight(
+    ...     [0, 0, 0], [2, 0, 0], pings=10, ping_interval_s=0.25,
+    ...     sway_m=lambda time_s: 0.02 * np.sin(time_s),
+    ... )
+    Track(10 pings in 2.25 s, x 0 to 4.5 m, y 0 to 0.01995 m, z 0 m)
     """
 
     positions_m: NDArray[np.float64]
@@ -50,7 +63,7 @@ class Track:
     pitch_rad: NDArray[np.float64] = 0.0  # type: ignore[assignment]
     roll_rad: NDArray[np.float64] = 0.0  # type: ignore[assignment]
 
-    if TYPE_CHECKING:  # arrays are converted: the constructor takes what holds numbers
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
 
         def __init__(
             self,
@@ -91,7 +104,7 @@ class Track:
         return len(self.positions_m)
 
     def __repr__(self) -> str:
-        """Return the number of pings, the time they take and where they lie."""
+        """Return the number of pings, their duration and their extents."""
         place_m = self.positions_m
         time_s = float(self.time_s[-1] - self.time_s[0])
         return reprs.summary(
@@ -121,25 +134,25 @@ class Track:
         pitch_rad: Motion = 0.0,
         roll_rad: Motion = 0.0,
     ) -> Track:
-        """Return a straight course at constant speed with added motion.
+        """Return a straight course at constant speed, with motion added to it.
 
         Parameters
         ----------
         start_m : array_like, [3]
-            Position at the first ping, at time 0, without added motion.
+            Position at the first ping, at time 0, without the added motion, metres.
         velocity_m_s : array_like, [3]
-            Velocity along the course. The heading is its horizontal direction, or x if the
-            horizontal velocity is zero.
+            Velocity along the course, metres per second. The heading is its horizontal direction,
+            or x if the horizontal velocity is zero.
         pings : int
             Number of pings.
         ping_interval_s : float
-            Time from ping to ping.
+            Time between pings, seconds.
         surge_m, sway_m, heave_m : number, array_like [pings], or function
-            Displacement forward along the heading, to port, and up. A function takes the times,
-            float64 [pings], and returns the displacements. Their time derivative (central
-            differences) is added to the track's velocity.
+            Displacement forward along the heading, to port, and up, metres. A function takes the
+            times, float64 [pings], and returns the displacements. Their time derivative (central
+            differences) is added to the velocity of the track.
         yaw_rad, pitch_rad, roll_rad : number, array_like [pings], or function
-            Attitude relative to the level heading.
+            Attitude relative to the level heading, radians.
 
         Raises
         ------
@@ -178,7 +191,7 @@ class Channels(NamedTuple):
     rx_velocity_m_s: NDArray[np.float64] | None
 
     def __repr__(self) -> str:
-        """Return the number of channels and where the receivers lie."""
+        """Return the number of channels and the extents of the receivers."""
         return reprs.summary(
             self,
             f"{len(self.rx_m)} channels",
@@ -192,28 +205,38 @@ def channels(sonar: Sonar, track: Track, *, motion_in_flight: bool = False) -> C
     Parameters
     ----------
     sonar : Sonar
-        Elements on the platform.
+        Sonar with its elements on the platform.
     track : Track
         Poses of the platform.
     motion_in_flight : bool
-        Also return the receivers' velocity. This is the platform's velocity; rotation during an
-        echo's flight is neglected.
+        If True, also return the velocity of the receivers. This is the velocity of the platform.
+        Rotation while the sound travels is neglected.
 
     Returns
     -------
     Channels
-        tx_m, rx_m and rx_velocity_m_s, which is None without motion in flight. The channel's number
-        is ping * receivers + receiver.
+        Named tuple of `tx_m`, `rx_m` and `rx_velocity_m_s`, float64 [channels, 3] each. The
+        velocity is None without motion in flight. The number of a channel is
+        ping * receivers + receiver.
 
     Raises
     ------
     TypeError, ValueError
         If an argument has the wrong type, or the channels do not fit into memory.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> pulse = clsas.Pulse(carrier_hz=100e3, bandwidth_hz=20e3, duration_s=1e-3)
+    >>> sonar = clsas.Sonar(pulse, rx_m=[[-0.1, 0, 0], [0.1, 0, 0]])
+    >>> track = clsas.Track.straight([0, 0, 0], [2, 0, 0], pings=10, ping_interval_s=0.1)
+    >>> clsas.channels(sonar, track)
+    Channels(20 channels, receivers at x -0.1 to 1.9 m, y 0 m, z 0 m)
     """
     validate.instance("sonar", sonar, Sonar)
     validate.instance("track", track, Track)
     motion_in_flight = validate.flag("motion_in_flight", motion_in_flight)
-    # Nine numbers per channel, and the ranges to some points that every caller computes.
+    # Nine numbers per channel, and the ranges to some points, which every caller computes.
     validate.memory("sonar and track", 300 * track.pings * sonar.receivers)
     turn = track.rotations.as_matrix()
     tx = track.positions_m + turn @ sonar.tx_m
@@ -227,16 +250,29 @@ def channels(sonar: Sonar, track: Track, *, motion_in_flight: bool = False) -> C
 class Pointing:
     """Direction of the beam axis, to which element patterns refer.
 
-    Use `broadside`, `squint`, `scan` or `spot`. Elements turn as a whole with their beam.
+    Create one with `broadside`, `squint`, `scan` or `spot`. Elements turn as a whole with their
+    beam.
 
     Parameters
     ----------
     squint_rad : tuple of float
-        Angles forward of broadside (port), one per ping, repeated.
+        Angles forward of broadside (port), radians, one per ping. They repeat if there are more
+        pings.
     depression_rad : float
-        Angle of the axis below the platform's horizontal plane.
+        Angle of the axis below the platform's horizontal plane, radians.
     spot_m : tuple of three floats, optional
-        World position at which the axis points, in place of the angles.
+        World position at which the axis points, metres, instead of the angles.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value has the wrong type or shape, or is not finite.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> clsas.Pointing.squint(0.1, depression_rad=0.3)
+    Pointing(squint (0.1) rad, depression 0.3 rad)
     """
 
     squint_rad: tuple[float, ...] = (0.0,)
@@ -257,41 +293,41 @@ class Pointing:
 
     @classmethod
     def broadside(cls, *, depression_rad: float = 0.0) -> Pointing:
-        """Point to port, perpendicular to the platform."""
+        """Return a beam that points to port, perpendicular to the platform."""
         return cls(depression_rad=depression_rad)
 
     @classmethod
     def squint(cls, angle_rad: float, *, depression_rad: float = 0.0) -> Pointing:
-        """Point forward of broadside by an angle (aft if negative)."""
+        """Return a beam that points forward of broadside by an angle (aft if negative)."""
         return cls((validate.number("angle_rad", angle_rad, "rad"),), depression_rad)
 
     @classmethod
     def scan(cls, angles_rad: ArrayLike, *, depression_rad: float = 0.0) -> Pointing:
-        """Step through angles forward of broadside, one per ping, repeatedly."""
+        """Return a beam that steps through angles forward of broadside, one per ping, in turn."""
         angles = validate.array("angles_rad", angles_rad, np.float64, None)
         return cls(tuple(np.atleast_1d(angles).tolist()), depression_rad)
 
     @classmethod
     def spot(cls, point_m: ArrayLike) -> Pointing:
-        """Point at a fixed position in the world (spotlight)."""
+        """Return a beam that points at a fixed position in the world (spotlight)."""
         point = validate.array("point_m", point_m, np.float64, (3,))
         return cls(spot_m=tuple(point.tolist()))
 
     def axes(self, track: Track) -> NDArray[np.float64]:
-        """Return the elements' unit vectors in the world at every ping.
+        """Return the unit vectors of the elements in the world at every ping.
 
         Returns
         -------
         float64 array, [pings, 3 vectors, 3]
-            Direction of the element's length, beam axis, and direction of its height.
+            Direction of the element's length, its beam axis, and the direction of its height.
 
         Raises
         ------
         TypeError
             If `track` is not a Track.
         ValueError
-            If the spot lies straight ahead or astern: the direction of the element's length would
-            be undefined.
+            If the spot lies straight ahead or astern, where the direction of the element's length
+            is undefined.
         """
         validate.instance("track", track, Track)
         if self.spot_m is None:
@@ -324,7 +360,7 @@ def _at(name: str, motion: Motion, time: NDArray[np.float64]) -> NDArray[np.floa
 def _rate(
     name: str, motion: Motion, time: NDArray[np.float64], interval: float
 ) -> NDArray[np.float64]:
-    """Time derivative: local for a function, by differences between pings for an array."""
+    """Return the time derivative: local for a function, between pings for an array."""
     if callable(motion):
         step = 1e-3 * interval
         return (_at(name, motion, time + step) - _at(name, motion, time - step)) / (2 * step)

@@ -1,4 +1,4 @@
-"""Visibility: from which channels, or positions on a track, a beam touches points and boxes."""
+"""Visibility: the channels, or positions on a track, whose beam touches points and boxes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 _LEAST_DISTANCE_M = 1e-9
-_ANY_DIRECTION = 4.0  # exceeds any difference of two sines
-_PAIRS_AT_ONCE = 1 << 16  # of boxes and runs: with half as many the search takes a tenth longer
+_ANY_DIRECTION = 4.0  # larger than any difference of two sines
+# Pairs of boxes and runs that are tested together. With half as many the search takes a tenth
+# longer.
+_PAIRS_AT_ONCE = 1 << 16
 
 
 def sines(
@@ -23,20 +25,20 @@ def sines(
 ) -> NDArray[np.float64]:
     """Return the sine of every point's aspect angle at every channel, float64 [channels, points].
 
-    The sine is 0 at the phase centre itself.
+    The sine of a point at the phase centre itself is 0.
 
     Parameters
     ----------
     points_m : float64 [points, 3]
     phase_centres_m, along : float64 [channels, 3]
-        Phase centres and the track's unit directions.
+        Phase centres, and unit directions of the track there.
     """
     return _sines(points_m, phase_centres_m, along)[0].T
 
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """Boxes whose sides have common directions.
+    """Boxes whose sides have the same directions.
 
     Attributes
     ----------
@@ -44,7 +46,7 @@ class Boxes:
     axes_m : float64 [axes, 3]
         Directions of the sides.
     half : float64 [boxes, axes] or [1, axes]
-        Half the sides, in lengths of the axes.
+        Half the length of the sides, as a multiple of the length of the axes.
     """
 
     centres_m: NDArray[np.float64]
@@ -53,7 +55,7 @@ class Boxes:
 
     @classmethod
     def equal(cls, centres_m: NDArray[np.float64], half_m: NDArray[np.float64]) -> Boxes:
-        """Return boxes of one size; `half_m` holds half their sides as vectors, [axes, 3]."""
+        """Return boxes of one size; `half_m` contains half their sides as vectors, [axes, 3]."""
         return cls(centres_m, half_m, np.ones((1, len(half_m))))
 
     def __len__(self) -> int:
@@ -68,12 +70,12 @@ class Boxes:
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """Aspect angles of points, and of boxes around them, from positions on a track.
+    """Aspect angles of points, and of boxes around them, at positions on a track.
 
     Attributes
     ----------
     sine, inverse_m : float64 [points, positions]
-        Sine of the aspect angle of a point, and one over its distance.
+        Sine of the aspect angle of a point, and the inverse of its distance.
     axes_m : float64 [axes, 3]
         Directions of the boxes' sides.
     slopes : float64 [axes, points, positions]
@@ -100,7 +102,7 @@ class Visibility:
         points_m : float64 [points, 3]
         axes_m : float64 [axes, 3]
         track_m, along : float64 [positions, 3]
-            Positions on the track, and its unit direction there.
+            Positions on the track, and its unit directions there.
         """
         sine, distance_m = _sines(points_m, track_m, along)
         towards_m = (axes_m @ points_m.T)[..., None] - (axes_m @ track_m.T)[:, None]
@@ -115,10 +117,10 @@ class Visibility:
         along: NDArray[np.float64],
         index: NDArray[np.int64],
     ) -> Visibility:
-        """Return the visibility of points, each from positions of its own.
+        """Return the visibility of points, each from its own positions.
 
-        Parameters are those of `of`, and `index`, int64 [points, positions]: the positions' numbers
-        for each point.
+        Parameters are those of `of`, and `index`, int64 [points, positions]: the numbers of the
+        positions for each point.
         """
         of_positions = (track_m.T, along.T, axes_m @ track_m.T, axes_m @ along.T)
         gathered = np.take(np.concatenate(of_positions), index, axis=1)
@@ -139,7 +141,7 @@ class Visibility:
         towards_m: NDArray[np.float64],
         along_axes: NDArray[np.float64],
     ) -> Visibility:
-        """Return it from the components of the lines of sight and of the track along the axes."""
+        """Return the visibility, given lines of sight and track directions along the axes."""
         inverse_m = 1 / np.maximum(distance_m, _LEAST_DISTANCE_M, out=distance_m)
         slopes = towards_m
         for slope, along in zip(slopes, along_axes, strict=True):
@@ -157,20 +159,23 @@ class Visibility:
         around_m: float | NDArray[np.float64] = 0.0,
         spread: float | NDArray[np.float64] = 0.0,
     ) -> NDArray[np.float64]:
-        """Depth by which boxes around the points may reach into a beam, [points, positions].
-
-        The depth is an upper bound in sine of the aspect angle. It is negative where no part of
-        the box lies in the beam.
+        """Return the depth to which boxes around the points may reach into a beam.
 
         Parameters
         ----------
         limits : (low, high)
             Sines of the aspect angle at which the beam begins and ends.
         half : float64 [axes], [1, axes] or [points, axes]
-            Half the boxes' sides, in lengths of the axes.
+            Half the sides of the boxes, as a multiple of the length of the axes.
         around_m, spread : float or float64 [positions]
-            A position stands for others within this distance, whose directions differ from its
-            own by a vector of at most this length.
+            Bounds for the positions that each position represents: their distance from it, metres,
+            and the length of the difference of their directions.
+
+        Returns
+        -------
+        float64 [points, positions]
+            Upper bound of the depth, in sine of the aspect angle. It is negative where no part of
+            the box lies in the beam.
         """
         low, high = limits
         half = np.atleast_2d(half)
@@ -181,15 +186,15 @@ class Visibility:
             reach += each[:, None] * slope
         if np.any(around_m) or np.any(spread):
             ratio = np.minimum(around_m * self.inverse_m, 0.5)
-            # Seen from closer, the box fills a larger angle.
+            # From a closer position, the box fills a larger angle.
             reach += ratio + ratio * ratio * ratio
             reach /= 1 - ratio
             reach += spread
-            # From half the distance it may lie in any direction.
+            # From half the distance, the box may lie in any direction.
             wide += 2 * ratio
-        # So may its parts, seen from inside the ball around it.
+        # From inside the ball around the box, its parts may lie in any direction.
         np.copyto(reach, _ANY_DIRECTION, where=wide >= 1)
-        # The depth past the nearer limit, which is the smaller of the two depths.
+        # Add the depth past the nearer limit, which is the smaller of the two depths.
         reach -= np.abs(self.sine - (low + high) / 2)
         reach += (high - low) / 2
         return reach
@@ -197,11 +202,12 @@ class Visibility:
 
 @dataclass(frozen=True, eq=False)
 class BeamTrack:
-    """Positions along a track with the beam that each carries.
+    """Positions along a track, each with its beam.
 
-    The type answers from which positions the beam touches boxes, coarse to fine: first for runs
-    of positions together, then for the single positions of the runs that matter. Its bounds are
-    safe: a position whose beam touches a box is never missed, and a few others may be found.
+    The methods find the positions from which the beam touches boxes, from coarse to fine: first for
+    whole runs of consecutive positions, then for the single positions of the runs that matter. The
+    bounds are safe. A position whose beam touches a box is never missed, but a few others may be
+    returned.
 
     Attributes
     ----------
@@ -224,13 +230,13 @@ class BeamTrack:
     def run(self) -> int:
         """Number of positions in a run, a power of two.
 
-        Searching both ends of `count` positions costs count / run + 2 run tests, which is least
-        at this length.
+        Searching both ends of `count` positions takes count / run + 2 run tests. This length
+        minimises their number.
         """
         return 2 ** max(round(math.log2(self.count / 2) / 2), 0)
 
     def touching(self, boxes: Boxes) -> NDArray[np.bool_]:
-        """Return which boxes the beam touches from which positions, bool [boxes, positions]."""
+        """Return whether the beam touches each box from each position, bool [boxes, positions]."""
         found = np.zeros((len(boxes), self.count), np.bool_)
         box, run = np.nonzero(self._runs_touching(boxes))
         step = max(_PAIRS_AT_ONCE // self.run, 1)
@@ -247,10 +253,10 @@ class BeamTrack:
         return Spans(*np.concatenate(found, axis=1))
 
     def depth(self, boxes: Boxes, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return `Visibility.overlap` of each box at positions of its own, [boxes, positions].
+        """Return `Visibility.overlap` of each box at its own positions, [boxes, positions].
 
-        It is above 0 where the beam may touch the box. `index` holds the positions' numbers,
-        int64 [boxes, positions].
+        It is positive where the beam may touch the box. `index` contains the numbers of the
+        positions, int64 [boxes, positions].
         """
         centres_m = boxes.centres_m - self.position_m[0]
         visibility = Visibility.of_each(centres_m, boxes.axes_m, self._local_m, self.along, index)
@@ -258,14 +264,14 @@ class BeamTrack:
 
     @functools.cached_property
     def _local_m(self) -> NDArray[np.float64]:
-        """Positions about the first one: far from the origin, coordinates would cancel."""
+        """Positions relative to the first one; far from the origin, digits would cancel."""
         return self.position_m - self.position_m[0]
 
     @functools.cached_property
     def _runs(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-        """For each run, the position that stands for it, and how far the others may differ.
+        """For each run, its representative position, and how far the others differ from it.
 
-        That is their largest distance from it, and the largest change of direction.
+        The differences are the largest distance and the largest change of direction.
         """
         starts = np.arange(0, self.count, self.run)
         middle = np.minimum(starts + self.run // 2, self.count - 1)
@@ -277,7 +283,7 @@ class BeamTrack:
         return middle, around_m, spread
 
     def _runs_touching(self, boxes: Boxes) -> NDArray[np.bool_]:
-        """Return which boxes the beam may touch from anywhere in which runs, [boxes, runs]."""
+        """Return whether the beam may touch each box from anywhere in each run, [boxes, runs]."""
         middle, around_m, spread = self._runs
         centres_m = boxes.centres_m - self.position_m[0]
         visibility = Visibility.of(
@@ -286,7 +292,7 @@ class BeamTrack:
         return visibility.overlap(self.limits, boxes.half, around_m, spread) > 0
 
     def _members(self, run: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the numbers of the positions in runs, [runs, run]; the last one is repeated."""
+        """Return the numbers of the positions in runs, [runs, run]; the last position repeats."""
         return np.minimum(self.run * run[:, None] + np.arange(self.run), self.count - 1)
 
     def _spans(self, boxes: Boxes) -> tuple[NDArray[np.int64], ...]:
@@ -307,7 +313,8 @@ class BeamTrack:
                 inside = self.depth(boxes[some], index) > 0
                 found = inside.any(axis=1)
                 edge[some[found]] = index[found, inside[found].argmax(axis=1)]
-                # A run may touch a box that none of its positions does: go on to the next one.
+                # A run may seem to touch a box although none of its positions does. Go on to the
+                # next run.
                 further = ~found & (run != stop[some])
                 some, run = some[further], run[further] + step
         earliest = np.where(ever, self.run * first_run, self.count)
@@ -321,10 +328,10 @@ class Spans(NamedTuple):
     Attributes
     ----------
     first, last : int64 [boxes]
-        First and last position; `first` is beyond `last` where no position touches the box.
+        First and last position. `first` is greater than `last` where no position touches the box.
     earliest, latest : int64 [boxes]
-        First and last position of the runs that may touch the box anywhere between their
-        positions; `earliest` is beyond `latest` where none does.
+        First and last position of the runs that may touch the box anywhere, also between their
+        positions. `earliest` is greater than `latest` where none does.
     """
 
     first: NDArray[np.int64]
@@ -334,7 +341,7 @@ class Spans(NamedTuple):
 
     @property
     def ranges(self) -> NDArray[np.int32]:
-        """First position and the one after the last, int32 [boxes, 2]; 0, 0 where none touches."""
+        """First position and the one after the last, int32 [boxes, 2]; both 0 if none touches."""
         found = self.first <= self.last
         return np.where(found, [self.first, self.last + 1], 0).T.astype(np.int32)
 
@@ -342,8 +349,8 @@ class Spans(NamedTuple):
 def _sines(
     points_m: NDArray[np.float64], centres_m: NDArray[np.float64], along: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sines of aspect angles (0 at distance 0) and distances, both [points, centres]."""
-    origin_m = centres_m[0]  # keeps coordinates small, which far from the origin would cancel
+    """Return sines of aspect angles (0 at distance 0) and distances, both [points, centres]."""
+    origin_m = centres_m[0]  # keeps coordinates small; far from the origin, digits would cancel
     distance_m = cdist(points_m, centres_m)
     sine = (points_m - origin_m) @ along.T
     sine -= np.einsum("ci,ci->c", centres_m - origin_m, along)

@@ -1,4 +1,4 @@
-"""Benchmarks: speed and errors of imaging on a device, for the built-in cases."""
+"""Benchmarks: speed and accuracy of imaging on a device, for the built-in cases."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from clsas.trials.dense_cases import DenseCase
 
 _PIXELS = 300  # random pixels at which errors are measured
 _VISIBILITY_PIXELS = 64  # along either side, at which the share of visible channels is evaluated
-_FAST_RUNS = 3  # runs per round of the fast methods: their times scatter most
+_FAST_RUNS = 3  # runs per round of the fast methods, whose times scatter most
 
 
 def run(
@@ -42,7 +42,7 @@ def run(
     repeats: int = 5,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Measure exact backprojection on a built-in case.
+    """Return speed and errors of exact backprojection for a built-in case.
 
     Parameters
     ----------
@@ -51,25 +51,25 @@ def run(
     device : Device, str or int, optional
         See `clsas.opencl.device.choose`.
     accuracy_db : float
-        As for `clsas.backproject`.
+        Requested accuracy, see `clsas.backproject`.
     repeats : int
-        Timed runs, after one that builds the kernels.
+        Number of timed runs, which follow one that builds the kernels.
     progress : callable, optional
         Called as progress(runs done, runs).
 
     Returns
     -------
     dict
-        Results in types of JSON.
+        Results as JSON types.
 
-        - `seconds`: the whole call of `clsas.backproject`, that is, the choice of the interpolator,
-          upsampling, references, transfers, kernels and reading the image back.
+        - `seconds`: time of the whole call of `clsas.backproject`, that is, choosing the
+          interpolator, upsampling, references, transfers, kernels and reading the image back.
         - `gbp_per_s`: 1e9 pixel-channel pairs per second, from the median of `seconds`.
-        - `kernel_seconds`: time in the backprojection kernel, the smallest of the runs.
+        - `kernel_seconds`: least time of a run in the backprojection kernel.
         - `gflop_per_s`: arithmetic rate of the kernel; `share_of_peak`: that rate over the rate of
           independent multiply-adds on the device.
-        - `rounding_error_db`: error of random pixels against a float64 sum with the same
-          interpolator; `true_error_db`: against the ideal sum of band-limited lines.
+        - `rounding_error_db`: error of random pixels relative to a float64 sum with the same
+          interpolator; `true_error_db`: relative to the ideal sum of band-limited lines.
     """
     validate.one_of("case", case, tuple(cases.EXACT_CASES))
     device = open_device(device)
@@ -125,25 +125,26 @@ def run_factorized(
     repeats: int = 5,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Measure factorized against exact imaging, in turns.
+    """Return speed and errors of factorized and exact imaging, measured in turns.
 
     Parameters
     ----------
-    case : str or Case
+    case : str, Case or DenseCase
         One of `clsas.trials.cases.FACTORIZED_CASES`, or another case.
     device : Device, str or int, optional
         See `clsas.opencl.device.choose`.
     tolerance_db : float
-        As for `clsas.plan`.
+        Requested tolerance, see `clsas.plan`.
     repeats : int
-        Timed rounds, after one that builds the kernels. A single round includes building them.
+        Number of timed rounds, which follow one that builds the kernels. A single round includes
+        building them.
     progress : callable, optional
         Called as progress(rounds done, rounds).
 
     Returns
     -------
     dict
-        Results in types of JSON.
+        Results as JSON types.
 
         - `seconds`: the whole call of `clsas.factorize` with a plan; `again_seconds`: a call of a
           `clsas.Imager` that has formed an image. Each runs three times in a round.
@@ -151,10 +152,10 @@ def run_factorized(
           `default_seconds`: with its default accuracy.
         - `speedup`: `exact_seconds` over `seconds`; `speedup_again`: `exact_seconds` over
           `again_seconds`; `speedup_over_default`: `default_seconds` over `seconds`;
-          `speedup_whole`: `exact_seconds` over `whole_seconds`; of medians.
-        - `plan_seconds`: planning, once; `whole_seconds`: planning and imaging, by
-          `clsas.factorize` with a tolerance.
-        - `error_db`: error against an exact image of -80 dB.
+          `speedup_whole`: `exact_seconds` over `whole_seconds`; all from medians.
+        - `plan_seconds`: time of planning, measured once; `whole_seconds`: time of planning and
+          imaging, by `clsas.factorize` with a tolerance.
+        - `error_db`: error relative to an exact image of -80 dB.
     """
     if isinstance(case, str):
         validate.one_of("case", case, tuple(cases.FACTORIZED_CASES))
@@ -186,12 +187,13 @@ def run_factorized(
         "samples": lines.length,
         "pixels": list(grid.shape),
         "tolerance_db": tolerance_db,
-        "seconds": first | {"included": "all of clsas.factorize, the plan given"},
+        "seconds": first | {"included": "all of clsas.factorize with a given plan"},
         "again_seconds": again | {"included": "the same, by an Imager that has formed an image"},
         "plan_seconds": plan_seconds,
         "whole_seconds": whole | {"included": "planning and imaging"},
-        "exact_seconds": exactly | {"included": "all of clsas.backproject, as accurate"},
-        "default_seconds": default | {"included": "the same, as accurate as by default"},
+        "exact_seconds": exactly
+        | {"included": "all of clsas.backproject, with an accuracy equal to the tolerance"},
+        "default_seconds": default | {"included": "the same, with the default accuracy"},
         "speedup": exactly["median"] / first["median"],
         "speedup_again": exactly["median"] / again["median"],
         "speedup_whole": exactly["median"] / whole["median"],
@@ -212,7 +214,9 @@ def run_mosaic(
     repeats: int = 3,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Measure a mosaic against exact imaging with and without a beam, in turns.
+    """Return speed and errors of a mosaic and of exact imaging, measured in turns.
+
+    Exact images are formed with and without a beam.
 
     Parameters
     ----------
@@ -221,26 +225,26 @@ def run_mosaic(
     device : Device, str or int, optional
         See `clsas.opencl.device.choose`.
     tolerance_db : float
-        As for `clsas.mosaic`.
+        Requested tolerance, see `clsas.mosaic`.
     repeats : int
         As for `run_factorized`.
     progress : callable, optional
-        Called as progress(done, total) while the lines are simulated, and then after every round.
+        Called as progress(done, total) while the lines are simulated, and after every round.
 
     Returns
     -------
     dict
-        Results in types of JSON.
+        Results as JSON types.
 
-        - `seconds`: all of `clsas.mosaic`, with planning, from lines in memory to the image in
+        - `seconds`: time of `clsas.mosaic` including planning, from lines in memory to the image in
           memory; three runs in a round.
-        - `exact_seconds`, `unlimited_seconds`: `clsas.backproject` with and without the beam, with
-          an accuracy equal to the tolerance; `default_unlimited_seconds`: without the beam, with
-          the default accuracy.
-        - `speedup`, `speedup_unlimited`, `speedup_over_default`: these three over `seconds`, of
-          medians.
+        - `exact_seconds`, `unlimited_seconds`: time of `clsas.backproject` with and without the
+          beam, with an accuracy equal to the tolerance; `default_unlimited_seconds`: without the
+          beam, with the default accuracy.
+        - `speedup`, `speedup_unlimited`, `speedup_over_default`: these three times over `seconds`,
+          from medians.
         - `share_seen`: share of all pixel-channel pairs within the beam.
-        - `error_db`: error against an exact image of -80 dB.
+        - `error_db`: error relative to an exact image of -80 dB.
         - `shadow_contrast_difference_db`: contrast of the wreck's shadow minus that in the exact
           image.
     """
@@ -305,10 +309,10 @@ def _in_turns(
     rounds: int,
     progress: Callable[[int, int], None] | None,
 ) -> dict[str, dict[str, float]]:
-    """Return statistics of the methods' seconds by name, from rounds of all methods.
+    """Return statistics of the seconds of every method by name, from rounds of all methods.
 
-    A name may occur several times in a round. One more round before builds the kernels, unless
-    there is only one.
+    A name may occur several times in a round. Unless there is only one round, another one precedes
+    them, which builds the kernels and is not counted.
     """
     taken: dict[str, list[float]] = {name: [] for name, _ in methods}
     warm = int(rounds > 1)
@@ -331,20 +335,20 @@ def _statistics(seconds: list[float]) -> dict[str, float]:
 def flops_per_pair(taps: int, phase_terms: int) -> int:
     """Return the floating-point operations of cl/backproject_tiles.cl per pixel and channel.
 
-    The source has 13 operations for the position, 7 + 4 (phase_terms - 1) for sine and cosine, and
-    8 to apply the phase and add. Each pair of taps has 4 (taps/2 - 1) + 4 for the weights and 8 to
-    apply them.
+    The source takes 13 operations for the position, 7 + 4 (phase_terms - 1) for sine and cosine,
+    and 8 to apply the phase and add. Each pair of taps takes 4 (taps/2 - 1) + 4 operations for the
+    weights and 8 to apply them.
     """
     pairs = taps // 2
     return 28 + 4 * (phase_terms - 1) + pairs * (4 * (pairs - 1) + 12)
 
 
 _CHAINS = (8, 12, 16)
-"""Chains of multiply-adds: 8 hide a latency of 4 cycles, 12 fit 16 registers, 16 fit 32."""
+"""Numbers of independent chains: 8 hide a latency of 4 cycles, 12 fit 16 registers, 16 fit 32."""
 
 
 def peak_flops(device: Device) -> float:
-    """Return a device's rate of independent multiply-adds, flop/s (cl/peak.cl)."""
+    """Return the rate of independent multiply-adds of a device, flop/s (cl/peak.cl)."""
     width = device.info.width
     items, steps = 1 << 14, 1 << 11
     result = device.buffer(4 * items)

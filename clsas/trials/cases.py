@@ -14,7 +14,7 @@ from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow
 from clsas.trials.dense_cases import DENSE_CASES, DenseCase
 
-_POINTS = 1000
+_POINTS = 1000  # a plain choice; simulation time is proportional to it
 _DUNES_M = 8.0  # length and width of a dune
 
 
@@ -37,8 +37,8 @@ class Case:
     beam : BeamWindow, optional
         Weights of the channels.
     depth_m, relief_m : float
-        Depth of the plane of points and pixels below the track, and height of the dunes on it from
-        trough to crest. Dunes are 8 m long and wide.
+        Depth below the track of the plane in which points and pixels lie, and height of the dunes
+        on it from trough to crest. Dunes are 8 m long and wide.
     """
 
     channels: int
@@ -66,7 +66,7 @@ class Case:
         return self.relief_m / 2 * dunes
 
     def lines(self, seed: int = 1) -> RangeLines:
-        """Return range lines of random points all over the image, with complex amplitudes."""
+        """Return range lines of random points in the area of the image, with complex amplitudes."""
         random = np.random.default_rng(seed)
         along = (np.arange(self.channels) - (self.channels - 1) / 2) * self.spacing_m
         tx_m = np.stack([along, np.zeros_like(along), np.zeros_like(along)], axis=1)
@@ -86,7 +86,7 @@ class Case:
 
 
 EXACT_CASES = {
-    # Chapter 5 of the thesis (Ødegaard 2004), which does not give the bandwidth.
+    # Chapter 5 of the thesis (Ødegaard 2004), which does not state the bandwidth.
     "bp-thesis": Case(640, 8.25e-3, 1e6, 100e3, (-2.5, 2.5), (40.0, 45.0), 1024),
     "bp-2k": Case(2048, 15e-3, 120e3, 30e3, (-20.0, 20.0), (40.0, 80.0), 2048),
 }
@@ -95,7 +95,7 @@ EXACT_CASES = {
 _BEAM = BeamWindow(20.0, "hann")
 
 FFBP_2K = Case(2000, 15e-3, 120e3, 30e3, (-20.48, 20.46), (40.0, 80.0), 2048, _BEAM)
-"""Square image of 4 million pixels from as many channels as it has rows."""
+"""Square image of 4 million pixels, from about as many channels as it has rows."""
 
 FACTORIZED_CASES: dict[str, Case | DenseCase] = {
     "ffbp-thesis": EXACT_CASES["bp-thesis"],
@@ -112,20 +112,20 @@ FACTORIZED_CASES: dict[str, Case | DenseCase] = {
         depth_m=20.0,
         relief_m=1.0,
     ),
-    # The same pixel and channel spacing, with a longer track and larger ranges.
+    # The pixel and channel spacing of ffbp-2k, with a longer track and larger ranges.
     "ffbp-8k": Case(8192, 15e-3, 120e3, 30e3, (-40.96, 40.94), (40.0, 121.9), 4096, _BEAM),
     **DENSE_CASES,
 }
 """Cases of factorized imaging."""
 
 MOSAIC_CASES = {"mosaic-wreck": (4096, BeamWindow(5.0, "hann"))}
-"""Cases of mosaics of the wreck (`clsas.trials.wreck`): pixels along either side, and the beam."""
+"""Cases of mosaics of the wreck (`clsas.trials.wreck`): pixels along each side, and the beam."""
 
 
 def scaled(size: int) -> Case:
-    """Return ffbp-2k with `size` channels and `size` x `size` pixels, over the same extents.
+    """Return ffbp-2k with `size` channels and `size` x `size` pixels over the same area.
 
-    Frequencies are scaled, so that pixels and channels keep their spacing in wavelengths.
+    Frequencies are scaled so that pixels and channels keep their spacing in wavelengths.
     """
     case = FFBP_2K
     finer = size / case.pixels

@@ -1,4 +1,4 @@
-"""Wide-beam case of the thesis (Ødegaard 2004, chapter 5), from simulation to measured image."""
+"""Demo: the wide-beam case of the thesis (Ødegaard 2004, chapter 5), simulated and imaged."""
 
 from __future__ import annotations
 
@@ -53,24 +53,24 @@ def run(
     say: Callable[[str], None] = print,
     progress: Callable[[str], AbstractContextManager[Progress]] = _silent,
 ) -> dict[str, Any]:
-    """Simulate, compress, image, measure and draw the case.
+    """Simulate, compress, image, measure and draw the case; return the results.
 
     Parameters
     ----------
     out : Path
-        Folder for the files; it is made if it does not exist.
+        Folder for the files, created if it does not exist.
     device : str or int, optional
         See `clsas.opencl.device.choose`.
     say : callable
-        Called with every line of the report.
+        Called with each line of the report.
     progress : callable
-        Called with the name of a step. Returns a context manager that yields the progress callback
+        Called with the name of a step; returns a context manager that yields the progress callback
         of the step, or None.
 
     Returns
     -------
     dict
-        "seconds" of every step, "device", "driver", "point" (the PointResponse of the scene's first
+        "seconds" of each step, "device", "driver", "point" (the PointResponse of the scene's first
         target), "expected" (its theoretical resolutions) and "files".
 
     Raises
@@ -78,7 +78,7 @@ def run(
     DeviceError
         If there is no such device.
     FileExistsError
-        If the folder holds files with the demo's names that another program made.
+        If the folder contains files with the names of the demo's that another program wrote.
     ImportError
         If matplotlib is not installed.
     OSError
@@ -88,10 +88,10 @@ def run(
     scene = _scene_in(out)
     sonar, track, targets, grid = scene.need("sonar", "track", "targets", "grid")
     demo = _Demo(out, scene, opened, say, progress)
-    demo.tell_scene(sonar, track, targets, grid)
+    demo.report_scene(sonar, track, targets, grid)
     lines = demo.lines(sonar, track, targets, grid)
     info = opened.info
-    demo.tell("device", f"{info.label}, driver {info.driver}")
+    demo.report("device", f"{info.label}, driver {info.driver}")
     image = demo.form("image", lines, grid)
     demo.keep("image", image, plot.image_db(image, title="whole scene"))
     point = targets.positions_m[0]
@@ -100,8 +100,8 @@ def run(
     response = measure_point(close_up, near=tuple(point[:2]))
     plot.save_png(plot.cuts(response), out / "cuts.png")
     expected_m = expected_resolution_m(sonar, track, point)
-    demo.tell_point(response, point, expected_m, sonar)
-    demo.tell("files", f"{out}: {', '.join(_FILES)}")
+    demo.report_point(response, point, expected_m, sonar)
+    demo.report("files", f"{out}: {', '.join(_FILES)}")
     return {
         "seconds": demo.seconds,
         "device": info.label,
@@ -113,19 +113,19 @@ def run(
 
 
 def _scene_in(out: Path) -> SceneFile:
-    """Write the scene file into a folder and return the scene.
+    """Return the scene after writing its file into a folder.
 
     Raises
     ------
     FileExistsError
-        If the folder holds files with the demo's names that another program made.
+        If the folder contains files with the names of the demo's that another program wrote.
     """
     text, file = built_in_scene("thesis_wide_beam"), out / "scene.toml"
     taken = [name for name in _FILES if (out / name).exists()]
     if taken and not (file.is_file() and file.read_bytes() == text):
         raise FileExistsError(
-            f"out must be a new folder or that of a demo whose scene.toml is as it was made: in "
-            f"{out} this would write over {', '.join(taken)}"
+            "out must be a new folder, or that of an earlier demo with an unchanged scene.toml: in "
+            f"{out} the demo would overwrite {', '.join(taken)}"
         )
     out.mkdir(parents=True, exist_ok=True)
     file.write_bytes(text)
@@ -133,15 +133,15 @@ def _scene_in(out: Path) -> SceneFile:
 
 
 def _around(point_m: NDArray[np.float64]) -> Grid:
-    """Return the grid of the close-up of a point."""
+    """Return the grid of a close-up of a point."""
     x, y, _ = point_m
-    reach, count = _CLOSE_UP_M, _CLOSE_UP_PIXELS
-    return Grid.plane(x=(x - reach, x + reach, count), y=(y - reach, y + reach, count))
+    half_m, count = _CLOSE_UP_M, _CLOSE_UP_PIXELS
+    return Grid.plane(x=(x - half_m, x + half_m, count), y=(y - half_m, y + half_m, count))
 
 
 @dataclass(frozen=True)
 class _Demo:
-    """Steps of the demo, which are timed and reported."""
+    """Steps of the demo, each of which is timed and reported."""
 
     out: Path
     scene: SceneFile
@@ -150,12 +150,12 @@ class _Demo:
     progress: Callable[[str], AbstractContextManager[Progress]]
     seconds: dict[str, float] = field(default_factory=dict)
 
-    def tell(self, label: str, text: str) -> None:
+    def report(self, label: str, text: str) -> None:
         """Write a line of the report."""
         self.say(f"{label:<10} {text}")
 
     def timed(self, step: str, work: Callable[[Progress], Result]) -> Result:
-        """Return the result of a step; measure its time."""
+        """Return the result of a step, and record its time."""
         with self.progress(step) as callback:
             start = time.perf_counter()
             result = work(callback)
@@ -168,13 +168,13 @@ class _Demo:
         plot.save_png(figure, self.out / f"{name}.png")
 
     def lines(self, sonar: Sonar, track: Track, targets: PointTargets, grid: Grid) -> RangeLines:
-        """Simulate echoes and compress them."""
+        """Return range lines of simulated echoes."""
         options = self.scene.simulate
         echoes = self.timed(
             "simulate", lambda p: simulate(sonar, track, targets, **options, progress=p)
         )
         self.keep("echoes", echoes, plot.geometry(echoes, grid))
-        self.tell(
+        self.report(
             "simulate",
             f"{echoes.channels} echoes of {echoes.length} samples in "
             f"{self.seconds['simulate']:.2f} s",
@@ -183,46 +183,46 @@ class _Demo:
             "compress", lambda p: compress(echoes, **self.scene.compress, progress=p)
         )
         self.keep("lines", lines, plot.range_lines(lines))
-        self.tell(
+        self.report(
             "compress",
             f"{lines.channels} lines of {lines.length} samples in {self.seconds['compress']:.2f} s",
         )
         return lines
 
     def form(self, step: str, lines: RangeLines, grid: Grid) -> Image:
-        """Form an image exactly."""
+        """Return an exact image."""
         options = self.scene.image
         image = self.timed(
             step, lambda p: form_exactly(lines, grid, device=self.device, **options, progress=p)
         )
-        self.tell(
+        self.report(
             step,
             f"{' x '.join(map(str, grid.shape))} pixels from {lines.channels} lines in "
-            f"{self.seconds[step]:.2f} s, with building the kernel",
+            f"{self.seconds[step]:.2f} s, including the build of the kernel",
         )
         return image
 
-    def tell_scene(self, sonar: Sonar, track: Track, targets: PointTargets, grid: Grid) -> None:
-        """Report the scene, and what its sampling costs in the image."""
+    def report_scene(self, sonar: Sonar, track: Track, targets: PointTargets, grid: Grid) -> None:
+        """Report the scene, and how its sampling affects the image."""
         pulse = sonar.pulse
-        self.tell(
+        self.report(
             "scene",
             f"{targets.points} points, {track.pings} pings of {sonar.receivers} receivers, "
             f"{pulse.carrier_hz / 1e6:g} MHz, {pulse.bandwidth_hz / 1e3:g} kHz",
         )
         for finding in check_sampling(sonar, track, grid):
-            self.tell("", f"note: {finding.message}")
+            self.report("", f"note: {finding.message}")
 
-    def tell_point(
+    def report_point(
         self,
         response: PointResponse,
         point_m: NDArray[np.float64],
         expected_m: tuple[float, float],
         sonar: Sonar,
     ) -> None:
-        """Report the measured point beside theory."""
+        """Report the measured point and the theoretical resolution."""
         x, y, _ = point_m
-        self.tell(
+        self.report(
             "measure",
             f"peak at x = {response.x_m:.5f} m, y = {response.y_m:.5f} m; the point is at "
             f"{x:g}, {y:g} m",
@@ -235,7 +235,7 @@ class _Demo:
         for name, cut, expected, rule in zip(
             ("azimuth", "range"), cuts, expected_m, rules, strict=True
         ):
-            self.tell(
+            self.report(
                 "",
                 f"{name:<7} {1e3 * cut.resolution_m:.2f} mm wide at -3 dB (theory "
                 f"{1e3 * expected:.2f} mm; {rule} mm), PSLR {max(cut.pslr_db):.1f} dB, "
@@ -248,9 +248,9 @@ def expected_resolution_m(
 ) -> tuple[float, float]:
     """Return the theoretical -3 dB widths of a point in azimuth and range.
 
-    The response along an axis is the Fourier transform of the spectrum along it. In azimuth this is
-    the two-way element pattern at the spatial frequency (sin theta_tx + sin theta_rx)/lambda of
-    every channel; in range it is |P(f)|^2 of the matched pulse at 2 f/c.
+    The response along an axis is the Fourier transform of the spectrum along it. In azimuth the
+    spectrum is the two-way element pattern at the spatial frequency (sin theta_tx + sin
+    theta_rx)/lambda of each channel. In range it is |P(f)|^2, that of the matched pulse, at 2 f/c.
     """
     tx, rx, _ = channels(sonar, track)
     sines = [(point_m - end)[:, 0] / np.linalg.norm(point_m - end, axis=1) for end in (tx, rx)]
@@ -267,7 +267,7 @@ def expected_resolution_m(
 
 
 def _width(cycles_per_m: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
-    """Full width at half power of |sum weight exp(j 2 pi cycles_per_m u)| around u = 0."""
+    """Return the full width at half power of |sum weight exp(j 2 pi cycles_per_m u)| at u = 0."""
     offset = np.linspace(0, 1 / np.ptp(cycles_per_m), 2001)
     response = np.abs(np.exp(2j * np.pi * np.multiply.outer(offset, cycles_per_m)) @ weight)
     return 2 * float(np.interp(-0.5, -((response / response[0]) ** 2), offset))

@@ -1,4 +1,4 @@
-"""Benchmark cases of dense apertures, and of a volume."""
+"""Benchmark cases with dense apertures, and of a volume."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _AIR_M_S, _WATER_M_S = 343.0, 1500.0
 
 @dataclass(frozen=True)
 class DenseCase:
-    """Channels anywhere, over a scene of random points.
+    """Channels at any positions over a scene of random points.
 
     Attributes
     ----------
@@ -29,15 +29,15 @@ class DenseCase:
     carrier_hz, bandwidth_hz, sound_speed_m_s : float
         Band of the range lines, without a window, sampled at 1.25 bandwidths.
     target_m : (x, y, z)
-        Sides of the box around the origin in which points lie.
+        Sides of the box around the origin in which the points lie.
     image_m : float
         Side of the image.
     pixels : int
         Pixels along either side.
     slices : int
-        Number of images on top of each other, from the target's lowest point to its highest.
+        Number of images at different heights, from the lowest point of the target to the highest.
     points : int
-        Number of points; simulation takes as long as they are many.
+        Number of points, to which the simulation time is proportional.
     """
 
     track: Callable[[], NDArray[np.float64]]
@@ -51,7 +51,7 @@ class DenseCase:
     points: int = 1000
 
     beam: ClassVar[BeamWindow | None] = None
-    """Every channel counts for every pixel."""
+    """No beam: every channel contributes to every pixel."""
 
     @property
     def channels(self) -> int:
@@ -105,9 +105,9 @@ def helix(
 
 
 def passes(count: int, per_pass: int, spacing_m: float) -> NDArray[np.float64]:
-    """Return positions of straight passes beside the origin, [channels, 3].
+    """Return positions on straight passes beside the origin, [channels, 3].
 
-    They have 3 headings and 4 heights, and different distances.
+    The passes have 3 headings, 4 heights and different distances from the origin.
     """
     along_m = (np.arange(per_pass) - (per_pass - 1) / 2) * spacing_m
     found = []
@@ -137,7 +137,7 @@ def _in_air(pixels: int) -> DenseCase:
 
 
 DENSE_CASES = {
-    # 150 turns of 360 pings in air, about a target of 0.24 m.
+    # 150 turns of 360 pings in air, around a target of 0.24 m.
     "ffbp-helix": _in_air(150),
     "ffbp-helix-fine": _in_air(600),
     "ffbp-passes": DenseCase(

@@ -1,7 +1,7 @@
 """Scenes with a known ideal image, at the extremes of what clsas images.
 
-Lines and images are those of `clsas.trials.oracle`. From the library a scene uses only the
-containers `RangeLines`, `Grid` and `BeamWindow`.
+Lines and ideal images come from `clsas.trials.oracle`. The library contributes only the containers
+`RangeLines`, `Grid` and `BeamWindow`.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from clsas.trials import oracle
 from clsas.trials.oracle import Band, Echo
 
 LIGHT_M_S = 299_792_458.0
-_FLAT = 0.94  # share of the bandwidth in which a pulse's spectrum is flat
-_EDGE = 0.01  # standard deviation of the spectrum's edges over the bandwidth
-_FADED = 6.0  # standard deviations after which a Gaussian is 1.5e-8
-_TONES = 24  # per channel in a noise floor
-_QUANTUM_M = 2.0**-29  # float64 adds multiples of this without rounding up to 1.6e7 m
+_FLAT = 0.94  # share of the bandwidth over which the spectrum of a pulse is flat
+_EDGE = 0.01  # standard deviation of the edges of the spectrum, over the bandwidth
+_FADED = 6.0  # standard deviations at which a Gaussian has fallen to 1.5e-8
+_TONES = 24  # number of tones that make up the noise of a channel
+_QUANTUM_M = 2.0**-29  # float64 represents multiples of this exactly up to 1.6e7 m
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Range lines, a grid, and the ideal image there.
+    """Range lines, a grid, and the ideal image on it.
 
     Attributes
     ----------
@@ -52,14 +52,14 @@ class Known:
 
 
 def along_x(channels: int, spacing_m: float, sway_m: float = 0.0) -> NDArray[np.float64]:
-    """Return positions along x about the origin, with random deviations across, [channels, 3]."""
+    """Return positions along x about the origin with random deviations across, [channels, 3]."""
     x_m = (np.arange(channels) - (channels - 1) / 2) * spacing_m
     across_m = sway_m * np.random.default_rng(1).normal(size=(channels, 2))
     return np.column_stack([x_m, across_m])
 
 
 def circle(channels: int, radius_m: float, height_m: float = 0.0) -> NDArray[np.float64]:
-    """Return positions all around the origin, [channels, 3]."""
+    """Return positions on a circle around the origin, [channels, 3]."""
     angle = 2 * np.pi * np.arange(channels) / channels
     return np.column_stack(
         [radius_m * np.cos(angle), radius_m * np.sin(angle), np.full(channels, height_m)]
@@ -93,7 +93,7 @@ def scene(
     relief_m: float = 0.0,
     seed: int = 0,
 ) -> Known:
-    """Return random points on a horizontal grid, as one sonar receives them.
+    """Return a scene of random points on a horizontal grid.
 
     Parameters
     ----------
@@ -115,14 +115,14 @@ def scene(
     targets : int
         Number of points.
     within : (from, to)
-        Part of the columns in which points lie.
+        Part of the columns in which the points lie, as shares of the width.
     oversampling : float
         Sample rate over bandwidth.
     colour : callable, optional
         Called with centre and width in cycles per metre; returns the bands of the pulse. By
         default the pulse's spectrum is flat, or tilted by `tilt_db`.
     on_carrier : bool
-        True if lines keep their carrier. The sampled band must then include it.
+        True if lines keep their carrier. The sampled band must then include the pulse's band.
     offset : float
         Constant in every line, relative to the rms of its echoes.
     tail : float
@@ -130,7 +130,7 @@ def scene(
     noise : float
         Noise in nine tenths of the sampled band, relative to the rms of the echoes.
     origin_m : (x, y, z)
-        Offset of all coordinates.
+        Offset added to all coordinates.
     own_starts : bool
         True if lines begin at different ranges.
     relief_m : float
@@ -147,7 +147,7 @@ def scene(
     height_m = relief_m * np.random.default_rng(seed).normal(size=shape)
     corner, pixels = _pixels(centre_m, pixel_m, height_m)
     extent_m = pixels[-1, -1, :2] - corner[:2]
-    # No points near the border, so that the image holds their main lobes.
+    # No points near the border, so that their main lobes are in the image.
     low, high = np.array([within, (0.1, 0.9), (0.1, 0.9)]).T
     points = corner + rng.uniform(low, high, (targets, 3)) * [*extent_m, 0]
     amplitude = rng.normal(size=(targets, 2)) @ [1, 1j]
@@ -161,7 +161,7 @@ def scene(
     of_pixels_m = oracle.ranges_m(pixels, tx, rx, speed_m_s, velocity)
     fade_m = _FADED / (2 * np.pi * min(band.edge for band in bands))
     levels = np.array([offset, tail, noise])
-    if levels.any():  # they extend over the whole line, and fade with a Gaussian
+    if levels.any():  # disturbances extend over the whole line, and fade like a Gaussian
         fade_m = max(fade_m, np.ptp(of_pixels_m, axis=1).max())
     first_m, length = _extent(np.hstack([at_m, of_pixels_m]), fade_m, step_m)
     if own_starts:
@@ -192,7 +192,7 @@ def scene(
 def _pixels(
     centre_m: Sequence[float], pixel_m: tuple[float, float], height_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the position of the first pixel, without relief, and those of all, [..., 3]."""
+    """Return the position of the first pixel without relief, and those of all pixels, [..., 3]."""
     rows, columns = height_m.shape
     x_m, y_m = (
         step * (np.arange(count) - (count - 1) / 2)
@@ -206,7 +206,7 @@ def _pixels(
 def _extent(
     range_m: NDArray[np.float64], fade_m: float, step_m: float
 ) -> tuple[NDArray[np.float64], int]:
-    """Return first ranges and length of lines that hold ranges [channels, n] and a margin."""
+    """Return first ranges and the length of lines that cover ranges [channels, n] and a margin."""
     nearest, farthest = range_m.min(axis=1), range_m.max(axis=1)
     length = int(np.ceil(((farthest - nearest).max() + 2 * fade_m) / step_m)) + 1
     return nearest - fade_m, length
@@ -215,7 +215,7 @@ def _extent(
 def _from_one_start(
     first_m: NDArray[np.float64], length: int, step_m: float
 ) -> tuple[NDArray[np.float64], int]:
-    """Let all lines begin at the nearest range, unless they would then be mostly zeros."""
+    """Return a common first range for all lines, unless they would then be mostly zeros."""
     spread_m = np.ptp(first_m)
     if spread_m >= length * step_m:
         return first_m, length
@@ -223,7 +223,7 @@ def _from_one_start(
 
 
 def ultrasonic(channels: int = 160, track: NDArray | None = None, **options: Any) -> Known:
-    """1 MHz, 100 kHz, 42.5 m away: 28 000 wavelengths."""
+    """Return a scene at 1 MHz with 100 kHz of bandwidth, 42.5 m (28 000 wavelengths) away."""
     defaults: dict[str, Any] = {
         "carrier_hz": 1e6, "bandwidth_hz": 1e5, "pixel_m": (4e-3, 4e-3), "shape": (48, 48),
     }  # fmt: skip
@@ -232,7 +232,7 @@ def ultrasonic(channels: int = 160, track: NDArray | None = None, **options: Any
 
 
 def array(*, moving: bool, channels: int = 160, **options: Any) -> Known:
-    """Eight receivers beside one transmitter per ping, that stand still or move at up to 17 m/s."""
+    """Return `ultrasonic` for 8 receivers per transmitter, at rest or moving at up to 17 m/s."""
     rx = along_x(channels, 8.25e-3)
     tx = np.repeat(rx[::8], 8, axis=0) + [0.3, 0.1, -0.2]
     velocity = np.random.default_rng(3).uniform(-10, 10, rx.shape) if moving else None
@@ -240,7 +240,7 @@ def array(*, moving: bool, channels: int = 160, **options: Any) -> Known:
 
 
 def raw(channels: int = 96, targets: int = 60, oversampling: float = 8.0, **options: Any) -> Known:
-    """30 kHz, 8 kHz on the carrier, sampled at 64 kHz and made analytic."""
+    """Return a scene at 30 kHz with 8 kHz of bandwidth, of analytic lines on their carrier."""
     return scene(
         along_x(channels, 0.025), (0.2, 12, 0), carrier_hz=3e4, bandwidth_hz=8e3,
         pixel_m=(0.03, 0.03), on_carrier=True, targets=targets, oversampling=oversampling,
@@ -249,7 +249,7 @@ def raw(channels: int = 96, targets: int = 60, oversampling: float = 8.0, **opti
 
 
 def at_1_khz(**options: Any) -> Known:
-    """1 kHz, 200 Hz, 1.5 km away."""
+    """Return a scene at 1 kHz with 200 Hz of bandwidth, 1.5 km away."""
     return scene(
         along_x(80, 0.7), (0, 1500, -200), carrier_hz=1e3, bandwidth_hz=200, pixel_m=(6.0, 1.5),
         **options,
@@ -257,7 +257,7 @@ def at_1_khz(**options: Any) -> Known:
 
 
 def radar(**options: Any) -> Known:
-    """10 GHz, 600 MHz, from an aircraft 8 km away."""
+    """Return a scene at 10 GHz with 600 MHz of bandwidth, from an aircraft 8 km away."""
     return scene(
         along_x(128, 2.0, sway_m=0.3), (20, 7000, -4000), carrier_hz=1e10, bandwidth_hz=6e8,
         pixel_m=(0.15, 0.1), speed_m_s=LIGHT_M_S, **options,
@@ -265,7 +265,7 @@ def radar(**options: Any) -> Known:
 
 
 def closed(**options: Any) -> Known:
-    """100 kHz, 20 kHz, from a circle of 8 m all around the grid."""
+    """Return a scene at 100 kHz with 20 kHz of bandwidth, inside a circle of 8 m radius."""
     return scene(
         circle(300, 8.0, 3.0), (0.1, 0.05, 0), carrier_hz=1e5, bandwidth_hz=2e4,
         pixel_m=(3e-3, 3e-3), **options,
@@ -273,12 +273,12 @@ def closed(**options: Any) -> Known:
 
 
 def narrow(**options: Any) -> Known:
-    """1 MHz with a band of 0.5 %."""
+    """Return `ultrasonic` with a bandwidth of 0.5 % of the carrier."""
     return ultrasonic(96, bandwidth_hz=5e3, **options)
 
 
 def widest(**options: Any) -> Known:
-    """30 kHz with a band of 190 %, 12 m away."""
+    """Return a scene at 30 kHz with a bandwidth of 190 % of the carrier, 12 m away."""
     return scene(
         along_x(160, 0.02), (0.2, 12, 0), carrier_hz=3e4, bandwidth_hz=5.7e4, pixel_m=(0.01, 0.01),
         **options,
@@ -286,7 +286,7 @@ def widest(**options: Any) -> Known:
 
 
 def rings(**options: Any) -> Known:
-    """20 kHz in air, on its carrier, from five rings of 0.8 m around the grid."""
+    """Return a scene at 20 kHz in air, on the carrier, inside five rings of 0.83 m radius."""
     track = np.concatenate([circle(90, 0.83, 0.5 + 0.04 * number) for number in range(5)])
     return scene(
         track, (0, 0, 0), carrier_hz=2e4, bandwidth_hz=4e3, pixel_m=(5e-3, 5e-3), speed_m_s=349.0,
@@ -295,7 +295,7 @@ def rings(**options: Any) -> Known:
 
 
 def apart(**options: Any) -> Known:
-    """100 kHz, 2 kHz, 40 m away, with the receiver 10 m above the transmitter."""
+    """Return a scene at 100 kHz with 2 kHz of bandwidth, and receivers 10 m above transmitters."""
     tx = along_x(200, 0.08)
     defaults: dict[str, Any] = {"bandwidth_hz": 2e3, "pixel_m": (0.2, 0.2)}
     return scene(
@@ -304,7 +304,7 @@ def apart(**options: Any) -> Known:
 
 
 def uneven(**options: Any) -> Known:
-    """100 kHz, 500 Hz, with receivers whose velocity differs by 5 m/s rms from ping to ping."""
+    """Return a scene at 100 kHz with 500 Hz of bandwidth, and velocities that vary by 5 m/s rms."""
     tx = along_x(200, 0.08)
     velocity = [2.0, 0, 0] + np.random.default_rng(5).normal(0, 3, (200, 3))
     return scene(
@@ -314,7 +314,7 @@ def uneven(**options: Any) -> Known:
 
 
 def headings(**options: Any) -> Known:
-    """30 kHz, three passes on other headings, of which a Hann beam sees parts."""
+    """Return a scene at 30 kHz, from three passes at different headings with a Hann beam."""
     turn = np.radians(np.repeat([0, 60, 120], 104))
     along = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
     aside = np.stack([np.sin(turn), -np.cos(turn), 0 * turn], axis=1)
@@ -327,7 +327,7 @@ def headings(**options: Any) -> Known:
 
 
 def loud(**options: Any) -> Known:
-    """30 kHz, with a channel of 30 dB more two wavelengths off the track."""
+    """Return a scene at 30 kHz, where a channel 30 dB louder is two wavelengths off the track."""
     track, gains = along_x(300, 0.035), np.ones(300)
     track[130] += [0, 0.1, 0.07]
     gains[130] = 10**1.5
@@ -338,7 +338,7 @@ def loud(**options: Any) -> Known:
 
 
 def edge(**options: Any) -> Known:
-    """30 kHz, with points where the coverage of a Hann beam ends: there weights are small."""
+    """Return a scene at 30 kHz, with points at the edge of a Hann beam, where weights are small."""
     return scene(
         along_x(300, 0.02), (3, 9.5, 0), carrier_hz=3e4, bandwidth_hz=9e3, pixel_m=(0.04, 0.02),
         shape=(32, 96), beam=BeamWindow(20, "hann", along=[1, 0, 0]), within=(0.88, 0.97),
@@ -354,16 +354,8 @@ def steps(centre: float, width: float) -> list[Band]:
     ]
 
 
-def line_in_the_spectrum(centre: float, width: float) -> list[Band]:
-    """Return a weak flat band and, near its edge, a tone of 20 dB more."""
-    return [
-        Band(centre, 0.9 * width, 0.01 * width, 0.1),
-        Band(centre + 0.42 * width, 0.0, 0.01 * width, 1.0),
-    ]
-
-
 def _quantised(positions_m: ArrayLike) -> NDArray[np.float64]:
-    """Round positions so that a far origin can be added without rounding."""
+    """Return rounded positions, to which a distant origin can be added exactly."""
     return np.round(np.asarray(positions_m, np.float64) / _QUANTUM_M) * _QUANTUM_M
 
 
@@ -375,15 +367,15 @@ def _disturbances(
     levels: NDArray[np.float64],
     centre: float,
 ) -> list[Echo]:
-    """Return a constant, a tail below the band, and noise as echoes.
+    """Return echoes that represent a constant, a tail below the band, and noise.
 
-    `levels` are those of the three, rms values over a line.
+    `levels` are the rms values of the three over a line.
     """
     offset, tail, noise = levels
     channels = len(first_m)
     middle_m = (first_m + (length - 1) / 2 * step_m)[:, None]
-    edge = _FADED / (np.pi * length * step_m)  # fades at both ends
-    # Rms of the envelope over the line.
+    edge = _FADED / (np.pi * length * step_m)  # envelopes fade at both ends of the line
+    # Rms value of the envelope over the line.
     fullness = np.sqrt(np.sqrt(np.pi) / (2 * _FADED))
     found = []
     if offset:
@@ -409,7 +401,7 @@ def _disturbances(
 def _weights(
     beam: BeamWindow, pixels_m: NDArray[np.float64], centres_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return a beam's weights, [channels, pixels], from their definition."""
+    """Return the weights of a beam from their definition, [channels, pixels]."""
     if beam.along is None:
         raise ValueError("beam must have the direction `along`")
     towards = pixels_m.reshape(1, -1, 3) - centres_m[:, None]

@@ -1,10 +1,11 @@
 """Oracle: analytic echoes and their ideal image in float64, against which imagers are tested.
 
-This module shares no code with the library; it imports only NumPy. An echo is a function known at
-every range. Its samples are range lines; its value at the range of a pixel contributes to the ideal
-image. No sample is interpolated and no spectrum is measured.
+This module shares no code with the library and imports only NumPy. An echo is an analytic function
+of range. Its samples form the range lines, and its value at the range of a pixel contributes to the
+ideal image. No sample is interpolated and no spectrum is measured.
 
-Frequencies are cycles per metre of range: f hertz are 2 f / c, because range is half the path.
+Frequencies are in cycles per metre of range: f hertz correspond to 2 f / c, because range is half
+the path.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_ITERATIONS = 16  # of a delay; each reduces the error by |velocity| / speed, 1/20 or less
+_ITERATIONS = 16  # each multiplies the error of a delay by |velocity| / speed, at most 1/20
 
 
 @dataclass(frozen=True)
@@ -26,12 +27,12 @@ class Band:
     ----------
     centre, width : float
         Centre and width, cycles per metre of range. The centre includes the carrier. A width of 0
-        is a tone under a Gaussian envelope.
+        gives a tone with a Gaussian envelope.
     edge : float
-        Standard deviation of the edges, cycles per metre. The pulse fades like the Gaussian of
-        standard deviation 1 / (2 pi edge) metres.
+        Standard deviation of the edges, cycles per metre. The pulse decays like a Gaussian with a
+        standard deviation of 1 / (2 pi edge) metres.
     level : complex
-        Value of the pulse at its peak, without the tilt.
+        Value of the pulse at its peak, before the tilt.
     tilt_db : float
         Rise of the spectrum over the width, dB.
     """
@@ -50,9 +51,10 @@ class Echo:
     Attributes
     ----------
     range_m : array_like of float, shape [channels, echoes]
+        Ranges of the peaks.
     amplitude : array_like of complex, broadcasts with [channels, echoes]
     bands : sequence of Band
-        The pulse's spectrum is their sum. Their centres may have shape [channels, 1].
+        Bands whose sum is the spectrum of the pulse. Their centres may have shape [channels, 1].
     """
 
     range_m: NDArray[np.float64]
@@ -67,10 +69,10 @@ def ranges_m(
     speed_m_s: float = 1.0,
     rx_velocity_m_s: ArrayLike = 0.0,
 ) -> NDArray[np.float64]:
-    """Half the paths from transmitters over points to receivers, metres, [channels, points].
+    """Return half the path from transmitter to point to receiver, metres [channels, points].
 
-    `rx_m` is where receivers are at transmission. The delay of a moving one is found by iteration:
-    c tau = |x - tx| + |x - rx - v tau|.
+    `rx_m` are the positions of the receivers at the time of transmission. If they move, the delay
+    tau is found by iterating c tau = |x - tx| + |x - rx - v tau|.
     """
     points = np.reshape(points_m, (1, -1, 3)).astype(np.float64)
     tx, rx, velocity = (
@@ -86,10 +88,10 @@ def ranges_m(
 
 
 def pulse(offset_m: ArrayLike, bands: Sequence[Band]) -> NDArray[np.complex128]:
-    """Value of a pulse at some ranges from its peak, its carrier included.
+    """Return the value of a pulse at given ranges from its peak, including the carrier.
 
-    The transform of a box is a sinc; Gaussian edges multiply it by a Gaussian. A spectrum times
-    exp(a f) is the pulse at the complex range r - j a / (2 pi).
+    The transform of a box is a sinc, which Gaussian edges multiply by a Gaussian. Multiplying the
+    spectrum by exp(a f) gives the pulse at the complex range r - j a / (2 pi).
     """
     offset = np.asarray(offset_m, np.float64)
     total = np.zeros(offset.shape, np.complex128)
@@ -108,7 +110,7 @@ def samples(
     length: int,
     carrier_cycles_per_m: float,
 ) -> NDArray[np.complex128]:
-    """Range lines of echoes with their carrier mixed out, [channels, length].
+    """Return range lines of echoes after mixing out the carrier, [channels, length].
 
     A pulse u(r - rho) is received as u(r - rho) exp(-j 2 pi K r) at range r, with K the carrier.
     """
@@ -121,15 +123,16 @@ def samples(
 def image(
     echoes: Sequence[Echo], range_m: NDArray[np.float64], weights: ArrayLike = 1.0
 ) -> NDArray[np.complex128]:
-    """Ideal image at pixels of some ranges [channels, pixels]: the weighted sum over channels.
+    """Return the ideal image, the weighted sum over channels, at ranges [channels, pixels].
 
-    Restoring the carrier's phase, exp(+j 2 pi K rho), cancels what `samples` mixed out.
+    The carrier needs no correction: restoring its phase, exp(+j 2 pi K rho), cancels the mixing in
+    `samples`.
     """
     return np.sum(np.asarray(weights) * received(echoes, range_m), axis=0)
 
 
 def received(echoes: Sequence[Echo], at_m: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Return what every channel receives from ranges [channels, n], carrier included."""
+    """Return what every channel receives from ranges [channels, n], including the carrier."""
     total = np.zeros(at_m.shape, np.complex128)
     for echo in echoes:
         amplitude = np.broadcast_to(echo.amplitude, np.shape(echo.range_m))
@@ -139,8 +142,8 @@ def received(echoes: Sequence[Echo], at_m: NDArray[np.float64]) -> NDArray[np.co
     return total
 
 
-def error_db(pixels: ArrayLike, wanted: ArrayLike) -> float:
-    """Relative rms error of an image, dB."""
-    wanted = np.ravel(wanted)
-    difference = np.ravel(pixels).astype(np.complex128) - wanted
-    return float(20 * np.log10(np.linalg.norm(difference) / np.linalg.norm(wanted) + 1e-300))
+def error_db(pixels: ArrayLike, ideal: ArrayLike) -> float:
+    """Return the relative rms error of an image, dB."""
+    ideal = np.ravel(ideal)
+    difference = np.ravel(pixels).astype(np.complex128) - ideal
+    return float(20 * np.log10(np.linalg.norm(difference) / np.linalg.norm(ideal) + 1e-300))

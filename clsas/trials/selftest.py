@@ -1,4 +1,4 @@
-"""Test of accuracy on the user's own device, against the oracle."""
+"""Self-test: the accuracy of all imagers on a user's device, measured against the oracle."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _BUILDS = ((1, False), (4, False), (8, False), (8, True), (16, False))  # width,
 _WIDEST = 16
 
 _DIVIDED = Costs(pixel_ns=1e6, point_ns=1e6)
-"""Costs with which even small images are divided, since exact imaging is predicted to be slow."""
+"""Costs that make exact imaging look slow, so that plans divide even small images."""
 _FAR_M = (1e7, -1e7, 1e7)
-_WAVENUMBER_DB = -60.0  # error bound of the wavenumber image, which takes no accuracy
+_WAVENUMBER_DB = -60.0  # bound for the wavenumber image, for which no accuracy can be requested
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class Result:
     case : str
         Scene and imager.
     asked_db : float or None
-        Requested relative rms error, dB; None for an imager that takes no request.
+        Requested relative rms error, dB; None for an imager without a request.
     measured_db : float or None
         Measured relative rms error; None if no image was formed.
     bound_db : float
-        Largest error with which the test is passed.
+        Largest error with which the image passes.
     failure : str
         Type and message of the exception that imaging raised; "" if an image was formed.
     """
@@ -58,7 +58,7 @@ class Result:
 
     @property
     def passed(self) -> bool:
-        """True if the error is within its bound (NaN is not)."""
+        """True if the error is within its bound; an error of NaN is not."""
         return self.measured_db is not None and self.measured_db <= self.bound_db
 
 
@@ -67,13 +67,14 @@ def run(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Result, ...]:
-    """Form images at the extremes, and measure their errors against the oracle.
+    """Return the errors of images of extreme scenes, measured against the oracle.
 
     The scenes cover 1 kHz to 10 GHz, bands of 0.5 to 190 % of the carrier, one to 1000 channels,
-    guard bands down to a tenth, and coordinates up to 10 000 km. Every imager is tested: exact,
-    factorized (in single and in half precision), mosaic and wavenumber. On a CPU every image is
-    also formed with kernels of one lane, as a GPU's are built, and some with every other vector
-    width that the CPU supports. An image that cannot be formed has not passed; the others follow.
+    guard bands down to a tenth of the bandwidth, and coordinates up to 10 000 km. Every imager is
+    tested: exact, factorized (in single and in half precision), mosaic and wavenumber. On a CPU
+    every image is also formed with kernels of one lane, as they are built for a GPU, and some
+    images with every other vector width that the CPU supports. An image that cannot be formed does
+    not pass, and the test continues with the others.
 
     Parameters
     ----------
@@ -109,7 +110,7 @@ def run(
         try:
             known = made(scene)
             measured_db = known.error_db(_quietly(imager, known, bound_db, used).pixels)
-        except Exception as error:  # whatever a driver does, the other images tell more
+        except Exception as error:  # a driver may raise anything; the other images still count
             failure = f"{type(error).__name__}: {error}"
         case = f"{scene}, {imager}{variant}"
         results.append(Result(case, asked_db, measured_db, bound_db, failure))
@@ -119,21 +120,23 @@ def run(
 
 
 def _quietly(imager: str, known: Known, asked_db: float, device: Device) -> Image:
-    """Form an image without warnings: only the measured error matters."""
+    """Return an image without warning, since only the measured error matters."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", validate.ClsasWarning)
         return form(imager, known, asked_db, device)
 
 
 def form(imager: str, known: Known, asked_db: float, device: Device) -> Image:
-    """Return the image of a scene by one of `IMAGERS`."""
+    """Return the image of a scene that one of `IMAGERS` forms."""
     return IMAGERS[imager](known, asked_db, device)
 
 
 def other_builds(info: DeviceInfo) -> list[tuple[int, bool]]:
-    """Return the other builds of kernels: floats of a vector, and whether lookups are permuted.
+    """Return the builds of kernels that a device does not use by default.
 
-    Only CPUs have more than one. Compilers may fail with more lanes than the CPU has.
+    A build is the number of floats in a vector, and whether lookups are permuted. Only CPUs have
+    more than one. Wider vectors than those of the CPU are left out, since compilers may fail on
+    them.
     """
     if info.kind != "cpu":
         return []
@@ -143,7 +146,7 @@ def other_builds(info: DeviceInfo) -> list[tuple[int, bool]]:
 
 
 def variants(device: Device) -> dict[str, Device]:
-    """Return the device with every other build of kernels that it supports, by name."""
+    """Return variants of the device, one for each of `other_builds`, by name."""
     return {
         f"width {width}{', permuted' if permute else ''}": driven(device, width, permute)
         for width, permute in other_builds(device.info)
@@ -153,8 +156,8 @@ def variants(device: Device) -> dict[str, Device]:
 def driven(device: Device, width: int, permute: bool) -> Device:
     """Return a device whose kernels are built for vectors of `width` floats, permuted or not.
 
-    One float is what a GPU's are built for: the device is then driven as a GPU in every way, with
-    work-groups of 64, its own buffers, copies to and from them, and half precision.
+    A width of one float selects the build for GPUs. The device is then driven as a GPU in every
+    respect: with work-groups of 64, its own buffers, copies to and from them, and half precision.
     """
     if (width, permute) == (device.info.width, device.info.permute):
         return device
@@ -176,16 +179,16 @@ def _factorized(known: Known, asked_db: float, device: Device) -> Image:
 
 
 def _in_half_precision(known: Known, asked_db: float, device: Device) -> Image:
-    # Every device can compute in half precision, but plans use it only where it is fast.
+    # Every device can compute in half precision, but plans use it only on those where it is fast.
     able = driven(device, device.info.width, True)
     chosen = divided_plan(known, asked_db, able)
     if not chosen.half_precision:
-        raise RuntimeError(f"a plan for {asked_db:g} dB was to take half precision, and did not")
+        raise RuntimeError(f"the plan for {asked_db:g} dB should use half precision, but does not")
     return factorize(known.lines, known.grid, chosen, device=device)
 
 
 def divided_plan(known: Known, asked_db: float, device: Device) -> Plan:
-    """Return a plan that divides a scene's image even though it is small."""
+    """Return a plan that divides the image of a scene, however small."""
     return plan(
         known.lines, known.grid, tolerance_db=asked_db, beam=known.beam, device=device,
         costs=_DIVIDED,
@@ -242,7 +245,7 @@ _SCENES: dict[str, Callable[[], Known]] = {
         track=along_x(400, 0.03), beam=_HANN, targets=3, shape=(24, 24)
     ),
 }
-# Tighter tolerances leave these scenes to exact imaging.
+# With tighter tolerances these scenes would be imaged exactly.
 _ROUGHLY = {
     "moving receivers": -30.0,
     "2 % and 10 m apart": -20.0,
@@ -263,7 +266,7 @@ _CHECKS = (
     ("Hann beam", "mosaic", -50.0),
     ("Hann beam", "wavenumber", None),
 )
-# Requests whose kernels compile fast: those for -80 and -50 dB take half as long again.
+# Requests whose kernels compile fast. Kernels for -80 and -50 dB take 1.5 times as long.
 _OF_VARIANTS = (("flat", "exact", -60.0), ("flat", "factorized", -35.0))
 
 

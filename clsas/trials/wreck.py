@@ -1,7 +1,7 @@
 """Narrow-beam case: a wreck and its shadow, after chapter 6 of the thesis (Ødegaard 2004).
 
 The scene is `scenes/wreck.toml`. Its range lines take minutes to simulate and are cached. The
-benchmarks and scripts/thesis use them and the contrast of the shadow.
+benchmarks and scripts/thesis use these lines and the contrast of the shadow.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from clsas.simulation.simulator import simulate
 
 X_M, Y_M = (-32.0, 32.0), (36.0, 92.0)
 
-_FOOTPRINT_M = 2.5  # more than half the length of track that a pixel of the wreck is visible from
-_SPACING_M = 0.25  # of the points that are classified as lit or in shadow
-_FLAT_M = 0.3  # largest height that counts as sand
-_LEFT_OUT_M = 2.0  # to either side of a position that is left out
-_SURROUNDINGS_M = (12.0, 30.0)  # distance along and across up to which lit sand is compared
+_FOOTPRINT_M = 2.5  # more than half the length of track from which a pixel is visible
+_SPACING_M = 0.25  # of points that are classified as lit or in shadow
+_FLAT_M = 0.3  # largest height of a point that counts as sand
+_LEFT_OUT_M = 2.0  # half the side of the square that is left out around a position
+_SURROUNDINGS_M = (12.0, 30.0)  # distances along and across within which lit sand counts
 
 
 def grid(pixels: int) -> Grid:
@@ -43,7 +43,7 @@ def scene() -> SceneFile:
 
 
 def lines(progress: Callable[[int, int], None] | None = None) -> RangeLines:
-    """Return the scene's range lines. The first call simulates them, which takes minutes.
+    """Return the range lines of the scene. The first call simulates them, which takes minutes.
 
     Later calls read them from the cache (`clsas.core.cache.private_folder`).
     """
@@ -76,9 +76,10 @@ class Shadow:
 
     @cached_property
     def masks(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Positions [n, 2] of sand around the wreck, which are in shadow and which are lit, [n].
+        """Positions [n, 2] of sand around the wreck, and which are in shadow and which lit, [n].
 
-        Both hold from everywhere along the part of the track where the positions are visible.
+        A position counts as in shadow, or as lit, if it is so from the whole part of the track from
+        which it is visible.
         """
         seabed, track = self.scene.need("targets", "track")
         x_m, y_m = (
@@ -108,7 +109,7 @@ class Shadow:
     def contrast_db(self, image: Image, without_m: tuple[float, float] | None = None) -> float:
         """Return the mean power of lit sand over that of the shadow, dB.
 
-        Sand within 2 m along and across of the position `without_m` is left out.
+        Sand within 2 m of the position `without_m`, along and across, is left out.
         """
         ground, dark, light = self.masks
         if without_m is not None:

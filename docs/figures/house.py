@@ -17,8 +17,14 @@ FLOORS = (
         (
             ("exact", "the image, whatever it takes\ntiles, backprojection"),
             ("aperture", "which few stand for many?\nmean track, virtual channels"),
-            ("factorized", "the image, fast\ntree, stages, leaves, plans"),
-            ("planning", "which way is the fastest?\nwork, errors, search, plan"),
+            ("plans", "what has been decided?\nplan, predictions"),
+        ),
+        RED,
+    ),
+    (
+        (
+            ("factorized", "the image, fast\ngeometry, tree, stages, leaves"),
+            ("planning", "which way is the fastest?\nwork, errors, search, Imager"),
         ),
         RED,
     ),
@@ -50,6 +56,7 @@ FLOORS = (
 FLOWS = (
     "samples, positions, pixels",
     "directions, weights, spectra, buffers",
+    "exact images, virtual channels, plans",
     "plans, images",
     "corrected lines, findings, figures",
     "stored images, pictures",

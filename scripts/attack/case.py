@@ -1,4 +1,4 @@
-"""A small mosaic to attack: 48 patches of a swaying track, formed in some seconds."""
+"""A small mosaic to attack: 48 patches of a swaying track, which take some seconds to form."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ PATCHES = 48
 
 
 def write_scene(folder: Path) -> Path:
-    """Write the scene file; return where."""
+    """Write the scene file, and return its path."""
     path = folder / "scene.toml"
     path.write_text(SCENE)
     return path
 
 
 def command(scene: Path, store: Path, workers: int = 0) -> list[str]:
-    """Return the command that forms the mosaic, alone or in worker processes."""
+    """Return the command that forms the mosaic, in one process or with worker processes."""
     lines = next(iter(scene.parent.glob("*.lines.h5")), None)
     parts = [sys.executable, "-m", "clsas", "mosaic", scene, "-o", store]
     parts += ["--lines", lines] if lines else []

@@ -1,11 +1,12 @@
-"""Kill mosaics with SIGKILL, over and over; what is left must be whole, and the end bit-identical.
+"""Kill mosaics with SIGKILL over and over, and check that finished patches stay intact.
 
     python scripts/attack/kills.py --kills 200 --workers 0 2
 
 Every run is killed at a random moment: while it starts, or after some patches. Either all of its
-processes are killed, or the main one alone, or one worker. After every kill the patches that count
-as finished must be those of a mosaic that was never killed. After 10 kills the run is left to
-finish: the store must then equal the other, and hold no temporary file. Exits with 1 otherwise.
+processes are killed, or only the main process, or one worker. After every kill the finished patches
+must equal those of a mosaic that was never killed. After 10 kills the run may finish. The store
+must then equal the other bit by bit, and there must be no temporary files. Otherwise the exit code
+is 1.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from case import PATCHES, command, write_scene
 from clsas import Store
 
 KILLS_PER_STORE = 10
-ORPHANS_S = 60  # by when workers whose main process was killed must have ended
+ORPHANS_S = 60  # after which workers whose main process was killed must have ended
 DEADLINE_S = 600  # for one run
 
 
 class Miss(Exception):
-    """Something that a kill must not leave."""
+    """A state that a kill must not leave behind."""
 
 
 def run_and_kill(arguments: list[str], chance: random.Random, start_s: float, log: Path) -> str:
@@ -55,7 +56,7 @@ def run_and_kill(arguments: list[str], chance: random.Random, start_s: float, lo
         kind = "nothing"
     elif kind == "worker":
         chance.choice(workers).kill()
-        # The others do its work, unless it had not started yet: then the run ends with one error.
+        # The others take over its work. If it was still starting, the run ends with one error.
         if process.wait(DEADLINE_S) and "while it started" not in log.read_text().split("\n")[-2]:
             raise Miss(f"a run did not survive the loss of a worker:\n{log.read_text()[-2000:]}")
     elif kind == "main":
@@ -82,7 +83,7 @@ def family(pid: int) -> list[psutil.Process]:
 
 
 def in_session(leader: int) -> list[int]:
-    """Return the live processes of a session."""
+    """Return the ids of the live processes in a session."""
     found = []
     for pid in psutil.pids():
         try:
@@ -94,7 +95,7 @@ def in_session(leader: int) -> list[int]:
 
 
 def check_finished(path: Path, reference: Store) -> int:
-    """Compare the patches that count as finished; return how many there are."""
+    """Compare the finished patches with the reference, and return their number."""
     if not path.exists():
         return 0
     store = Store.opened(path)
@@ -107,17 +108,25 @@ def check_finished(path: Path, reference: Store) -> int:
 
 
 def check_chunk(path: Path, reference: Store, row: int, column: int) -> None:
-    """Compare a patch's pixels, bit by bit."""
+    """Compare the pixels of a patch with the reference, bit by bit."""
     ours, theirs = (each / "pixels" / "c" / f"{row}/{column}" for each in (path, reference.path))
     if ours.read_bytes() != theirs.read_bytes():
-        raise Miss(f"patch {row},{column} has other pixels")
+        raise Miss(f"the pixels of patch {row},{column} differ")
 
 
 def main() -> None:
-    """Kill, check, tell."""
+    """Kill runs, check what they leave, and report."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kills", type=int, default=200, help="for each number of workers")
-    parser.add_argument("--workers", type=int, nargs="+", default=[0, 2], help="0: no workers")
+    parser.add_argument(
+        "--kills", type=int, default=200, help="number of kills for each number of workers"
+    )
+    parser.add_argument(
+        "--workers",
+        type=int,
+        nargs="+",
+        default=[0, 2],
+        help="numbers of workers; 0 for a single process",
+    )
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     chance = random.Random(options.seed)
@@ -131,10 +140,10 @@ def main() -> None:
 
 
 def attack(folder: Path, workers: int, kills: int, chance: random.Random) -> None:
-    """Kill so many runs with so many workers."""
+    """Kill runs with a number of workers until there have been `kills` kills."""
     scene, log = write_scene(folder), folder / "log"
     reference = folder / "reference.zarr"
-    # The first run also simulates the lines; the one alone is the reference of all.
+    # The first run, in one process, also simulates the lines. Its mosaic is the reference.
     subprocess.run(command(scene, reference), check=True, capture_output=True)
     first = Store.opened(reference)
     start = time.monotonic()
@@ -159,9 +168,9 @@ def attack(folder: Path, workers: int, kills: int, chance: random.Random) -> Non
         if left := [str(each) for each in folder.rglob("*.part")]:
             raise Miss(f"temporary files are left: {left}")
         stores += 1
-    told = ", ".join(f"{kind} {count}" for kind, count in sorted(tally.items()))
+    kinds = ", ".join(f"{kind} {count}" for kind, count in sorted(tally.items()))
     print(
-        f"{workers or 'no'} workers: {done} kills ({told}), {stores} stores of {PATCHES} patches, "
+        f"{workers or 'no'} workers: {done} kills ({kinds}), {stores} stores of {PATCHES} patches, "
         "all bit-identical, no temporary file left",
         flush=True,
     )

@@ -1,12 +1,13 @@
-"""Image lines of difficult spectra, and hold what comes out to what was asked, or warned of.
+"""Image lines with difficult spectra, and compare errors with the requests or with warnings.
 
-Thin guard bands: echoes of four points by two pings of the thesis's sonar, compressed with less and
-less oversampling, flat and tilted by 10 dB, against the image of lines sampled four times as fine
-as their band. Offsets: lines on their carrier with a constant in all of them, against the oracle.
+Thin guard bands: echoes of four points from two pings of the thesis's sonar, with flat and tilted
+spectra (10 dB), are compressed with less and less oversampling. The reference is an image of lines
+with an oversampling of 4. Offsets: lines on their carrier contain a constant. The reference is the
+oracle.
 
     python scripts/attack/spectra.py [--device NAME]
 
-The exit code is 1 if any image errs by more than was asked without a warning that says by how much.
+The exit code is 1 if the error of any image exceeds the request, and no warning predicted it.
 """
 
 import argparse
@@ -31,7 +32,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", help="index, kind or name")
     device = parser.parse_args().device
-    print("error in dB: asked, measured (predicted), ! where a warning gave the prediction")
+    print("errors in dB: requested, measured (predicted); ! marks predictions that a warning gave")
     for length_m in (0.0, 2.5):
         for tilt_db in (0, 10, -10):
             guard_bands(tilt_db, length_m, device)
@@ -43,7 +44,7 @@ def main() -> None:
 
 
 def guard_bands(tilt_db: float, length_m: float, device: str | None) -> None:
-    """Image lines with ever thinner guard bands, that end `length_m` beside the points."""
+    """Image lines with ever thinner guard bands, which end `length_m` beyond the points."""
     sonar = clsas.Sonar.thesis_wide_beam()
     track = clsas.Track.straight((-0.264, 0, 0), (2, 0, 0), pings=2, ping_interval_s=0.264)
     span = (42.5 - length_m, 42.5 + length_m) if length_m else None
@@ -65,7 +66,7 @@ def guard_bands(tilt_db: float, length_m: float, device: str | None) -> None:
 
 
 def tilted(echoes: clsas.Echoes, tilt_db: float) -> clsas.Echoes:
-    """Return echoes whose spectrum rises by `tilt_db` over the pulse's band."""
+    """Return echoes whose spectrum rises by `tilt_db` over the band of the pulse."""
     frequency = np.fft.fftfreq(2 * echoes.length, 1 / echoes.sample_rate_hz)
     relative = np.clip(frequency / echoes.pulse.bandwidth_hz, -0.5, 0.5)
     padded = np.pad(echoes.samples, ((0, 0), (0, echoes.length)))
@@ -80,7 +81,7 @@ def report(
     error_db: Callable[[np.ndarray], float],
     device: str | None,
 ) -> None:
-    """Print one row of the table: the exact image and the factorized one."""
+    """Print one row of the table: errors of the exact and of the factorized image."""
     row = f"{name:45}"
     for asked_db in (-80, -50):
         with warnings.catch_warnings(record=True) as caught:

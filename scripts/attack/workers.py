@@ -2,9 +2,9 @@
 
     python scripts/attack/workers.py --workers 2
 
-Lists every port on which the run's processes listen and asks each as HTTP, as HTTPS, and as Dask
-does: in plain text, with TLS, and with a certificate of its own making. As root it does so as the
-user nobody. Exits with 1 if any of it is answered.
+The script lists every port on which processes of the run listen. It sends each port requests in
+HTTP and HTTPS, and in the protocol of Dask: in plain text, with TLS, and with a certificate that it
+made itself. If run as root, it does so as the user nobody. The exit code is 1 if any port answers.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SETTLED_S = 3.0  # after which all ports of a worker are open
 
 
 def listening(pid: int) -> dict[tuple[str, int], str]:
-    """Return the addresses where a process and those it started listen, and who it is."""
+    """Return the addresses where a process and its children listen, and which of them does."""
     found = {}
     with contextlib.suppress(psutil.NoSuchProcess):
         root = psutil.Process(pid)
@@ -58,12 +58,12 @@ def answers_http(address: tuple[str, int], page: str, encrypted: bool) -> bool:
             with connection:
                 connection.sendall(f"GET {page} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
                 return connection.recv(16).startswith(b"HTTP/")
-    except OSError:  # refused, reset, timed out, or TLS says no
+    except OSError:  # refused, reset, timed out, or rejected by TLS
         return False
 
 
 def answers_dask(address: tuple[str, int], security: Security | None, protocol: str) -> bool:
-    """Return whether a port lets a client ask who it is, before it would let it run code."""
+    """Return whether a port tells a Dask client its identity, the step before running code."""
 
     async def ask() -> bool:
         arguments = {} if security is None else security.get_connection_args("client")
@@ -93,13 +93,13 @@ def without_certificate() -> Security:
 
 
 def reached(addresses: list[tuple[str, int]]) -> list[str]:
-    """Return what of some ports answers a client that has no part in the run."""
+    """Return the answers of some ports to a client from outside the run."""
     with ThreadPoolExecutor(max(len(addresses), 1)) as pool:
         return [each for answers in pool.map(reached_at, addresses) for each in answers]
 
 
 def reached_at(address: tuple[str, int]) -> list[str]:
-    """Return what answers at one port."""
+    """Return the answers of one port."""
     name = f"{address[0]}:{address[1]}"
     found = [
         f"{name} answers {'HTTPS' if encrypted else 'HTTP'} {page}"
@@ -116,12 +116,12 @@ def reached_at(address: tuple[str, int]) -> list[str]:
         f"{name} answers Dask {way}" for way, how in ways.items() if answers_dask(address, *how)
     ]
     if not address[0].startswith("127.") and address[0] != "::1":
-        found.append(f"{name} is not of this machine alone")
+        found.append(f"{name} can be reached from other machines")
     return found
 
 
 def reached_by_another(addresses: list[tuple[str, int]]) -> list[str]:
-    """Return what `reached` does, as the user nobody if this one may become it."""
+    """Return the result of `reached` as the user nobody, if this process can change users."""
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe()
 
@@ -131,24 +131,24 @@ def reached_by_another(addresses: list[tuple[str, int]]) -> list[str]:
             os.setgid(NOBODY)
             os.setuid(NOBODY)
         theirs.send((os.geteuid(), reached(addresses)))
-        os._exit(0)  # without waiting for threads of unanswered questions
+        os._exit(0)  # without waiting for threads with unanswered requests
 
     process = context.Process(target=ask)
     process.start()
-    user, found = ours.recv() if ours.poll(600) else (None, ["asking did not end"])
+    user, found = ours.recv() if ours.poll(600) else (None, ["the requests did not end"])
     process.join()
-    print(f"asked {len(addresses)} ports as user {user}")
+    print(f"tried {len(addresses)} ports as user {user}")
     return found
 
 
 def attack(folder: Path, workers: int) -> list[str]:
-    """Start a run, ask all of its ports, let it finish; return what answered."""
+    """Start a run, try all of its ports, let it finish, and return the answers."""
     scene = write_scene(folder)
     subprocess.run(command(scene, folder / "alone.zarr"), check=True, capture_output=True)
     survey = folder / "survey"
     survey.mkdir()
     next(folder.glob("*.lines.h5")).rename(survey / "0.h5")
-    # A run that waits for more files lives until all was asked.
+    # A run that waits for more files lives until all ports have been tried.
     arguments = [*command(scene, folder / "a.zarr", workers), "--lines", str(survey)]
     process = subprocess.Popen(
         [*arguments, "--follow", "--idle-s", "3600"],
@@ -177,7 +177,7 @@ def attack(folder: Path, workers: int) -> list[str]:
 
 
 def main() -> None:
-    """Attack, tell."""
+    """Attack the workers, and report."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()

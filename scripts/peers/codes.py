@@ -1,4 +1,4 @@
-"""The codes that are compared, and the settings of each that are measured."""
+"""Codes that are compared, and the settings of each that are measured."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from peers.workers import PeerError, built, environment
 
 FASTSAR = "fastsar==0.1.8"
 TORCH = "torch==2.13.0"
-_NOT_GIVEN = "--torchbp takes a checkout of it, as it is not on PyPI"
+_NOT_GIVEN = "--torchbp must give a checkout, since it is not on PyPI"
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way of a code to an image.
+    """A code with settings that form an image.
 
     Attributes
     ----------
@@ -25,12 +25,12 @@ class Method:
     kind : str
         "exact" or "factorized".
     words : str
-        The settings, for a reader.
+        Settings, in words.
     settings : dict
-        The settings, for the code's program.
+        Settings, for the program that runs the code.
     best : bool
-        Whether these are the code's best at about -50 dB, or at the least error it reaches: tables
-        of cost against size and cores have these alone.
+        True if these are the code's best settings for about -50 dB, or for the least error that it
+        reaches. Tables of time by size and by cores contain only these.
     """
 
     code: str
@@ -42,14 +42,14 @@ class Method:
 
 @dataclass(frozen=True)
 class Code:
-    """An installed code: the Python that has it, and the program that runs it."""
+    """An installed code: the Python of its environment, and the program that runs it."""
 
     python: Path | str
     program: Path
 
 
 def installed(torchbp: Path | None) -> tuple[dict[str, Code], dict[str, str]]:
-    """Return the codes that are here, by name, and why the others are not."""
+    """Return the installed codes by name, and the reasons why others are missing."""
     codes, absent = {"clsas": Code(sys.executable, _program("clsas"))}, {}
     try:
         codes["FastSAR"] = Code(environment(FASTSAR, [FASTSAR]), _program("fastsar"))
@@ -69,7 +69,7 @@ def _program(code: str) -> Path:
 
 
 def methods(devices: list[str]) -> Iterator[Method]:
-    """Yield all methods: exact ones of every code, then factorized ones."""
+    """Yield all methods: first the exact ones of every code, then the factorized ones."""
     for device in devices:
         for level in (-50.0, -80.0):
             settings = {"device": device, "accuracy_db": level}
@@ -96,9 +96,9 @@ def methods(devices: list[str]) -> Iterator[Method]:
 
 
 def _torchbp_factorized() -> Iterator[Method]:
-    """Yield the settings that a sweep over these formers' few options left as the best.
+    """Yield the best settings from a sweep over the few options of these functions.
 
-    More stages are faster on a straight track, and miss what a circle holds.
+    More stages are faster on a straight track, but lose a part of what a circular track records.
     """
     adaptive = {"former": "cfbp_adaptive", "upsampling": 8}
     deep = {"stages": 6, "merge_cost": 4.0}

@@ -1,6 +1,6 @@
-"""Images by other codes beside those of clsas: `scripts/bench peers`.
+"""Comparison of other codes with clsas: `scripts/bench peers`.
 
-All codes form the same images, in turns. Each runs in a process of its own, other codes in
+All codes form the same images, in turns. Each code runs in a separate process. Other codes have
 environments of their own in the cache folder. FastSAR comes from PyPI, torchbp from a checkout.
 """
 
@@ -24,14 +24,14 @@ from studies import tables
 from clsas.exact import reference
 
 ERROR_PIXELS = 1000
-_LONG_S = 60.0  # an image that takes longer is formed once
+_LONG_S = 60.0  # an image that takes longer is formed only once
 SIZES = (256, 512, 1024, 2048)
 COLUMNS = ("image", "code", "settings", "seconds: median (min to max)", "planning s", "GBP/s")
 
 
 @dataclass
 class Measured:
-    """What a method took on a number of cores, and how much it erred; or why it refused."""
+    """Times and error of a method on a number of cores, or the reason why it refused."""
 
     method: Method
     cores: int | None
@@ -51,8 +51,9 @@ def error_db(
 ) -> float:
     """Return the rms error at some pixels over the rms of the image, dB.
 
-    The best common complex factor is taken out: other codes scale images by their own windows and
-    transforms. The level is that of all pixels, since few of an image of points are bright.
+    The best common complex factor is removed first, since other codes scale images by their windows
+    and transforms. The level is that of all pixels, since few pixels of an image of points are
+    bright.
     """
     found = pixels.ravel()[chosen].astype(np.complex128)
     factor = np.vdot(found, ideal) / np.vdot(found, found)
@@ -68,10 +69,10 @@ def measure(
     cores: Sequence[int | None] = (None,),
     repeats: int = 3,
 ) -> list[Measured]:
-    """Return what methods take for a scene, by turns.
+    """Return times and errors of methods for a scene, measured in turns.
 
-    A first image of each is not timed. One that takes more than a minute counts, and is not formed
-    again.
+    The first image of each method is not timed, unless it takes more than a minute. The method then
+    forms no further image.
     """
     lines, grid = scene.lines(), scene.grid
     count = min(ERROR_PIXELS, grid.size)
@@ -108,7 +109,7 @@ def measure(
 
 
 def row(one: Measured, pairs: int) -> list[str]:
-    """Return a method's row of the table of a track."""
+    """Return the row of a method in the table of a track."""
     method = one.method
     name = [method.kind, method.code, method.words]
     if one.refused:
@@ -122,11 +123,11 @@ def row(one: Measured, pairs: int) -> list[str]:
     ]
 
 
-def _told(one: Measured) -> str:
+def _in_words(one: Measured) -> str:
     return "refused" if one.refused else f"{one.median:.3f} s, {one.error_db:.0f} dB"
 
 
-def _say_absent(absent: dict[str, str]) -> None:
+def _print_absent(absent: dict[str, str]) -> None:
     for name, reason in absent.items():
         print(f"\n{name} is not measured: {reason}")
 
@@ -139,7 +140,7 @@ def _describe(track: str, scene: scenes.Scene, pixels: int) -> None:
 def peers(
     devices: list[str], tracks: Iterable[str], pixels: int | None, torchbp: Path | None
 ) -> None:
-    """Print times and true errors of exact and factorized images by all codes, per track."""
+    """Print times and true errors of exact and factorized images by all codes, for each track."""
     codes, absent = installed(torchbp)
     for track in tracks:
         side = pixels or scenes.PIXELS[track]
@@ -148,13 +149,13 @@ def peers(
         _describe(track, scene, side)
         found = measure(scene, codes, methods(devices))
         tables.table([*COLUMNS, "true error dB"], [row(one, pairs) for one in found])
-    _say_absent(absent)
+    _print_absent(absent)
 
 
 def peers_scaling(
     devices: list[str], tracks: Iterable[str], largest: int, torchbp: Path | None
 ) -> None:
-    """Print times and errors of the codes' best settings against the pixels along a side."""
+    """Print times and errors with the codes' best settings, by the number of pixels."""
     codes, absent = installed(torchbp)
     best = [method for method in methods(devices) if method.best]
     sizes = [size for size in SIZES if size <= largest]
@@ -163,7 +164,7 @@ def peers_scaling(
         for size in sizes:
             print(f"{track}, {size} x {size} pixels", file=sys.stderr, flush=True)
             found.append(measure(scenes.TRACKS[track](size), codes, best))
-        print(f"\n{track}: median of 3 (one that takes over a minute is formed once), and error\n")
+        print(f"\n{track}: median of 3 images (of 1 that takes over a minute), and error\n")
         rows = []
         for several in zip(*found, strict=True):
             method = several[0].method
@@ -172,9 +173,9 @@ def peers_scaling(
                 power = tables.exponent(sizes, [one.median for one in several])
                 grows = f"N^{power:.2f}"
             name = f"{method.code}, {method.words}"
-            rows.append([method.kind, name, *map(_told, several), grows])
-        tables.table(["image", "code, settings", *(f"N = {n}" for n in sizes), "at the end"], rows)
-    _say_absent(absent)
+            rows.append([method.kind, name, *map(_in_words, several), grows])
+        tables.table(["image", "code, settings", *(f"N = {n}" for n in sizes), "for large N"], rows)
+    _print_absent(absent)
 
 
 def peers_cores(
@@ -184,7 +185,7 @@ def peers_cores(
     cores: Sequence[int],
     torchbp: Path | None,
 ) -> None:
-    """Print times of the codes' best settings on several numbers of cores."""
+    """Print times with the codes' best settings, by the number of cores."""
     codes, absent = installed(torchbp)
     best = [method for method in methods(devices) if method.best]
     for track in tracks:
@@ -200,7 +201,7 @@ def peers_cores(
             if not any(one.refused for one in several):
                 gain = f"{several[0].median / several[-1].median:.2f}"
             name = f"{method.code}, {method.words}"
-            rows.append([method.kind, name, *map(_told, several), gain])
+            rows.append([method.kind, name, *map(_in_words, several), gain])
         counts = [f"{each} core{'s' * (each > 1)}" for each in cores]
         tables.table(["image", "code, settings", *counts, "gain"], rows)
-    _say_absent(absent)
+    _print_absent(absent)

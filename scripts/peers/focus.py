@@ -1,7 +1,8 @@
-"""Autofocus by torchbp beside that of clsas: `scripts/bench peers --autofocus`.
+"""Autofocus by torchbp and by clsas: `scripts/bench peers --autofocus`.
 
-Both get the same lines, said to be on a track without the sway. What they find moves the lines, and
-one judge forms the images of both: clsas, along the corrected and along the true track.
+Both codes receive the same lines, with the positions of a track without the sway. Their corrections
+are applied to these positions. clsas then forms the images of both, with the corrected and with the
+true tracks.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from peers.workers import worker
 from studies import focusing, navigating, tables
 
 import clsas
-from clsas.core.lines import wavelength_m
+from clsas.core.wavelengths import wavelength_m
 
 COLUMNS = (
     "scene",
@@ -52,7 +53,7 @@ RADAR_SETTINGS = {
 
 @dataclass(frozen=True)
 class Frame:
-    """torchbp's frame: horizontal axes from the middle of the track, x towards the image."""
+    """Frame of torchbp: horizontal axes from the middle of the track, x towards the image."""
 
     origin_m: NDArray[np.float64]
     axes: NDArray[np.float64]
@@ -68,13 +69,13 @@ class Frame:
         return cls(origin_m, np.stack([ahead, [-ahead[1], ahead[0], 0], [0, 0, 1]]))
 
     def of_points(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return points in this frame, [..., 3]."""
+        """Return the coordinates of points in this frame, [..., 3]."""
         return (points_m - self.origin_m) @ self.axes.T
 
     def moved(self, lines: clsas.RangeLines, by_m: NDArray[np.float64]) -> clsas.RangeLines:
-        """Return lines moved by displacements in this frame, less what no image shows of them.
+        """Return lines moved by displacements in this frame, without their mean and trend.
 
-        A shift or a turn of the track moves the image, and its peak between other pixels.
+        A shift or a turn of the track only moves the image, and its peak relative to the pixels.
         """
         seen_m = np.stack(
             [navigating.detrended(each) for each in by_m.T.astype(np.float64)], axis=1
@@ -84,7 +85,7 @@ class Frame:
 
 
 def corners_m(grid: clsas.Grid) -> NDArray[np.float64]:
-    """Return the corners of a plane grid, [2, 2, 3]."""
+    """Return the corners of a plane grid, metres [2, 2, 3]."""
     rows, columns = grid.shape
     corner_m, down_m, across_m = grid.vectors_m
     down, across = np.array([0, rows - 1]), np.array([0, columns - 1])
@@ -94,7 +95,7 @@ def corners_m(grid: clsas.Grid) -> NDArray[np.float64]:
 def polar_grid(
     points_m: NDArray[np.float64], range_step_m: float, sine_step: float
 ) -> dict[str, object]:
-    """Return the polar grid that holds points in the frame."""
+    """Return the polar grid that covers points in the frame."""
     x_m, y_m = points_m[..., 0].ravel(), points_m[..., 1].ravel()
     far_m, sine = np.hypot(x_m, y_m).max(), y_m / np.hypot(x_m, y_m)
     near_m = x_m.min()
@@ -108,29 +109,29 @@ def polar_grid(
 
 @dataclass(frozen=True)
 class Trial:
-    """Lines said to be on a wrong track, what is right, and how torchbp is to focus them.
+    """Lines with wrong positions, their true positions, and the settings of torchbp.
 
     Attributes
     ----------
     words : str
-        The scene.
-    true, told : RangeLines
-        Lines on their track, and on the track that both codes are told.
+        Description of the scene.
+    true, given : RangeLines
+        Lines with their true positions, and with those that both codes are given.
     grid : Grid
         Grid on which clsas focuses.
     peak_db : callable
-        Returns the peak of an image of lines over that of the true ones, dB.
+        Returns the peak of an image of lines over that of the true lines, dB.
     axes : dict
-        torchbp's grid, in its frame.
+        Grid of torchbp, in its frame.
     others : dict
-        What else torchbp is told.
+        Further inputs of torchbp.
     settings : dict
-        Settings of torchbp, by their words.
+        Settings of torchbp, by their description.
     """
 
     words: str
     true: clsas.RangeLines
-    told: clsas.RangeLines
+    given: clsas.RangeLines
     grid: clsas.Grid
     peak_db: Callable[[clsas.RangeLines], float]
     axes: dict[str, object]
@@ -139,36 +140,36 @@ class Trial:
 
     @property
     def frame(self) -> Frame:
-        """The frame in which torchbp works."""
-        return Frame.of(self.told, self.grid)
+        """Frame in which torchbp works."""
+        return Frame.of(self.given, self.grid)
 
     def left_m(self, lines: clsas.RangeLines) -> NDArray[np.float64]:
-        """Return what is left of the sway, without what no image shows."""
+        """Return the residual sway without mean and trend, metres."""
         return navigating.detrended((lines.tx_m - self.true.tx_m) @ self.frame.axes[0])
 
 
 def sonar_trials(device: str) -> Iterator[Trial]:
-    """Yield the scenes of `studies.focusing` that lie on its small grid."""
+    """Yield trials of the scenes of `studies.focusing` on its small grid."""
     small = {name: each for name, each in focusing.SCENES.items() if each.grid is focusing.GRID}
     for name, scene in small.items():
-        true, told = focusing.recorded(scene.targets, scene.sway_m)
-        frame = Frame.of(told, focusing.GRID)
-        sine_step = focusing.WAVELENGTH_M / (2.5 * np.ptp(told.tx_m[:, 0]))
+        true, given = focusing.recorded(scene.targets, scene.sway_m)
+        frame = Frame.of(given, focusing.GRID)
+        sine_step = focusing.WAVELENGTH_M / (2.5 * np.ptp(given.tx_m[:, 0]))
         points_m = frame.of_points(corners_m(focusing.GRID))
         yield Trial(
             f"{name}: {scene.smooth:g} smooth, {scene.white:g} white",
             true,
-            told,
+            given,
             focusing.GRID,
             partial(focusing.peak_db, true=true, device=device),
-            polar_grid(points_m, told.range_step_m, sine_step),
+            polar_grid(points_m, given.range_step_m, sine_step),
             {"element_wavelengths": focusing.SONAR.tx_length_m / focusing.WAVELENGTH_M},
             SONAR_SETTINGS,
         )
 
 
 def radar_trials(path: Path, device: str) -> Iterator[Trial]:
-    """Yield the recorded radar pass, with sways that nobody is told."""
+    """Yield trials of the recorded radar pass, with sways that neither code knows."""
     true, grid = focusing.radar_pass(path), focusing.RADAR_GRID
     given_db = focusing.reflector_db(true, device)
     frame = Frame.of(true, grid)
@@ -193,14 +194,14 @@ def radar_trials(path: Path, device: str) -> Iterator[Trial]:
 
 
 def rows(trial: Trial, device: str, code: Code | None) -> Iterator[list[str]]:
-    """Yield a row of what clsas finds, and rows of what torchbp does."""
+    """Yield a row for the result of clsas, and rows for those of torchbp."""
 
-    def told(words: str, code: str, lines: clsas.RangeLines, seconds: float) -> list[str]:
+    def row(words: str, code: str, lines: clsas.RangeLines, seconds: float) -> list[str]:
         left_m, wave_m = trial.left_m(lines), wavelength_m(lines)
         return [
             words,
             code,
-            f"{trial.peak_db(trial.told):.2f}" if words else "",
+            f"{trial.peak_db(trial.given):.2f}" if words else "",
             f"{trial.peak_db(lines):.2f}",
             f"{focusing.residual_m(left_m) / wave_m:.4f}",
             f"{focusing.smooth_residual_m(left_m) / wave_m:.4f}",
@@ -208,8 +209,8 @@ def rows(trial: Trial, device: str, code: Code | None) -> Iterator[list[str]]:
         ]
 
     start = time.perf_counter()
-    found = clsas.autofocus(trial.told, trial.grid, device=device)
-    yield told(trial.words, f"clsas, {device}", found.lines, time.perf_counter() - start)
+    found = clsas.autofocus(trial.given, trial.grid, device=device)
+    yield row(trial.words, f"clsas, {device}", found.lines, time.perf_counter() - start)
     if code is None:
         return
     frame = trial.frame
@@ -217,9 +218,9 @@ def rows(trial: Trial, device: str, code: Code | None) -> Iterator[list[str]]:
         scene_file, moved_file = Path(folder) / "scene.npz", Path(folder) / "moved.npy"
         np.savez(
             scene_file,
-            frame_m=frame.of_points(trial.told.tx_m),
-            range_step_m=trial.told.range_step_m,
-            **scenes.as_profiles(trial.told),
+            frame_m=frame.of_points(trial.given.tx_m),
+            range_step_m=trial.given.range_step_m,
+            **scenes.as_profiles(trial.given),
             **trial.axes,
             **trial.others,
         )
@@ -229,8 +230,8 @@ def rows(trial: Trial, device: str, code: Code | None) -> Iterator[list[str]]:
                 if "refused" in answer:
                     yield ["", f"torchbp, {words}", "", f"refused: {answer['refused']}", "", "", ""]
                 else:
-                    lines = frame.moved(trial.told, np.load(moved_file))
-                    yield told("", f"torchbp, {words}", lines, answer["seconds"])
+                    lines = frame.moved(trial.given, np.load(moved_file))
+                    yield row("", f"torchbp, {words}", lines, answer["seconds"])
 
 
 def peers_autofocus(device: str, torchbp: Path | None, recordings: Path | None) -> None:

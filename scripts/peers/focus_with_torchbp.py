@@ -1,8 +1,8 @@
-"""Autofocus by torchbp, for `scripts/bench peers --autofocus`; runs in an environment that has it.
+"""Autofocus by torchbp for `scripts/bench peers --autofocus`, run in an environment with torchbp.
 
-The frame of the scene is torchbp's: x is where the sonar looks, y is along-track, and the origin
-lies in the middle of the track. A sonar's image has a polar grid, for which torchbp takes the
-pattern of the elements into account; a radar's pass has a Cartesian one.
+The frame is that of torchbp: x is the look direction, y is along-track, and the origin is the
+middle of the track. Images of sonars have a polar grid, on which torchbp accounts for the pattern
+of the elements. Images of a radar pass have a Cartesian grid.
 """
 
 import sys
@@ -15,7 +15,7 @@ from torchbp import autofocus, ops
 
 LIGHT_M_S = 299_792_458.0
 SCENE = dict(np.load(sys.argv[1]))
-UPSAMPLING = 8  # it reads lines by linear interpolation
+UPSAMPLING = 8  # since torchbp interpolates lines linearly
 POSITIONS_M = torch.from_numpy(SCENE["frame_m"].astype(np.float32))
 GRID = {name: tuple(SCENE[name]) for name in ("r", "theta", "x", "y") if name in SCENE}
 GRID |= {name: int(SCENE[name]) for name in ("nr", "ntheta", "nx", "ny") if name in SCENE}
@@ -40,7 +40,7 @@ def lines() -> torch.Tensor:
 
 
 def pattern() -> dict:
-    """Return the two-way pattern of the elements, sinc^2, where there are elements."""
+    """Return the two-way pattern of the elements, sinc^2, or nothing if there are no elements."""
     if "element_wavelengths" not in SCENE:
         return {}
     widest = np.pi / 6
@@ -54,7 +54,7 @@ def pattern() -> dict:
 
 
 def answer(former: str, image_file: str, **settings: float | str) -> dict:
-    """Write the displacement of every position in the frame; return the seconds that it took."""
+    """Write the displacement of every position in the frame, and return the seconds taken."""
     start = time.perf_counter()
     with torch.inference_mode():
         data = lines()

@@ -1,6 +1,6 @@
-"""How a program beside `scripts/bench peers` answers: one line of JSON for every line of requests.
+"""Protocol of the programs that `scripts/bench peers` runs: a line of JSON answers each request.
 
-The programs run in environments of their own, so this file needs Python only.
+The programs run in other environments, so this module needs only Python.
 """
 
 import json
@@ -10,12 +10,12 @@ from collections.abc import Callable
 
 
 def serve(answer: Callable[..., dict]) -> None:
-    """Answer requests, objects of keyword arguments, until the standard input ends.
+    """Answer requests, which are objects of keyword arguments, until the standard input ends.
 
-    What raises is answered by `refused`, with the error's message.
+    If a request raises, the answer is `refused` with the message of the error.
     """
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what libraries print must not get between the answers
+    os.dup2(2, 1)  # output of libraries must not mix with the answers
     for line in sys.stdin:
         try:
             found = answer(**json.loads(line))

@@ -1,9 +1,9 @@
-"""Scenes that all codes image, and their lines in each code's conventions.
+"""Scenes that all codes image, and their lines in the conventions of each code.
 
-A scene has channels, all of which count in every pixel of a square image in the plane z = 0. The
-straight track is that of the benchmark case `bp-2k`, or of a part of it. The circle has a radius of
-15 m and looks down on its middle from 8 m. The helix is that of the case `ffbp-helix`, in air: all
-150 turns from 150 pixels along a side on, fewer turns with fewer pixels.
+All channels of a scene contribute to every pixel of a square image in the plane z = 0. The straight
+track is that of the benchmark case `bp-2k`, or a part of it. The circle has a radius of 15 m and a
+height of 8 m above its centre. The helix is that of the case `ffbp-helix`, in air. It has all 150
+turns for 150 or more pixels along each side, and fewer turns for fewer pixels.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from clsas.trials.dense_cases import DenseCase, helix
 
 Scene = Case | DenseCase
 PADDING = 64  # zeros at both ends of a line, which keep its echoes from wrapping around
-LIGHT_M_S = 299_792_458.0  # the speed of waves in codes for radar
+LIGHT_M_S = 299_792_458.0  # the speed of waves that codes for radar assume
 
-# Along a full circle images resolve a quarter of a wavelength, 3 mm. With 4 channels to a pixel
-# along the side, neighbouring channels see phases of the farthest pixels half a cycle apart.
+# With a full circle, images resolve a quarter of a wavelength, 3 mm. With 4 channels per pixel
+# along the side, phases of the farthest pixels change by half a cycle from channel to channel.
 _CIRCLE_PIXEL_M = 2.5e-3
 _CIRCLE_CHANNELS = 4
 _PER_TURN = 360  # channels of the helix
 
 
 def straight(pixels: int) -> Case:
-    """Return the part of `bp-2k` with so many pixels along either side, and as many channels."""
+    """Return the part of `bp-2k` with a number of pixels along each side, and as many channels."""
     whole = cases.EXACT_CASES["bp-2k"]
     (left, right), (near, far) = whole.x_m, whole.y_m
     steps = (pixels - 1) / (whole.pixels - 1)
@@ -58,12 +58,12 @@ def circle(pixels: int) -> DenseCase:
 
 
 def spiral(pixels: int) -> DenseCase:
-    """Return as many turns of the helix of `ffbp-helix` as pixels along a side of 0.24 m."""
+    """Return as many turns of the helix of `ffbp-helix` as pixels along each side of 0.24 m."""
     whole = cases.FACTORIZED_CASES["ffbp-helix"]
     assert isinstance(whole, DenseCase)
 
     def track() -> NDArray[np.float64]:
-        # The middle of the whole track, whose turns are 5 mm apart.
+        # Take the middle part of the whole track, whose turns are 5 mm apart.
         spare = (len(whole.track()) - _PER_TURN * pixels) // 2
         return whole.track()[max(spare, 0) :][: _PER_TURN * pixels]
 
@@ -72,11 +72,11 @@ def spiral(pixels: int) -> DenseCase:
 
 TRACKS = {"straight": straight, "circle": circle, "helix": spiral}
 PIXELS = {"straight": 1024, "circle": 512, "helix": 150}
-"""Pixels along a side, unless others are asked for."""
+"""Default number of pixels along each side."""
 
 
 def write(path: Path, scene: Scene, lines: clsas.RangeLines) -> None:
-    """Write lines and grid to a file, in the conventions of every code."""
+    """Write lines and grid to a file, in the conventions of all codes."""
     grid = scene.grid
     corner_m, down_m, across_m = grid.vectors_m
     rows, columns = grid.shape
@@ -99,13 +99,13 @@ def write(path: Path, scene: Scene, lines: clsas.RangeLines) -> None:
 
 
 def waves(lines: clsas.RangeLines, count: int) -> NDArray[np.int64]:
-    """Return the waves along `count` samples: within half a cycle a sample of the lines' centre."""
+    """Return wavenumbers, in cycles per `count` samples, around the centre of the lines' band."""
     centre = round(measure_spectrum(lines).centre * count)
     return np.arange(-(count // 2), count - count // 2) + centre
 
 
 def odd_length(least: int) -> int:
-    """Return an odd length, so that no wave is exactly half a cycle off, whose FFT is fast."""
+    """Return an odd length with a fast FFT; odd, so that no wave is exactly half a cycle off."""
     length = scipy.fft.next_fast_len(least)
     while length % 2 == 0:
         length = scipy.fft.next_fast_len(length + 1)
@@ -113,7 +113,7 @@ def odd_length(least: int) -> int:
 
 
 def as_history(lines: clsas.RangeLines) -> dict[str, object]:
-    """Return lines as samples over frequency, as of a radar with the same wavelengths.
+    """Return lines as samples over frequency, like those of a radar with the same wavelengths.
 
     A point of amplitude A at range R gives S[p, k] = A exp(-j 4 pi f_k (R - ref_p) / c) in channel
     p at frequency f_k, with c the speed of light.
@@ -137,9 +137,9 @@ def as_history(lines: clsas.RangeLines) -> dict[str, object]:
 
 
 def as_profiles(lines: clsas.RangeLines) -> dict[str, object]:
-    """Return lines that all begin at one range, as of a radar with the same wavelengths.
+    """Return lines that begin at the same range, like those of a radar with the same wavelengths.
 
-    Lines are moved to the common range by the shift theorem; zeros fill them up.
+    The shift theorem moves lines to the common range, and zeros extend them.
     """
     begin_m = lines.first_range_m.min() - PADDING * lines.range_step_m
     shift = (lines.first_range_m - begin_m) / lines.range_step_m

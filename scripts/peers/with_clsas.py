@@ -1,6 +1,6 @@
-"""Images by clsas, for `scripts/bench peers`: a process of its own, as the other codes have.
+"""Images by clsas for `scripts/bench peers`, in a separate process like the other codes.
 
-The plan of a factorized image is made once for each setting, and that time is told apart.
+The plan of a factorized image is made once for each setting, and its time is reported separately.
 """
 
 import sys
@@ -34,7 +34,7 @@ GRID = clsas.Grid.plane(
 
 @cache
 def planned(tolerance_db: float, device: str) -> tuple[clsas.Plan, float]:
-    """Return a plan, and the seconds that it took."""
+    """Return a plan and the seconds that planning took."""
     start = time.perf_counter()
     plan = clsas.plan(LINES, GRID, tolerance_db=tolerance_db, device=device)
     return plan, time.perf_counter() - start
@@ -46,7 +46,7 @@ def answer(
     accuracy_db: float | None = None,
     tolerance_db: float | None = None,
 ) -> dict:
-    """Form an image, exact or factorized; return the seconds of planning and of imaging."""
+    """Form an exact or factorized image; return the seconds of planning and of imaging."""
     plan, planning = (None, 0.0) if tolerance_db is None else planned(tolerance_db, device)
     start = time.perf_counter()
     if plan is None:

@@ -1,7 +1,8 @@
-"""Images by FastSAR, for `scripts/bench peers`; runs in an environment that holds FastSAR.
+"""Images by FastSAR for `scripts/bench peers`, run in an environment with FastSAR.
 
-Formers are set up once for each setting, and that time is told apart: FastSAR plans for a geometry,
-which it can use again. A mosaic plans in the same call as it forms. Its own timers tell both apart.
+Formers are set up once for each setting, and that time is reported separately, since FastSAR can
+reuse the plan for a geometry. A mosaic is planned and formed in the same call, and FastSAR's timers
+separate the two.
 """
 
 import os
@@ -11,15 +12,15 @@ import warnings
 from collections.abc import Callable
 from functools import cache
 
-# One patch after the other, with timers: planning beside an image would share its cores.
+# Form one patch after the other, with timers. Otherwise planning would share the cores of imaging.
 os.environ.update(FASTSAR_TIMING="1", FASTSAR_MOSAIC_PREFETCH="0")
 
 import numpy as np
 from fastsar import ExactFormer, ImageFormer, ffbp_cpu, patches
 from protocol import serve
 
-warnings.simplefilter("ignore")  # of predicted errors; the table has the true ones
-ffbp_cpu.lib()  # compiles its kernels, which planning should not count
+warnings.simplefilter("ignore")  # about predicted errors; the table has the true ones
+ffbp_cpu.lib()  # compiles the kernels, which should not count as planning
 SCENE = dict(np.load(sys.argv[1]))
 (COLUMNS, ROWS), (STEP_X, STEP_Y) = SCENE["pixels"].tolist(), SCENE["step_m"].tolist()
 CENTRE_M = SCENE["corner_m"] + [COLUMNS / 2 * STEP_X, ROWS / 2 * STEP_Y, 0.0]
@@ -29,7 +30,7 @@ SAMPLES = SCENE["history"].shape[1]
 
 @cache
 def exact(interpolator: str, upsampling: int) -> tuple[Callable, float]:
-    """Return a former of exact images, and the seconds that its setup took."""
+    """Return a former of exact images and the seconds that its setup took."""
     start = time.perf_counter()
     former = ExactFormer(
         SCENE["positions_m"],
@@ -52,10 +53,10 @@ def exact(interpolator: str, upsampling: int) -> tuple[Callable, float]:
 
 @cache
 def whole(target_db: float) -> tuple[Callable, float]:
-    """Return a former of the whole image, and the seconds that its setup took.
+    """Return a former of the whole image and the seconds that its setup took.
 
-    FastSAR's own rule chooses final tiles by its predicted error, on a finer grid where they are
-    too large for a wave to be taken as plane.
+    FastSAR's rule chooses final tiles by the predicted error. If they are too large for the
+    approximation of plane waves, it uses a finer grid.
     """
     start = time.perf_counter()
     positions_m = SCENE["positions_m"] - CENTRE_M
@@ -86,7 +87,7 @@ def whole(target_db: float) -> tuple[Callable, float]:
 
 
 def mosaic(patch: int, target_db: float) -> tuple[np.ndarray, float, float]:
-    """Return an image of patches, and the seconds of planning and of all the rest."""
+    """Return an image of patches, the seconds of planning, and the seconds of all the rest."""
     timers = patches._Timer.acc
     timers.clear()
     start = time.perf_counter()

@@ -1,8 +1,8 @@
-"""Images by torchbp, for `scripts/bench peers`; runs in an environment that holds torchbp.
+"""Images by torchbp for `scripts/bench peers`, run in an environment with torchbp.
 
-torchbp's x is ground range and its y is along-track, so both are exchanged. It reads range lines by
-linear interpolation and leaves their oversampling to its caller: that is done here, within the time
-that is told. It plans nothing.
+In torchbp x is ground range and y is along-track, so both are exchanged here. torchbp interpolates
+range lines linearly and leaves their oversampling to the caller; it is done here, and its time is
+included. There is no planning.
 """
 
 import os
@@ -15,7 +15,7 @@ import torch
 import torchbp
 from protocol import serve
 
-warnings.simplefilter("ignore")  # of guard bands; the table has the true errors
+warnings.simplefilter("ignore")  # about guard bands; the table has the true errors
 torch.set_num_threads(len(os.sched_getaffinity(0)))
 LIGHT_M_S = 299_792_458.0
 SCENE = dict(np.load(sys.argv[1]))
@@ -24,7 +24,7 @@ CENTRE_HZ, BEGIN_M = float(SCENE["centre_hz"]), float(SCENE["begin_m"])
 RANGE_STEP_M = float(SCENE["range_step_m"])
 BAND_HZ = float(np.diff(SCENE["band_hz"])[0])
 PROFILES = torch.from_numpy(SCENE["profiles"])
-# The frame's origin is the middle of the track, as its polar grids want it.
+# The origin is the middle of the track, as the polar grids of torchbp require.
 MIDDLE_M = SCENE["positions_m"].mean(axis=0) * [1, 1, 0]
 POSITIONS_M = torch.from_numpy((SCENE["positions_m"] - MIDDLE_M)[:, [1, 0, 2]].astype(np.float32))
 LEFT_M, NEAR_M, _ = SCENE["corner_m"] - MIDDLE_M
@@ -37,7 +37,7 @@ CARTESIAN = {
 
 
 def upsampled(factor: int) -> dict:
-    """Return lines with so many samples for one, as arguments of every former."""
+    """Return arguments of every former, with lines upsampled by a factor."""
     spectrum = torch.fft.fft(PROFILES, dim=-1)
     count = spectrum.shape[1]
     half = (count + 1) // 2
@@ -54,11 +54,11 @@ def upsampled(factor: int) -> dict:
 
 
 def polar_grid(oversampling: float, lanczos: int) -> dict:
-    """Return the polar grid of the image, with room for its interpolation."""
+    """Return the polar grid of the image, with a margin for its interpolation."""
     across_m = np.array([NEAR_M, NEAR_M + (ROWS - 1) * STEP_Y])
     along_m = np.array([LEFT_M, LEFT_M + (COLUMNS - 1) * STEP_X])
     if across_m[0] <= 0:
-        raise ValueError("its polar grids hold only what lies to one side of the track")
+        raise ValueError("polar grids of torchbp cover only one side of the track")
     x_m, y_m = np.meshgrid(across_m, np.append(along_m, np.clip(0, *along_m)))
     range_m = np.hypot(x_m, y_m)
     sine = y_m / range_m
@@ -78,7 +78,7 @@ def polar_grid(oversampling: float, lanczos: int) -> dict:
 
 
 def exact(upsampling: int) -> torch.Tensor:
-    """Return the image of every channel in every pixel."""
+    """Return the exact image, to which every channel contributes in every pixel."""
     return torchbp.ops.backprojection_cart_2d(grid=CARTESIAN, **upsampled(upsampling))
 
 

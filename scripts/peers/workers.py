@@ -1,4 +1,4 @@
-"""Environments that hold other codes, and the processes in which every code runs."""
+"""Environments for other codes, and the processes in which the codes run."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _BUILD = ("setuptools", "packaging", "wheel", "ninja", "numpy", "scipy")
 
 
 class PeerError(Exception):
-    """Another code cannot be installed or run here."""
+    """A code cannot be installed or run on this machine."""
 
 
 def environment(name: str, *requirements: Sequence[str | Path]) -> Path:
-    """Return the Python of an environment of a name; make it if needed.
+    """Return the Python of an environment, which is created if necessary.
 
-    Each of the requirements are the arguments of one call of pip, one after the other.
+    Each entry of `requirements` contains the arguments of one call of pip.
     """
     folder = private_folder("peers") / name
     python = folder / "bin" / "python"
@@ -50,12 +50,12 @@ def environment(name: str, *requirements: Sequence[str | Path]) -> Path:
 
 
 def built(folder: Path, torch: str) -> Path:
-    """Return the Python of an environment that holds a checkout of torchbp; build it if needed.
+    """Return the Python of an environment with torchbp, which is built if necessary.
 
-    A copy of the checkout is built. Another state of its sources has another environment.
+    The build uses a copy of the checkout. Every state of the sources has its own environment.
     """
     if not (folder / "setup.py").exists() or not (folder / "torchbp").is_dir():
-        raise PeerError(f"{folder} is no checkout of torchbp: it has no setup.py and torchbp/")
+        raise PeerError(f"{folder} is not a checkout of torchbp: it lacks setup.py or torchbp/")
     digest = hashlib.sha256(torch.encode())
     for path in sorted(each for each in (folder / "torchbp").rglob("*") if each.is_file()):
         if path.suffix in {".py", ".cpp", ".h", ".cu", ".cuh"}:
@@ -77,13 +77,13 @@ def worker(
 ) -> Iterator[Ask]:
     """Yield a function that sends a request to the program of a code and returns its answer.
 
-    With a number of cores the program has no more than so many, and is told so in the ways that
-    OpenMP and PoCL listen to.
+    If a number of cores is given, the program may use no more. Its affinity and the environment
+    variables of OpenMP and PoCL are set accordingly.
     """
     environ, allowed = dict(os.environ), os.sched_getaffinity(0)
     if cores is not None:
         if cores > len(allowed):
-            raise PeerError(f"{cores} cores were asked for, and {len(allowed)} are there")
+            raise PeerError(f"{cores} cores were requested, but only {len(allowed)} are available")
         environ |= {"OMP_NUM_THREADS": str(cores), "POCL_MAX_PTHREAD_COUNT": str(cores)}
         os.sched_setaffinity(0, sorted(allowed)[:cores])  # the program inherits it
     try:
@@ -106,13 +106,15 @@ def worker(
         except BrokenPipeError:
             line = ""
         if not line:
-            raise PeerError(f"{program.name} ended with {process.wait()}, its messages are above")
+            raise PeerError(
+                f"{program.name} ended with exit code {process.wait()}; its messages are above"
+            )
         return json.loads(line)
 
     try:
         yield ask
     except BaseException:
-        process.kill()  # its image may take minutes
+        process.kill()  # an image in progress may take minutes
         raise
     finally:
         process.communicate()

@@ -1,8 +1,9 @@
-"""Print which effects the images of docs/assess.md need, and the time that each costs.
+"""Print which effects the images of docs/assess.md need, and the time that each effect costs.
 
-The thesis's case and the wreck are assessed as surveys, the two recordings as lines. Of the radar
-also with what is known of it and does not matter: that the aircraft flies on during flight, and
-that every pixel has a height, the same. The thesis's case also over a sloping seabed.
+The thesis's case and the wreck are assessed as surveys, the two recordings as lines. The radar
+recording is also assessed with two known effects that do not matter: the motion of the aircraft
+during the flight of a pulse, and a height for every pixel, which is the same for all. The thesis's
+case is also assessed over a sloping seabed.
 
     python scripts/real/effects.py [CASE ...] [--device NAME] [--repeats 5]
 """
@@ -29,11 +30,11 @@ from clsas.measures.assessment_result import Assessment
 from clsas.opencl.device import open_device
 
 AIRCRAFT_M_S = 100.0
-"""About what the aircraft flew: its positions are known, their times are not."""
+"""Approximate speed of the aircraft, whose positions are known, but not their times."""
 
 
 def survey(name: str, **simulate: Any) -> dict[str, Any]:
-    """Return what `clsas.assess` takes of a built-in scene."""
+    """Return the arguments of `clsas.assess` for a built-in scene."""
     scene = config.parse_scene(config.built_in_scene(name), name=name, folder=Path())
     lines = clsas.survey_lines(scene.sonar, scene.track, scene.grid, **simulate, **scene.compress)
     return {
@@ -48,19 +49,19 @@ def survey(name: str, **simulate: Any) -> dict[str, Any]:
 
 
 def recorded_block() -> dict[str, Any]:
-    """Return the ultrasonic recording."""
+    """Return lines and grid of the ultrasonic recording."""
     path = recordings.folder() / ultrasound.RECORDING
     return {"lines": ultrasound.range_lines(path), "grid": ultrasound.GRID}
 
 
 def recorded_car_park() -> dict[str, Any]:
-    """Return the first degree of the radar recording."""
+    """Return lines and grid of the first degree of the radar recording."""
     path = recordings.folder() / radar.RECORDINGS[0]
     return {"lines": radar.range_lines(path), "grid": radar.GRID}
 
 
 def car_park_in_full() -> dict[str, Any]:
-    """Return the same with velocities and a height map."""
+    """Return the same lines and grid with velocities and a height map."""
     given = recorded_car_park()
     lines, grid = given["lines"], given["grid"]
     course = np.gradient(lines.tx_m, axis=0)
@@ -73,7 +74,7 @@ def car_park_in_full() -> dict[str, Any]:
 
 
 def thesis_over_a_slope() -> dict[str, Any]:
-    """Return the thesis's case 8 m above a seabed that falls by 5 %, which is given as heights."""
+    """Return the thesis's case 8 m above a seabed with a slope of 5 %, given as heights."""
     given = survey("thesis_wide_beam")
     x_m, y_m = given["grid"].axes_m
     heights_m = np.broadcast_to(-8.0 - 0.05 * (y_m[:, None] - 40.0), (len(y_m), len(x_m)))
@@ -93,11 +94,11 @@ CASES: dict[str, Callable[[], dict[str, Any]]] = {
 
 
 def show(name: str, found: Assessment) -> None:
-    """Print a table of Markdown."""
+    """Print an assessment as a Markdown table."""
     print(
         f"\n**{name}**: {found.channels} channels, {' x '.join(map(str, found.pixels))} pixels, "
-        f"tolerance {found.tolerance_db:g} dB; {1e3 * found.seconds:.0f} ms with all that is "
-        f"modelled, {1e3 * found.simple_seconds:.0f} ms as it is formed\n"
+        f"tolerance {found.tolerance_db:g} dB; {1e3 * found.seconds:.0f} ms with all effects "
+        f"modelled, {1e3 * found.simple_seconds:.0f} ms as imagers form it\n"
     )
     columns = ("effect", "modelled", "error", "wavelengths, at most", "needed", "time", "left out")
     print("| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
@@ -113,7 +114,7 @@ def show(name: str, found: Assessment) -> None:
 
 
 def show_exact(given: dict[str, Any], device: str | None, repeats: int) -> None:
-    """Print what the exact image takes with all that is modelled and as it is formed, in turns."""
+    """Print the times of the exact image with all effects and as imagers form it, in turns."""
     seconds: dict[bool, list[float]] = {True: [], False: []}
     opened = open_device(device)
     for turn in range(repeats + 1):
@@ -132,19 +133,21 @@ def show_exact(given: dict[str, Any], device: str | None, repeats: int) -> None:
                 times.append(time.perf_counter() - start)
     full, simple = (min(times) for times in seconds.values())
     left_out = ", ".join(preparation.left_out) or "nothing"
-    print(f"\nExact: {full:.2f} s with all, {simple:.2f} s as it is formed (without {left_out})")
+    print(f"\nExact: {full:.2f} s with all effects, {simple:.2f} s as formed (without {left_out})")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("case", nargs="*", help=f"of {', '.join(CASES)} (default: all)")
+    parser.add_argument("case", nargs="*", help=f"case: {', '.join(CASES)} (default: all)")
     parser.add_argument("--device", help="part of an OpenCL device's name, or its index")
-    parser.add_argument("--repeats", type=int, default=5, help="images of each kind (default: 5)")
-    parser.add_argument("--tolerance-db", type=float, help="instead of each case's own")
+    parser.add_argument(
+        "--repeats", type=int, default=5, help="number of images of each kind (default: 5)"
+    )
+    parser.add_argument("--tolerance-db", type=float, help="tolerance instead of that of each case")
     arguments = parser.parse_args()
     for name in arguments.case or CASES:
         if name not in CASES:
-            parser.error(f"there is no case {name!r}: {', '.join(CASES)}")
+            parser.error(f"there is no case {name!r}; cases are {', '.join(CASES)}")
         given = CASES[name]()
         if arguments.tolerance_db is not None:
             given["tolerance_db"] = arguments.tolerance_db

@@ -1,7 +1,7 @@
 """Image airborne X-band radar recordings (GOTCHA): a car park on the plane z = 0.
 
-Every file holds one degree of a circle of 7 km radius, flown 7 km above the scene. The images of
-all files are added up coherently.
+Every file contains one degree of a circle of 7 km radius, flown 7 km above the scene. The images of
+all files are added coherently.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ GRID = clsas.Grid.plane(x=(-50.0, 50.0, 1001), y=(-50.0, 50.0, 1001))
 
 
 def range_lines(path: Path) -> clsas.RangeLines:
-    """Read a recording as range lines, with a Hamming window over frequency.
+    """Return range lines of a recording, with a Hamming window over frequency.
 
-    The lines are one period, c/(2 df), of range, centred on the range that a pulse is referenced
-    to. Their outermost metre fades out: a sharp end would be interpolated with an error of -65 dB
-    all along the line.
+    The lines cover one period of range, c/(2 df), centred on the range to which a pulse is
+    referenced. Their outermost metre fades out, since sharp ends would cause an interpolation error
+    of -65 dB along the whole line.
     """
     return clsas.read_phase_history(path, window="hamming").tapered_ends(1.0)
 
 
 def find_brightest(image: clsas.Image) -> PointResponse:
-    """Measure the brightest point of the image."""
+    """Return the response of the brightest point of the image."""
     x_m, y_m = image.grid.axes_m
     row, column = np.unravel_index(np.abs(image.pixels).argmax(), image.grid.shape)
     return clsas.measure_point(image, (x_m[column], y_m[row]), extent_m=10.0)
 
 
 def report(name: str, image: clsas.Image, pulses: int, out: Path) -> PointResponse:
-    """Print what the brightest point is like, draw the image and return the point."""
+    """Print the properties of the brightest point, draw the image, and return the point."""
     point = find_brightest(image)
     print(
         f"{name}: {pulses} pulses; brightest at x = {point.x_m:.2f} m, y = {point.y_m:.2f} m, "

@@ -1,4 +1,4 @@
-"""Where the recordings are, and what the programs that image them have in common."""
+"""Folder of the recordings, and the command line of the programs that image them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def folder() -> Path:
 
 
 def parse_arguments(description: str | None, default: Sequence[str]) -> argparse.Namespace:
-    """Return the command line's `recording` (paths), `out` (a folder, made here) and `device`.
+    """Return the arguments `recording` (paths), `out` (a folder, created here) and `device`.
 
     Parameters
     ----------
     description : str, optional
-        What the program does.
+        Description of the program.
     default : sequence of str
-        The recordings, relative to `folder()`, that are imaged when none is named.
+        Recordings, relative to `folder()`, that are imaged by default.
     """
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument(
@@ -35,7 +35,7 @@ def parse_arguments(description: str | None, default: Sequence[str]) -> argparse
         "or else in ../shared/data beside the repository)",
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("out"), help="folder of the pictures (default: out)"
+        "--out", type=Path, default=Path("out"), help="folder for the pictures (default: out)"
     )
     parser.add_argument("--device", help="part of an OpenCL device's name, or its index")
     arguments = parser.parse_args()

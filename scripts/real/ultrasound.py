@@ -1,7 +1,7 @@
 """Image an ultrasonic full-matrix capture of a notched aluminium block.
 
-Every element of a linear array transmitted in turn and every other one received: a bistatic
-recording, of real samples that are still on their carrier.
+The elements of a linear array transmitted in turn, and all others received. The recording is
+bistatic and consists of real samples, which still have their carrier.
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ from clsas.measures.quality import PointResponse
 RECORDING = "fmc_aluminium/contact_notch_aluminium.mat"
 SOUND_SPEED_M_S = 6320.0  # longitudinal waves in aluminium
 
-# The section below the array, which lies along x at depth y = 0.
+# Section below the array, which lies along x at the depth y = 0.
 GRID = clsas.Grid.plane(x=(-20e-3, 20e-3, 401), y=(2e-3, 45e-3, 431))
 
 
 def range_lines(path: Path) -> clsas.RangeLines:
-    """Read a recording as range lines: its analytic signals, mixed down.
+    """Return range lines of a recording: its analytic signals after mixing down.
 
-    The pulse is not known, and short enough to do without. The band from 0 to twice the array's
-    frequency holds all of it. The window is zero at both ends: a constant offset of the samples
-    leaves nothing, and neither transmission nor back wall rings through the image.
+    The pulse is unknown, but short enough that no compression is needed. Its spectrum lies between
+    0 and twice the frequency of the array. The window is zero at both ends of this band. It
+    therefore removes a constant offset of the samples, and neither transmission nor back wall
+    rings.
     """
     return clsas.read_full_matrix(path, sound_speed_m_s=SOUND_SPEED_M_S)
 
 
 def find_notch_tip(image: clsas.Image) -> PointResponse:
-    """Measure the brightest point inside the block: 10 mm or more from either face."""
+    """Return the response of the brightest point that is 10 mm or more from both faces."""
     x_m, depth_m = image.grid.axes_m
     inside = (depth_m > 10e-3) & (depth_m < 30e-3)
     amplitude = np.where(inside[:, None], np.abs(image.pixels), 0)
@@ -42,7 +43,7 @@ def find_notch_tip(image: clsas.Image) -> PointResponse:
 
 
 def back_wall_depth_m(image: clsas.Image) -> np.ndarray:
-    """Return the depth of the strongest echo beyond 30 mm, per column within 4 mm of x = 0."""
+    """Return the depth of the strongest echo below 30 mm, for columns within 4 mm of x = 0."""
     x_m, depth_m = image.grid.axes_m
     below = depth_m > 30e-3
     strip = np.abs(image.pixels[below][:, np.abs(x_m) < 4e-3])
@@ -50,7 +51,7 @@ def back_wall_depth_m(image: clsas.Image) -> np.ndarray:
 
 
 def draw(image: clsas.Image, tip: PointResponse, path: Path) -> None:
-    """Write the section as it is drawn in this trade: depth downwards, millimetres."""
+    """Write a picture of the section in the usual way: depth downwards, in millimetres."""
     figure = plot.image_db(image, dynamic_range_db=50, title="Aluminium block, notch and back wall")
     axes = figure.axes[0]
     axes.invert_yaxis()
@@ -79,7 +80,7 @@ def main() -> None:
         level_db = 20 * np.log10(tip.amplitude / np.abs(image.pixels).max())
         print(
             f"  notch tip: x = {1e3 * tip.x_m:.2f} mm, depth {1e3 * tip.y_m:.2f} mm, "
-            f"{level_db:.1f} dB of the greatest; {1e3 * tip.azimuth.resolution_m:.2f} mm wide "
+            f"{level_db:.1f} dB re the maximum; {1e3 * tip.azimuth.resolution_m:.2f} mm wide "
             f"and {1e3 * tip.range.resolution_m:.2f} mm deep (-3 dB)\n"
             f"  back wall: depth {1e3 * np.median(wall_m):.1f} mm, "
             f"varies by {1e3 * np.ptp(wall_m):.1f} mm over the middle 8 mm"

@@ -1,8 +1,8 @@
-"""The wreck, recorded by an array on a track that nobody knows: what micronavigation restores.
+"""The wreck, recorded from an unknown track, and its image after micronavigation.
 
-A part of the scene of `clsas.trials.wreck`: 18 m of the wreck's 25 m along the track, with its
-shadow, from 120 of 200 pings. They are half as far apart, so that four of the six phase centres
-overlap. The navigation says that the track is straight.
+The scene is a part of that of `clsas.trials.wreck`: 18 m of the wreck's 25 m along the track, with
+its shadow, from 120 of 200 pings. The pings are half as far apart, so that four of the six phase
+centres overlap. According to the navigation the track is straight.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from clsas.sonar.track import Track, channels
 from clsas.trials import wreck
 
 POINT_M = (-6.0, 54.0, 0.0)
-"""A reflector on the sand before the wreck."""
+"""Position of a reflector on the sand in front of the wreck."""
 RANGE_M = (54.0, 78.0)
-"""Ranges on the sand and the wreck, for micronavigation."""
+"""Nearest and farthest range for micronavigation, over sand and wreck."""
 
 _PINGS, _ADVANCE_M, _HEIGHT_M = 120, 0.2, 20.0
-_SWAY_M, _PERIOD = 0.2, 80.0  # pings: of the sway in the scene of the wreck, 16 m
-_AMPLITUDE = 60.0  # of the reflector: 30 dB above the sand
+_SWAY_M, _PERIOD = 0.2, 80.0  # pings: 16 m, the period of the sway in the scene of the wreck
+_AMPLITUDE = 60.0  # of the reflector, 30 dB above the sand
 _DENSITY_M2 = 400.0
 
 
@@ -57,21 +57,21 @@ sway_sd_m = 0.3
 yaw_sd_deg = 3.0
 surge_sd_m = 0.02
 """
-"""The scene file of the chain: what a user would write."""
+"""Scene file for `clsas process`, as a user would write it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Lines of one passage, with two tracks.
+    """Lines of one passage, with two sets of positions.
 
     Attributes
     ----------
-    true, told : RangeLines
-        With the positions of the track itself, and of the navigation.
+    true, given : RangeLines
+        Lines with the positions of the true track, and with those of the navigation.
     """
 
     true: RangeLines
-    told: RangeLines
+    given: RangeLines
 
 
 @dataclass(frozen=True)
@@ -83,9 +83,9 @@ class Measures:
     peak_db : float
         Level of the reflector.
     azimuth_m, range_m : float
-        Its widths at -3 dB.
+        Widths of the reflector at -3 dB.
     contrast_db : float
-        Power of lit sand over that of the wreck's shadow.
+        Power of lit sand over that of the wreck's shadow, dB.
     """
 
     peak_db: float
@@ -95,7 +95,7 @@ class Measures:
 
     @classmethod
     def of(cls, image: Image, shadow: wreck.Shadow) -> Measures:
-        """Return the measures of an image; raises ValueError if the reflector shows no peak."""
+        """Return the measures of an image; raise ValueError if the reflector has no peak."""
         point = measure_point(image, near=POINT_M[:2], extent_m=1.0)
         return cls(
             level_db(image),
@@ -106,14 +106,14 @@ class Measures:
 
 
 def level_db(image: Image) -> float:
-    """Return the largest level within half a metre of the reflector, dB."""
+    """Return the largest level within 0.5 m of the reflector, dB."""
     x_m, y_m = image.grid.axes_m
     near = np.ix_(np.abs(y_m - POINT_M[1]) < 0.5, np.abs(x_m - POINT_M[0]) < 0.5)
     return 20 * float(np.log10(np.abs(image.pixels[near]).max()))
 
 
 def recorded(progress: Callable[[int, int], None] | None = None) -> Recording:
-    """Simulate the recording, which takes about a minute on two cores."""
+    """Return the simulated recording, which takes about a minute on two cores."""
     sonar = Sonar.edgetech()
     course = (-_ADVANCE_M * (_PINGS - 1) / 2, 0.0, _HEIGHT_M), (_ADVANCE_M, 0, 0), _PINGS, 1.0
     turn = 2 * np.pi / _PERIOD
@@ -127,5 +127,5 @@ def recorded(progress: Callable[[int, int], None] | None = None) -> Recording:
         PointTargets([POINT_M], [_AMPLITUDE]),
     )
     lines = compress(simulate(sonar, true, targets, progress=progress), window="hamming")
-    told = channels(sonar, Track.straight(*course))
-    return Recording(lines, replace(lines, tx_m=told.tx_m, rx_m=told.rx_m))
+    given = channels(sonar, Track.straight(*course))
+    return Recording(lines, replace(lines, tx_m=given.tx_m, rx_m=given.rx_m))

@@ -1,4 +1,4 @@
-"""Autofocus against tracks that it is not told."""
+"""Autofocus of lines whose true track it does not know."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, wavelength_m
+from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import wavelength_m
 from clsas.exact.backprojection import form_exactly
 from clsas.files.phase_histories import read_phase_history
 from clsas.navigation.autofocus import IMAGE_TOLERANCE_DB, Autofocus, autofocus
@@ -34,14 +35,17 @@ GRID = Grid.plane(x=(1.5, 6.5, 320), y=(18.0, 21.0, 220))
 LARGE_PINGS, LARGE_GRID = 1500, Grid.plane(x=(1.5, 28.5, 1000), y=(18.0, 27.0, 1000))
 SONAR = Sonar(Pulse(100e3, 30e3, 1e-3), [[0.0, 0.0, 0.0]], tx_length_m=0.06, rx_length_m=0.06)
 
-_SMOOTHED = 12  # pings, over which the smooth part of a residual is a mean
-_REPEATS = 5  # in turns, of which the fastest counts
+_SMOOTHED = 12  # pings: standard deviation of the Gaussian that smooths residuals
+_REPEATS = 5  # runs in turns, of which the fastest counts
 
 
 def smooth_m(
     rms_m: float, seed: int = 0, *, pings: int = PINGS, correlated: float = 75
 ) -> NDArray[np.float64]:
-    """Return displacements that change over some pings, without what no image shows."""
+    """Return displacements that vary over some pings, without mean and trend.
+
+    Images do not depend on the latter.
+    """
     noise = np.random.default_rng(seed).standard_normal(pings + 1000)
     return _scaled(detrended(gaussian_filter1d(noise, correlated)[500 : 500 + pings]), rms_m)
 
@@ -86,7 +90,7 @@ def speckle(bright: int, seed: int = 0) -> PointTargets:
 
 
 def recorded(scene: PointTargets, sway_m: NDArray[np.float64]) -> tuple[RangeLines, RangeLines]:
-    """Return lines of a swaying track: as they are, and as the navigation has them."""
+    """Return lines from a swaying track, with its true positions and with those of navigation."""
     course = (0, 0, 0), (STEP_M, 0, 0), len(sway_m), 1.0
     track = Track.straight(*course, sway_m=sway_m)
     far_m = max(22.5, float(scene.positions_m[:, 1].max()) + 1)
@@ -101,7 +105,7 @@ def peak_db(
     *,
     grid: Grid = GRID,
 ) -> float:
-    """Return the brightest pixel of lines over that of the true ones, dB."""
+    """Return the peak of an image of lines over that of the true lines, dB."""
     image, ideal = (
         np.abs(factorize(each, grid, -40.0, device=device).pixels).max() for each in (lines, true)
     )
@@ -109,10 +113,16 @@ def peak_db(
 
 
 def residual_m(error_m: NDArray[np.float64], smoothed: float = 0) -> float:
-    """Return the rms of what is left of a sway, [pings], the largest of any 400 pings.
+    """Return the rms residual sway, metres: the largest over any 400 pings.
 
-    Over so many pings a response stays in the beam. A trend of theirs is left out. `smoothed` is
-    the number of pings of a mean.
+    A response stays in the beam for that many pings. Their mean and trend are removed.
+
+    Parameters
+    ----------
+    error_m : float64 [pings]
+        Residual sway.
+    smoothed : float
+        Standard deviation in pings of a Gaussian that smooths the residual first, or 0.
     """
     worst_m = 0.0
     for first in range(0, max(len(error_m) - PINGS, 0) + 1, PINGS // 4):
@@ -123,22 +133,22 @@ def residual_m(error_m: NDArray[np.float64], smoothed: float = 0) -> float:
 
 
 def smooth_residual_m(error_m: NDArray[np.float64]) -> float:
-    """Return the rms of what is left of the smooth part of a sway, [pings]."""
+    """Return the rms of the smooth part of a residual sway [pings], metres."""
     return residual_m(error_m, _SMOOTHED)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene and a sway, in wavelengths rms.
+    """A scene and a sway.
 
     Attributes
     ----------
     bright : int or None
-        Bright points in speckle; None for isolated points.
+        Number of bright points in speckle; None for isolated points.
     smooth, white : float
-        Sway that changes over some metres, and from ping to ping.
+        Rms sway, in wavelengths, that varies over some metres and from ping to ping.
     seed : int
-        Of the smooth sway.
+        Seed of the smooth sway.
     points : int
         Number of isolated points.
     grid : Grid
@@ -162,7 +172,7 @@ class Scene:
 
     @property
     def sway_m(self) -> NDArray[np.float64]:
-        """Sway of every ping."""
+        """Sway of every ping, metres."""
         smooth = smooth_m(self.smooth * WAVELENGTH_M, self.seed, pings=self.pings)
         return smooth + white_m(self.white * WAVELENGTH_M, pings=self.pings)
 
@@ -188,18 +198,18 @@ COLUMNS = (
 
 
 def rows(devices: Iterable[str]) -> Iterator[list[str]]:
-    """Yield peaks before and after autofocus, the residual sway, and the processor time."""
+    """Yield rows of peaks before and after autofocus, residual sway, and processor time."""
     for device in devices:
         for name, scene in SCENES.items():
             sway_m = scene.sway_m
-            true, told = recorded(scene.targets, sway_m)
-            found, images = _timed(told, scene.grid, device)
+            true, given = recorded(scene.targets, sway_m)
+            found, images = _timed(given, scene.grid, device)
             left_m = found.correction_m[:, 1] - sway_m
             left = residual_m(left_m) / WAVELENGTH_M
             yield [
                 f"{name}, {device}",
                 f"{scene.smooth:g} smooth, {scene.white:g} white",
-                f"{peak_db(told, true, device, grid=scene.grid):.2f}",
+                f"{peak_db(given, true, device, grid=scene.grid):.2f}",
                 f"{peak_db(found.lines, true, device, grid=scene.grid):.2f}",
                 f"{left:.4f}",
                 f"{smooth_residual_m(left_m) / WAVELENGTH_M:.4f}",
@@ -208,7 +218,7 @@ def rows(devices: Iterable[str]) -> Iterator[list[str]]:
 
 
 def _timed(lines: RangeLines, grid: Grid, device: str) -> tuple[Autofocus, float]:
-    """Return the result of autofocus, and its processor time in planned images, least of a few."""
+    """Return the result of autofocus, and its least processor time over that of an image."""
 
     def image() -> None:
         factorize(lines, grid, IMAGE_TOLERANCE_DB, device=device)
@@ -227,11 +237,13 @@ def _seconds(work: Callable[[], object]) -> float:
 
 RADAR_GRID = Grid.plane(x=(-37.0, 37.0, 500), y=(-37.0, 37.0, 500))
 RADAR_ERRORS = (0.0, 0.0), (0.3, 0.0), (2.0, 0.0), (0.0, 0.1), (1.0, 0.05)
-"""Sway given to a recorded pass, wavelengths rms: smooth, and from ping to ping."""
+"""Sway added to a recorded pass, wavelengths rms: smooth, and from ping to ping."""
 RADAR_COLUMNS = ("sway, wavelengths", "before, dB", "after, dB", "sharpness", "time in images")
 
-_REFLECTOR = Grid.plane(x=(-17.6, -13.6, 161), y=(19.6, 23.6, 161))  # around the brightest one
-_CORRELATED_PULSES = 15  # pulses over which the smooth sway changes
+_REFLECTOR = Grid.plane(
+    x=(-17.6, -13.6, 161), y=(19.6, 23.6, 161)
+)  # around the brightest reflector
+_CORRELATED_PULSES = 15  # pulses over which the smooth sway varies
 
 
 def radar_pass(path: str | os.PathLike) -> RangeLines:
@@ -240,7 +252,7 @@ def radar_pass(path: str | os.PathLike) -> RangeLines:
 
 
 def swaying(lines: RangeLines, smooth: float, white: float) -> RangeLines:
-    """Return lines said to be on a track with a sway, in wavelengths rms."""
+    """Return lines with a sway, in wavelengths rms, added to their positions."""
     wave_m = wavelength_m(lines)
     passage = Passage.of(lines, ("sway",), wave_m)
     sway_m = smooth_m(smooth * wave_m, pings=passage.pings, correlated=_CORRELATED_PULSES)
@@ -250,20 +262,20 @@ def swaying(lines: RangeLines, smooth: float, white: float) -> RangeLines:
 
 
 def reflector_db(lines: RangeLines, device: Device | str | None = None) -> float:
-    """Return the peak of the recording's brightest reflector, dB."""
+    """Return the level of the brightest reflector of the recording, dB."""
     image = form_exactly(lines, _REFLECTOR, device=device, accuracy_db=-50)
     return float(20 * np.log10(np.abs(image.pixels).max()))
 
 
 def radar_rows(path: str | os.PathLike, devices: Iterable[str]) -> Iterator[list[str]]:
-    """Yield the reflector's peak beside that of the given track, before and after autofocus."""
+    """Yield rows of the reflector's peak over that with the given track, before and after."""
     lines = radar_pass(path)
     for device, (smooth, white) in itertools.product(devices, RADAR_ERRORS):
-        told, given_db = swaying(lines, smooth, white), reflector_db(lines, device)
-        found, images = _timed(told, RADAR_GRID, device)
+        given, given_db = swaying(lines, smooth, white), reflector_db(lines, device)
+        found, images = _timed(given, RADAR_GRID, device)
         yield [
             f"{smooth:g} smooth, {white:g} white; {device}",
-            f"{reflector_db(told, device) - given_db:.2f}",
+            f"{reflector_db(given, device) - given_db:.2f}",
             f"{reflector_db(found.lines, device) - given_db:+.2f}",
             f"{found.sharpness_before:.0f} to {found.sharpness_after:.0f}",
             f"{images:.1f}",

@@ -1,7 +1,7 @@
-"""Micronavigation against tracks that it is not told, and against the bound of its errors.
+"""Micronavigation of lines whose true track it does not know, and the bound of its errors.
 
-The array is that of `Sonar.sensotek`, whose 24 first and last receivers overlap from ping to ping;
-those in between are left out, since micronavigation does not use them.
+The array is that of `Sonar.sensotek`, whose first and last 24 receivers overlap from ping to ping.
+The receivers in between are left out, since micronavigation does not use them.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ SPACING_M = WAVELENGTH_M / 2
 RECEIVERS, OVERLAPPING = 96, 24
 COHERENCES = (0.95, 0.7, 0.5)
 CELL_M = 0.0207
-"""Length over which speckle of this bandwidth is correlated in range."""
+"""Correlation length in range of speckle with this bandwidth, metres."""
 
-_RANGE_M = 60.0, 66.0  # of the swath against the bound
-_ANTENNA_M = WAVELENGTH_M  # length of the elements
+_RANGE_M = 60.0, 66.0  # swath for the comparison with the bound
+_ANTENNA_M = WAVELENGTH_M  # length of an element
 
 
 def overlapping_array(receivers: int, overlapping: int) -> tuple[Sonar, float]:
-    """Return a sonar of one-wavelength elements, and its advance from ping to ping, metres.
+    """Return a sonar with elements of one wavelength, and its advance per ping, metres.
 
-    Only the receivers that overlap, at both ends, are there.
+    It has only the receivers at both ends, which overlap from ping to ping.
     """
     pulse = Pulse(carrier_hz=100e3, bandwidth_hz=37.5e3, duration_s=1e-3)
     at = WAVELENGTH_M * (np.arange(receivers) - (receivers - 1) / 2)
@@ -57,7 +57,7 @@ def overlapping_array(receivers: int, overlapping: int) -> tuple[Sonar, float]:
 def seabed(
     track: Track, near_m: float, far_m: float, count: int, *, side: int = 1, seed: int = 5
 ) -> PointTargets:
-    """Return points spread evenly over all that a wide beam sees within some ranges: speckle."""
+    """Return speckle: random points over all that a wide beam covers within some ranges."""
     random = np.random.default_rng(seed)
     x = track.positions_m[:, 0]
     along_m = random.uniform(x.min() - far_m, x.max() + far_m, count)
@@ -73,7 +73,7 @@ def said_to_be_on(lines: RangeLines, sonar: Sonar, track: Track) -> RangeLines:
 
 
 def with_noise(lines: RangeLines, coherence: float, random: np.random.Generator) -> RangeLines:
-    """Return lines with noise of their own spectrum, so that pairs have a coherence."""
+    """Return lines with noise of the same spectrum, so that pairs have the given coherence."""
     spectrum = np.sqrt(np.mean(np.abs(np.fft.fft(lines.samples, axis=1)) ** 2, axis=0))
     white = random.standard_normal((*lines.samples.shape, 2)) @ [1, 1j]
     noise = np.fft.ifft(np.fft.fft(white, axis=1) * spectrum, axis=1)
@@ -83,15 +83,15 @@ def with_noise(lines: RangeLines, coherence: float, random: np.random.Generator)
 
 
 def detrended(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return values without their mean and linear trend, which no image shows of a track."""
+    """Return values without mean and linear trend, which only move the image of a track."""
     at = np.arange(len(values))
     return values - np.polyval(np.polyfit(at, values, 1), at)
 
 
 def bound(coherence: float, cells: float, pairs: int) -> tuple[float, float]:
-    """Return the least standard deviations of sway (m) and yaw (rad) from ping to ping.
+    """Return lower bounds of the standard deviations of sway (m) and yaw (rad) per ping.
 
-    See `clsas.micronavigate`; `cells` is the number of independent samples.
+    See `clsas.micronavigate`. `cells` is the number of independent samples.
     """
     phase = np.sqrt((1 - coherence**2) / (2 * cells * coherence**2))
     sway_m = WAVELENGTH_M / (4 * np.pi) * phase / np.sqrt(pairs)
@@ -100,7 +100,7 @@ def bound(coherence: float, cells: float, pairs: int) -> tuple[float, float]:
 
 @cache
 def straight_lines(pings: int = 21) -> RangeLines:
-    """Return lines of a straight track over speckle, 60 to 66 m away."""
+    """Return lines from a straight track over speckle, at ranges of 60 to 66 m."""
     sonar, advance_m = overlapping_array(RECEIVERS, OVERLAPPING)
     track = Track.straight((0, 0, 0), (advance_m, 0, 0), pings, 1.0)
     near_m, far_m = _RANGE_M
@@ -109,7 +109,7 @@ def straight_lines(pings: int = 21) -> RangeLines:
 
 
 def noisy_runs(count: int = 8, seed: int = 1) -> dict[float, list[Micronavigation]]:
-    """Return results for some realisations of noise on `straight_lines`, by coherence."""
+    """Return results for several realisations of noise on `straight_lines`, by coherence."""
     random = np.random.default_rng(seed)
     return {each: _noisy_runs(each, count, random) for each in COHERENCES}
 
@@ -131,36 +131,36 @@ def _noisy_runs(coherence: float, count: int, random: np.random.Generator) -> li
 def against_bound(
     runs: list[Micronavigation], name: str, coherence: float
 ) -> tuple[float, float, float]:
-    """Return the standard deviation and bias of steps, over the bound, and the intervals' cover.
+    """Return standard deviation and bias of steps over the bound, and the coverage of intervals.
 
     Parameters
     ----------
     runs : list of Micronavigation
-        Of several realisations of noise.
+        Results for several realisations of noise.
     name : {"sway", "yaw"}
     coherence : float
-        Of pairs.
+        Coherence of pairs.
 
     Returns
     -------
     deviation, bias : float
-        Over the bound.
+        Standard deviation and bias over the bound.
     cover : float
-        Share of errors within 1.96 of their own standard deviations.
+        Share of errors within 1.96 predicted standard deviations.
     """
     unit = "m" if name == "sway" else "rad"
     found = np.array([getattr(run, f"{name}_steps_{unit}") for run in runs])
-    told = np.array([getattr(run, f"{name}_steps_sd_{unit}") for run in runs])
+    predicted = np.array([getattr(run, f"{name}_steps_sd_{unit}") for run in runs])
     least = bound(coherence, np.ptp(_RANGE_M) / CELL_M, OVERLAPPING)[name == "yaw"]
-    # The mean of few runs takes a little of each with it.
+    # Subtracting the mean of few runs reduces their scatter, which the factor restores.
     away = (found - found.mean(axis=0)) * np.sqrt(len(runs) / (len(runs) - 1))
     deviation = float(np.sqrt(np.mean(found.var(axis=0, ddof=1))))
-    cover = float(np.mean(np.abs(away) <= 1.96 * told))
+    cover = float(np.mean(np.abs(away) <= 1.96 * predicted))
     return deviation / least, float(found.mean()) / least, cover
 
 
 def bound_rows() -> Iterator[list[str]]:
-    """Yield the errors of steps against the bound, by coherence."""
+    """Yield rows of the errors of steps over the bound, by coherence."""
     for coherence, found in noisy_runs().items():
         for name in ("sway", "yaw"):
             deviation, bias, cover = against_bound(found, name, coherence)
@@ -172,16 +172,16 @@ BOUND_COLUMNS = ("coherence", "step", "sd over the bound", "bias over the bound"
 
 @dataclass(frozen=True, eq=False)
 class Voyage:
-    """A recording of an array that moves unknown to its navigation.
+    """A recording of an array whose motion its navigation does not know.
 
     Attributes
     ----------
     told, true : RangeLines
-        With the positions of the navigation, and of the true track.
+        Lines with the positions of the navigation, and with those of the true track.
     range_m : (float, float)
-        Swath that the echoes come from.
+        Swath from which the echoes come.
     target_m : (x, y, z)
-        A bright point.
+        Position of a bright point.
     """
 
     told: RangeLines
@@ -191,7 +191,7 @@ class Voyage:
 
     @property
     def aperture_m(self) -> float:
-        """Length of the synthetic aperture of the target: its range times the beam's width."""
+        """Length of the target's synthetic aperture: its range times the beam width, metres."""
         return self.target_m[1] * WAVELENGTH_M / _ANTENNA_M
 
 
@@ -207,8 +207,8 @@ def voyage(
 ) -> Voyage:
     """Return a voyage over speckle and a bright point, with 0.2 m of sway and 1 degree of yaw.
 
-    `sway_pings` and `yaw_pings` are their periods, and `bright` is the point's amplitude over that
-    of single points of the speckle.
+    `sway_pings` and `yaw_pings` are the periods of these motions. `bright` is the amplitude of the
+    bright point over that of single points of the speckle.
     """
     sonar, advance_m = overlapping_array(RECEIVERS, overlapping)
     course = (0, 0, 0), (advance_m, 0, 0), pings, 1.0
@@ -226,7 +226,7 @@ def voyage(
 
 
 def navigated(voyage: Voyage, window_m: float | None = None) -> Micronavigation:
-    """Return what micronavigation finds of a voyage, in windows of a length in range."""
+    """Return the result of micronavigation for a voyage, with windows of a length in range."""
     return micronavigate(
         voyage.told,
         range_m=voyage.range_m,
@@ -238,9 +238,9 @@ def navigated(voyage: Voyage, window_m: float | None = None) -> Micronavigation:
 
 
 def residual_m(voyage: Voyage, found: RangeLines) -> float:
-    """Return the largest rms error of positions across the track within a synthetic aperture.
+    """Return the largest rms error across the track within any synthetic aperture, metres.
 
-    A shift and a linear trend within an aperture move the image and are left out.
+    Mean and linear trend within an aperture only move the image, and are removed.
     """
     error_m = (found.phase_centres_m - voyage.true.phase_centres_m)[:, 1]
     along_m = voyage.true.phase_centres_m[:, 0]
@@ -256,7 +256,7 @@ def residual_m(voyage: Voyage, found: RangeLines) -> float:
 def point_against_true(
     voyage: Voyage, found: RangeLines, device: Device | str | None = None
 ) -> tuple[float, float]:
-    """Return the bright point's peak (dB) and width along the track, over the true track's."""
+    """Return peak (dB) and width along the track of the point, over those with the true track."""
     x, y, _ = voyage.target_m
     grid = Grid.plane(x=(x - 0.5, x + 0.5, 401), y=(y - 0.5, y + 0.5, 201))
     made = [
@@ -273,11 +273,11 @@ VOYAGE_COLUMNS = ("track", "residual, wavelengths", "peak dB", "width")
 
 
 def voyage_rows(devices: Iterable[str]) -> Iterator[list[str]]:
-    """Yield residual, peak and width of an unknown track, before and after micronavigation."""
+    """Yield rows of residual, peak and width for an unknown track, before and after."""
     made = voyage()
     found = navigated(made)
     for device in devices:
-        for name, lines in (("as told", made.told), ("navigated", found.lines)):
+        for name, lines in (("as recorded", made.told), ("navigated", found.lines)):
             peak_db, width = point_against_true(made, lines, device)
             residual = residual_m(made, lines) / WAVELENGTH_M
             coherence = f"{np.median(found.coherence):.2f}"
@@ -293,14 +293,14 @@ def voyage_rows(devices: Iterable[str]) -> Iterator[list[str]]:
 def jitter_followed(
     path: str | os.PathLike, rms_s: float
 ) -> tuple[NDArray[np.float64], Micronavigation]:
-    """Return delays given to the transmissions of a full matrix capture, and what is found.
+    """Return delays added to the transmissions of a full matrix capture, and the result.
 
     Parameters
     ----------
     path : path-like
-        A MATLAB file as of `clsas.read_full_matrix`, of a line array over a wall at 40 mm.
+        A MATLAB file for `clsas.read_full_matrix`, of a line array over a wall at 40 mm.
     rms_s : float
-        Size of the delays.
+        Rms value of the delays, s.
     """
     data = scipy.io.loadmat(path, simplify_cells=True)["exp_data"]
     time_s, sound_m_s = np.ravel(data["time"]), float(data["ph_velocity"])

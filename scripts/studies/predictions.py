@@ -1,4 +1,4 @@
-"""Predicted against measured times of the benchmarks' cases."""
+"""Predicted and measured times of the benchmarks' cases."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from studies.tables import TOLERANCES_DB
 
 COLUMNS = ("case", "dB", "subimages", "predicted s", "measured s: median (min to max)", "ratio")
 ACCURACIES_DB = (-50.0, -80.0)
-"""Accuracies of cases of exact imaging."""
+"""Accuracies for the cases of exact imaging."""
 
 
 def requests(names: Sequence[str] | None = None) -> list[tuple[str, float]]:
-    """Return cases, all or some, with the accuracies or tolerances that the benchmarks use, dB."""
+    """Return all or some cases with the accuracies or tolerances of the benchmarks, dB."""
     known: dict[str, tuple[float, ...]] = dict.fromkeys(cases.EXACT_CASES, ACCURACIES_DB)
     known |= {case: TOLERANCES_DB.get(case, (-50.0,)) for case in cases.FACTORIZED_CASES}
     return [(case, asked_db) for case in names or known for asked_db in known[case]]
 
 
 def known_costs(device: Device) -> KnownCosts:
-    """Return the costs that a plan would use: those stored, or else scaled ones."""
+    """Return the costs that a plan would use: stored ones, or else scaled ones."""
     known = costs.load(device)
     return scaling.scaled(device) if known.source == "default" else known
 
@@ -48,10 +48,7 @@ def title(device: Device) -> str:
 def rows(
     device: Device, names: Sequence[str] | None = None, repeats: int = 5
 ) -> Iterator[list[str]]:
-    """Yield a row of the table for every request.
-
-    Costs are those of `known_costs`.
-    """
+    """Yield a row of the table for every request, with the costs of `known_costs`."""
     known = known_costs(device)
     for case, asked_db in requests(names):
         sides, predicted_s, form = _prepared(case, asked_db, device, known)
@@ -71,7 +68,7 @@ def rows(
 def _prepared(
     case: str, asked_db: float, device: Device, known: KnownCosts
 ) -> tuple[str, float, Callable[[], object]]:
-    """Return the sides of the subimages, the predicted time, and what forms the image."""
+    """Return the sides of the subimages, the predicted time, and a function to form the image."""
     described = (cases.EXACT_CASES | cases.FACTORIZED_CASES)[case]
     lines, grid, beam = described.lines(), described.grid, described.beam
     if case in cases.EXACT_CASES:
@@ -80,7 +77,7 @@ def _prepared(
         return "", float(known.costs.seconds(work)), form
     chosen = plan(lines, grid, tolerance_db=asked_db, beam=beam, device=device, costs=known.costs)
     sides = ", ".join(f"{rows} x {columns}" for rows, columns in chosen.sides)
-    # A copy has no geometry of an earlier image.
+    # A copy of the plan lacks the geometry of an earlier image.
     return (
         sides or "exact",
         chosen.predicted_seconds,
@@ -89,7 +86,7 @@ def _prepared(
 
 
 def _seconds(act: Callable[[], object]) -> float:
-    """Return the time that something takes."""
+    """Return the time that a call takes."""
     start = time.perf_counter()
     act()
     return time.perf_counter() - start

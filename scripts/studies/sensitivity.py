@@ -1,4 +1,4 @@
-"""Sensitivity of plans and images to tuned constants: each is set to half and twice its value."""
+"""Sensitivity of plans and images to tuned constants, at half and twice their values."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ from clsas.trials import cases
 ROOMS = ("planning", "factorized", "aperture", "exact")
 MODULES = ("clsas.signal.spectrum", "clsas.signal.ambiguity", "clsas.signal.interpolation")
 FIXED = {
-    "clsas.planning.calibration": "it measures costs, which the cases are given",
+    "clsas.planning.calibration": "measures costs, which are given for the cases",
     "clsas.planning.scaling": "as calibration",
     "clsas.planning.timed_images": "as calibration",
     "clsas.exact.checks": "limits of input",
     "clsas.exact.reference": "the float64 reference",
-    "clsas.exact.wavenumber": "another imager, with a tool of its own",
+    "clsas.exact.wavenumber": "another imager, which has its own tool",
     "STACK HELD CHUNK GUARD PHASES _GROUP _FINE VECTOR_ROOM": "layouts that kernels share",
     "_FAR _LARGEST_HALF _LEAST_HALF _MOST_EXPONENT _SINGULAR": "limits of number formats",
     "BEST_TOLERANCE_DB WORST_TOLERANCE_DB BEST_ACCURACY_DB": "limits of input",
     "ACCURACY_DB TOLERANCE_DB NEAREST_UPSAMPLING": "defaults of the interface",
 }
-"""Modules and constants that are left alone, and why."""
+"""Modules and constants that are not varied, and why."""
 
-_SLOW_EXACT = Costs(pixel_ns=1e3, point_ns=1e3)  # makes small images worth a factorization
+_SLOW_EXACT = Costs(pixel_ns=1e3, point_ns=1e3)  # so that small images are factorized
 _REFERENCE_DB = -80.0
-_RUNS = 3  # of which the fastest counts
+_RUNS = 3  # runs, of which the fastest counts
 
 
 @dataclass(frozen=True)
@@ -61,13 +61,13 @@ class Constant:
 
     @property
     def value(self) -> float:
-        """Its value."""
+        """Present value of the constant."""
         value: float = getattr(self.module, self.name)
         return value
 
     @property
     def neighbours(self) -> tuple[float, float]:
-        """Half and twice the value; the same of the power for decibels."""
+        """Half and twice the value; for decibels, half and twice the power."""
         if self.name.endswith("_DB"):
             return self.value - 3.0, self.value + 3.0
         if isinstance(self.value, int):
@@ -76,7 +76,7 @@ class Constant:
 
     @contextmanager
     def set_to(self, value: float) -> Iterator[None]:
-        """Give it another value, also where it is imported, and clear caches before and after."""
+        """Set another value, also in modules that import it; clear caches before and after."""
         before = self.value
         users = [self.module, *(m for m in _loaded() if self.name in _imported(m, self.module))]
         for module in users:
@@ -92,7 +92,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class Trial:
-    """A scene to plan, and to image if it is small.
+    """A scene to plan and, if it is small, to image.
 
     Attributes
     ----------
@@ -101,9 +101,9 @@ class Trial:
     costs : Costs
     device : Device
     exact : bool
-        Form the exact image at this accuracy instead.
+        True to form an exact image with the accuracy `tolerance_db` instead.
     reference : complex64 or None
-        An exact image of -80 dB. With one, images are formed and compared with it.
+        Exact image of -80 dB with which images are compared; None to make plans only.
     """
 
     tolerance_db: float
@@ -116,7 +116,7 @@ class Trial:
     reference: Any = None
 
     def run(self) -> Result:
-        """Plan, then form the image if there is a reference."""
+        """Return the result of planning and, if there is a reference, of imaging."""
         predicted_s = predicted_db = measured_s = measured_db = planning_s = math.nan
         chosen = None
         if not self.exact:
@@ -134,7 +134,7 @@ class Trial:
         if self.reference is not None:
             image = self._form(chosen)
             measured_db = relative_error_db(image, self.reference)
-            # Processor time scatters less than the clock on a machine that others use.
+            # On a busy machine, processor time scatters less than elapsed time.
             clock = time.process_time if self.device.info.kind == "cpu" else time.perf_counter
             measured_s = min(_seconds(lambda: self._form(chosen), clock) for _ in range(_RUNS))
         return Result(predicted_s, predicted_db, measured_s, measured_db, planning_s)
@@ -148,7 +148,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Result:
-    """Outcome of a trial: seconds, and errors in dB; NaN if it was not planned or not formed."""
+    """Result of a trial: seconds, and errors in dB; NaN if nothing was planned or formed."""
 
     predicted_s: float
     predicted_db: float
@@ -176,7 +176,7 @@ def constants(pattern: str = "") -> list[Constant]:
 
 
 def trials(device: Device) -> list[Trial]:
-    """Return the scenes: those of benchmarks are planned, small ones are formed too."""
+    """Return the scenes: large ones to plan only, and small ones to image too."""
     found = []
 
     def add(case: cases.Case, tolerance_db: float, costs: Costs, **others: Any) -> None:
@@ -195,7 +195,7 @@ def trials(device: Device) -> list[Trial]:
     add(large, -50.0, Costs())
     add(replace(large, beam=None), -30.0, Costs())
     add(replace(medium, depth_m=20.0, relief_m=1.0), -50.0, _SLOW_EXACT)
-    # Lines of a straight track stand for those of another: plans depend on the geometry.
+    # The samples of a straight track serve for other tracks too: plans depend on the geometry.
     position_m = medium.lines().tx_m
     sway_m = np.zeros_like(position_m)
     sway_m[:, 1:] = 0.05 * np.sin(position_m[:, :1] / [2.0, 3.0])
@@ -209,7 +209,7 @@ def trials(device: Device) -> list[Trial]:
         rx_m=position_m + apart_m,
         rx_velocity_m_s=np.broadcast_to(velocity_m_s, position_m.shape),
     )
-    # A rough track with a gap, and noise in all of the band, cut at both ends.
+    # A rough track with a gap; then noise in the whole band, which does not fade at the ends.
     random = np.random.default_rng(0)
     rough_m = position_m + random.standard_normal(position_m.shape) * [0.0, 2e-3, 2e-3]
     rough_m[:, 1] += 0.3 * np.sin(position_m[:, 0])
@@ -226,7 +226,7 @@ def trials(device: Device) -> list[Trial]:
 
 
 def changes(device: Device, pattern: str = "") -> Iterator[list[str]]:
-    """Yield a row for every constant and each of two other values: what changes, over all scenes.
+    """Yield a row for every constant and each of two other values, with changes over all scenes.
 
     The columns are `COLUMNS`.
     """
@@ -242,14 +242,14 @@ def changes(device: Device, pattern: str = "") -> Iterator[list[str]]:
             with constant.set_to(other):
                 try:
                     found = [scene.run() for scene in scenes]
-                except Exception as error:  # any value may break anything: that is the finding
+                except Exception as error:  # a value that breaks something is a finding too
                     yield [*row, f"{type(error).__name__}: {str(error)[:60]}", *[""] * 4]
                     continue
             yield [*row, *_compared(usual, found)]
 
 
 def _best(scene: Trial) -> Result:
-    """Return the result of a scene with the least times of some runs."""
+    """Return the result for a scene, with the least times of several runs."""
     runs = [scene.run() for _ in range(_RUNS)]
     least = {name: min(getattr(r, name) for r in runs) for name in ("measured_s", "planning_s")}
     return replace(runs[0], **least)
@@ -268,7 +268,7 @@ COLUMNS = (
 
 
 def _compared(usual: list[Result], found: list[Result]) -> list[str]:
-    """Return the cells of a row."""
+    """Return the cells of a row: the ranges of changes."""
 
     def span(values: list[float], least: float) -> str:
         kept = [value for value in values if not math.isnan(value)]
@@ -301,7 +301,7 @@ def _seconds(call: Callable[[], object], clock: Callable[[], float]) -> float:
 
 
 def _assigned(module: ModuleType) -> list[str]:
-    """Names in capitals that a module assigns at its top level."""
+    """Return names in capitals that a module assigns at its top level."""
     names = []
     for node in ast.parse(inspect.getsource(module)).body:
         if isinstance(node, ast.Assign):
@@ -313,7 +313,7 @@ def _assigned(module: ModuleType) -> list[str]:
 
 @functools.cache
 def _imported(module: ModuleType, source: ModuleType) -> frozenset[str]:
-    """Names that a module imports from another one."""
+    """Return the names that a module imports from another one."""
     nodes = ast.parse(inspect.getsource(module)).body
     return frozenset(
         alias.name
@@ -328,7 +328,7 @@ def _loaded() -> list[ModuleType]:
 
 
 def _clear_caches() -> None:
-    """Forget what functions of the library have cached: it may depend on a constant."""
+    """Clear the caches of the library's functions, whose results may depend on a constant."""
     for module in _loaded():
         for value in list(vars(module).values()):
             if value is not _imported and hasattr(value, "cache_clear"):

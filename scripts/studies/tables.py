@@ -29,9 +29,9 @@ TOLERANCES_DB = {
     "ffbp-2k": (-50.0, -30.0),
     **dict.fromkeys(cases.DENSE_CASES, (-40.0,)),
 }
-"""Tolerances of cases of factorized imaging, dB; -50 for others."""
-FITTED = 3  # exponents are fitted to this many of the largest sizes
-SHADOW_PIXELS = 1024  # along either side of the wreck's scene, 64 m x 56 m
+"""Tolerances for the cases of factorized imaging, dB; -50 for all others."""
+FITTED = 3  # number of the largest sizes to which exponents are fitted
+SHADOW_PIXELS = 1024  # along each side of the wreck's scene, 64 m x 56 m
 SHADOW_TOLERANCES_DB = (-20.0, -30.0, -40.0, -50.0, -60.0)
 SHADOW_LEVELS_DB = (
     10,
@@ -41,7 +41,7 @@ SHADOW_LEVELS_DB = (
     -15,
     -20,
     -25,
-)  # around a pixel, relative to the rms
+)  # level around a pixel, relative to the rms value
 SIZES = (256, 512, 1024, 2048, 4096, 8192)
 
 
@@ -54,7 +54,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
 
 
 def speed(devices: list[str]) -> None:
-    """Print speed and errors of exact imaging for the built-in cases at -50 and -80 dB."""
+    """Print speed and errors of exact imaging of the built-in cases at -50 and -80 dB."""
     rows = []
     for case in cases.EXACT_CASES:
         for accuracy_db in (-50.0, -80.0):
@@ -94,7 +94,7 @@ def speed(devices: list[str]) -> None:
 
 
 def presets(devices: list[str]) -> None:
-    """Print interpolators that `accuracy_db` chooses and their errors, on the first device."""
+    """Print the interpolators chosen by `accuracy_db` and their errors, on the first device."""
     rows = []
     for accuracy_db in (-20, -30, -40, -50, -60, -70, -80, -85):
         r = bench.run("bp-thesis", device=devices[0], accuracy_db=accuracy_db, repeats=3)
@@ -122,7 +122,7 @@ def presets(devices: list[str]) -> None:
 
 
 def taps(devices: list[str]) -> None:
-    """Print the kernel's time by taps, from which `clsas.signal.interpolation.COST` is taken."""
+    """Print the kernel time by taps, the source of `clsas.signal.interpolation.COST`."""
     case = dataclasses.replace(cases.EXACT_CASES["bp-thesis"], channels=512)
     lines, grid = case.lines(), case.grid
     best: dict[tuple[str, int], float] = {}
@@ -140,7 +140,7 @@ def taps(devices: list[str]) -> None:
 
 
 def simulation(devices: list[str]) -> None:
-    """Print times and memory of simulating 100 000 points on 1200 channels."""
+    """Print time and memory of a simulation of 100 000 points on 1200 channels."""
     random = np.random.default_rng(1)
     positions = random.uniform([-40, 50, 0], [40, 90, 0], (100_000, 3))
     scene = clsas.PointTargets(positions, random.standard_normal(100_000))
@@ -158,7 +158,7 @@ def simulation(devices: list[str]) -> None:
 
 
 def factorized(devices: list[str], names: list[str] | None = None) -> None:
-    """Print speed and errors of factorized imaging against exact imaging, for all or some cases."""
+    """Print speed and errors of factorized and exact imaging, for all or some cases."""
     rows = []
     for case, device in itertools.product(names or cases.FACTORIZED_CASES, devices):
         for tolerance_db in TOLERANCES_DB.get(case, (-50.0,)):
@@ -203,7 +203,7 @@ def factorized(devices: list[str], names: list[str] | None = None) -> None:
 
 
 def scaling(device: str, largest: int, csv_file: str | None, png_file: str | None) -> None:
-    """Print times of N channels and N x N pixels against N, and the exponents that fit them."""
+    """Print the times for N channels and N x N pixels by N, and the fitted exponents."""
     sizes = [size for size in SIZES if size <= largest]
     measured = [
         # Large images take minutes, and their times vary little from run to run.
@@ -226,7 +226,7 @@ def scaling(device: str, largest: int, csv_file: str | None, png_file: str | Non
     ]
     table(names, rows)
     exponents = {name: exponent(sizes, times) for name, times in seconds.items()}
-    print(f"\n{measured[0]['device']}, {measured[0]['driver']}: at the end time grows as", end=" ")
+    print(f"\n{measured[0]['device']}, {measured[0]['driver']}: for large N time grows as", end=" ")
     print(", ".join(f"N^{value:.2f} ({name})" for name, value in exponents.items()))
     if csv_file is not None:
         with open(csv_file, "w", newline="") as file:
@@ -236,7 +236,7 @@ def scaling(device: str, largest: int, csv_file: str | None, png_file: str | Non
 
 
 def exponent(sizes: list[int], times: list[float]) -> float:
-    """Return the power of N that fits the largest sizes; small images have mostly fixed costs."""
+    """Return the exponent of N fitted to the largest sizes, since small ones have fixed costs."""
     few = slice(-FITTED, None)
     if len(sizes) < 2:
         return np.nan
@@ -269,12 +269,12 @@ def draw_scaling(
 
 
 SURVEY_M = 500.0
-SURVEY_PARTS, SURVEY_PINGS = 26, 50  # files, and pings of each, 0.4 m apart
+SURVEY_PARTS, SURVEY_PINGS = 26, 50  # files, and pings per file, which are 0.4 m apart
 DAY_S = 86_400.0
 
 
 def shadows(devices: list[str]) -> None:
-    """Print errors in the wreck's shadows: relative to the mean level around, by that level."""
+    """Print errors in the wreck's shadows by the local level, to which they are relative."""
     lines, grid = wreck.lines(), wreck.grid(SHADOW_PIXELS)
     beam = cases.MOSAIC_CASES["mosaic-wreck"][1]
     rows = []
@@ -298,9 +298,9 @@ def shadows(devices: list[str]) -> None:
 
 
 def survey_lines(folder: str, part: int) -> None:
-    """Write one file of a survey by a swaying Edgetech array over one point per square metre."""
+    """Write a file of a survey with a swaying Edgetech array over one point per square metre."""
     pings = np.arange(part * SURVEY_PINGS, (part + 1) * SURVEY_PINGS)
-    # The track extends 10 m beyond the image at either end, which is more than half a beam.
+    # The track extends 10 m beyond the image at each end, more than half the beam's footprint.
     centre_m = np.zeros((len(pings), 3))
     centre_m[:, 0] = 0.4 * pings - 10
     centre_m[:, 1] = 0.2 * np.sin(2 * np.pi * pings / 57)
@@ -331,7 +331,7 @@ def survey(devices: list[str]) -> None:
     grid = clsas.Grid.plane((0, SURVEY_M, 10_001), (30, 130, 2001))
     beam = clsas.BeamWindow(6.0, "hann")
     with tempfile.TemporaryDirectory() as folder:
-        # In other processes, so that the peak memory of this one is that of imaging.
+        # Simulate in other processes, so that the peak memory of this one is that of imaging.
         with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
             list(pool.map(survey_lines, [folder] * SURVEY_PARTS, range(SURVEY_PARTS)))
         size = sum(file.stat().st_size for file in Path(folder).iterdir())

@@ -1,4 +1,4 @@
-"""Tuning: how sizes of batches and work-groups change the time of images on a device."""
+"""Tuning: effect of the sizes of batches and work-groups on imaging times of a device."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from studies.sensitivity import Constant
 
 COLUMNS = ("constant", "set to", "exact, s", "over usual", "factorized, s", "over usual")
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
-"""What each constant is set to, over its usual value."""
+"""Values to which each constant is set, over its usual value."""
 
 _TOLERANCE_DB = -50.0
-_RUNS = 3  # of which the median counts
+_RUNS = 3  # runs, of which the median counts
 
 
 def constants(device: Device) -> list[Constant]:
-    """Return the constants that matter on a device."""
+    """Return the constants that affect imaging times on a device."""
     batch = "_CACHED_BYTES" if device.info.kind == "cpu" else "_BATCH_BYTES"
     names = [
         ("exact.blocks", "_CHANNELS_AT_ONCE"),
@@ -38,7 +38,7 @@ def constants(device: Device) -> list[Constant]:
 
 
 def changes(device: Device, case: Case = FFBP_2K) -> Iterator[list[str]]:
-    """Yield a row for every constant and value: the times of an exact and a factorized image.
+    """Yield a row for every constant and value, with the times of an exact and a factorized image.
 
     The values of a constant take turns. The columns are `COLUMNS`.
 

@@ -1,7 +1,8 @@
-"""The scene of THESIS chapter 5 (Odegaard 2004), and what its figures' scripts share.
+"""Scene of THESIS chapter 5 (Odegaard 2004), and functions that its figures share.
 
-One point reflector in the middle of 5 m x 5 m from 40 m, seen by 10 pings of 64 receivers: 640
-phase centres over 5.28 m at 1 MHz. The thesis gives no bandwidth; 100 kHz is chosen here.
+One point reflector lies in the middle of an area of 5 m x 5 m, which begins at a range of 40 m. Ten
+pings of 64 receivers give 640 phase centres over 5.28 m at 1 MHz. The thesis does not state the
+bandwidth; 100 kHz is chosen here.
 """
 
 from __future__ import annotations
@@ -34,25 +35,25 @@ WAVELENGTH_M = 1.5e-3
 SPACING_M = 8.25e-3
 SIDE_M, PIXELS = 5.0, 1024
 NEAREST_M = 40.0
-ACCURACY_DB = -60.0  # of plain backprojection: exact beside any plan here
-GUARD_M = 25e-3  # around the point: what is beyond counts as a far side lobe
-WIDTH, PSLR_DB, LOSS_DB = 1.2, 3.0, 3.0  # how much worse a usable image may be
+ACCURACY_DB = -60.0  # of plain backprojection, more accurate than any plan here
+GUARD_M = 25e-3  # distance from the point beyond which a side lobe counts as far
+WIDTH, PSLR_DB, LOSS_DB = 1.2, 3.0, 3.0  # how much worse than the exact image a usable one may be
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The point, its lines and its image.
+    """Reflectors, their lines and their image.
 
     Attributes
     ----------
     device : Device
     pixels : int
-        Along either side; the pixel stays 4.9 mm, so that fewer make a smaller scene.
+        Number along each side. Pixels always measure 4.9 mm, so fewer pixels make a smaller scene.
     bistatic : bool
-        Whether every receiver stands where it is, half an array from the transmitter; else
-        transmitter and receiver stand at their phase centre (THESIS [32]).
+        True if receivers are at their true positions, up to half an array from the transmitter;
+        False if transmitter and receiver are both at their phase centre (THESIS [32]).
     points : int
-        How many reflectors; if more than one, scattered over the image.
+        Number of reflectors; if more than one, they are scattered over the image.
     """
 
     device: Device
@@ -62,12 +63,12 @@ class Scene:
 
     @property
     def side_m(self) -> float:
-        """Of the image: [45]'s L_I before the first stage."""
+        """Side of the image, L_I of [45] before the first stage, metres."""
         return SIDE_M * self.pixels / PIXELS
 
     @cached_property
     def grid(self) -> clsas.Grid:
-        """The image's grid."""
+        """Grid of the image."""
         half = (self.side_m - SIDE_M / PIXELS) / 2
         middle = NEAREST_M + self.side_m / 2
         return clsas.Grid.plane(
@@ -76,12 +77,12 @@ class Scene:
 
     @property
     def point_m(self) -> tuple[float, float]:
-        """Where the reflector is: in the middle, where subimages of every stage meet."""
+        """Position of the reflector, in the middle, where subimages of every stage meet."""
         return 0.0, NEAREST_M + self.side_m / 2
 
     @cached_property
     def lines(self) -> clsas.RangeLines:
-        """The reflector's compressed lines, with the elements' beam patterns."""
+        """Compressed lines, with the beam patterns of the elements."""
         thesis = Sonar.thesis_wide_beam()
         pings, spacing_m = 10, 64 * SPACING_M
         sonar = thesis
@@ -98,7 +99,7 @@ class Scene:
             random = np.random.default_rng(1)
             away_m = random.uniform(-0.5, 0.5, (self.points, 2)) * self.side_m
             positions_m = np.pad(away_m, ((0, 0), (0, 1))) + positions_m
-        # The whole scene from every channel, with room for side lobes in range.
+        # Ranges from every channel to the whole scene, with a margin for side lobes.
         far_m = math.hypot(NEAREST_M + self.side_m, self.side_m / 2 + 320 * SPACING_M)
         window_m = NEAREST_M - 1, far_m + 1
         echoes = clsas.simulate(sonar, track, clsas.PointTargets(positions_m), range_m=window_m)
@@ -106,36 +107,36 @@ class Scene:
 
     @cached_property
     def exact(self) -> clsas.Image:
-        """The image by plain backprojection."""
+        """Image by plain backprojection."""
         return self.backproject()
 
     def backproject(self) -> clsas.Image:
-        """Form the exact image."""
+        """Return the exact image."""
         return clsas.backproject(self.lines, self.grid, accuracy_db=ACCURACY_DB, device=self.device)
 
-    def plan(self, **wish: object) -> clsas.Plan:
-        """Return a plan by `stages`, `tolerance_db` or `tolerance_wavelengths`."""
-        return clsas.plan(self.lines, self.grid, device=self.device, **wish)
+    def plan(self, **request: object) -> clsas.Plan:
+        """Return a plan for `stages`, `tolerance_db` or `tolerance_wavelengths`."""
+        return clsas.plan(self.lines, self.grid, device=self.device, **request)
 
     def form(self, plan: clsas.Plan) -> clsas.Image:
-        """Form the image by a plan."""
+        """Return the image that a plan forms."""
         return clsas.factorize(self.lines, self.grid, plan, device=self.device)
 
     @cached_property
     def scattered(self) -> Scene:
-        """The same with many reflectors: for errors that hold for no one place."""
+        """The same scene with many reflectors, for errors that do not depend on one position."""
         return replace(self, points=300)
 
-    def error_db(self, **wish: object) -> float:
-        """Return the relative rms error of the image by a plan, dB."""
-        return clsas.relative_error_db(self.form(self.plan(**wish)), self.exact)
+    def error_db(self, **request: object) -> float:
+        """Return the relative rms error of the image that a plan forms, dB."""
+        return clsas.relative_error_db(self.form(self.plan(**request)), self.exact)
 
     def error_m(self, stages: Stages) -> float:
-        """Return the error of all stages by [45]."""
+        """Return the range error of all stages according to [45], metres."""
         return sum(nearest.stage_errors_m(stages, SPACING_M, self.side_m, NEAREST_M))
 
     def range_errors_m(self, plan: clsas.Plan) -> np.ndarray:
-        """Return the range errors of a nearest-beam plan at 1016 pixels, [pixels, channels]."""
+        """Return range errors of a nearest-beam plan at 1016 pixels, metres [pixels, channels]."""
         random = np.random.default_rng(1)
         pixels = random.integers(0, self.pixels, (1000, 2))
         ends = [0, self.pixels // 2 - 1, self.pixels // 2, self.pixels - 1]
@@ -143,12 +144,12 @@ class Scene:
         return range_errors_m(plan, self.lines, self.grid, pixels)
 
     def largest_error_m(self, plan: clsas.Plan) -> float:
-        """Return the largest of them."""
+        """Return the largest range error of a nearest-beam plan, metres."""
         return float(np.abs(self.range_errors_m(plan)).max())
 
     @cached_property
     def exact_quality(self) -> Quality:
-        """What is measured on the exact image."""
+        """Quality of the exact image."""
         return self.measure(self.exact)
 
     @cached_property
@@ -157,15 +158,15 @@ class Scene:
         return clsas.measure_point(self.exact, self.point_m, search_m=GUARD_M).amplitude
 
     def measure(self, image: clsas.Image) -> Quality:
-        """Measure the point in an image."""
+        """Return the quality of the point in an image."""
         x_m, _ = image.grid.axes_m
         beyond = profile(image)[np.abs(x_m - self.point_m[0]) > GUARD_M]
         try:
             with warnings.catch_warnings():
-                # A side lobe above the peak is what a broken image has.
+                # In a useless image, a side lobe may exceed the peak, which gives a warning.
                 warnings.simplefilter("ignore", clsas.ClsasWarning)
                 found = clsas.measure_point(image, self.point_m, search_m=GUARD_M)
-        except ValueError:  # no point response is left
+        except ValueError:  # there is no point response
             resolution_m = pslr_db = islr_db = loss_db = math.nan
         else:
             far_db = decibels(beyond, found.amplitude).max(initial=-math.inf)
@@ -179,21 +180,21 @@ class Scene:
 
 @dataclass(frozen=True)
 class Quality:
-    """What is measured on the point.
+    """Measures of the point in an image.
 
     Attributes
     ----------
     resolution_m : float
         -3 dB width in azimuth.
     pslr_db : float
-        Highest side lobe over the peak: along azimuth through it, or anywhere else beyond
+        Highest side lobe over the peak, either in azimuth through the peak, or anywhere beyond
         `GUARD_M` in azimuth.
     islr_db : float
-        Energy of the nearest 10 side lobes to either side over the main lobe's, in azimuth.
+        Energy of the nearest 10 side lobes on each side over that of the main lobe, in azimuth.
     loss_db : float
-        Exact peak over this one.
+        Peak of the exact image over this peak.
     error_db : float
-        Relative rms error of the whole image against the exact one.
+        Relative rms error of the whole image.
     """
 
     resolution_m: float
@@ -203,7 +204,7 @@ class Quality:
     error_db: float
 
     def usable(self, exact: Quality) -> bool:
-        """Whether the point is still one: as wide, as clean and as strong, nearly."""
+        """Return whether width, side lobes and peak are close to those of the exact image."""
         return (
             abs(self.resolution_m / exact.resolution_m - 1) <= WIDTH - 1
             and self.pslr_db <= exact.pslr_db + PSLR_DB
@@ -211,7 +212,7 @@ class Quality:
         )
 
     def cells(self) -> dict[str, str]:
-        """Return columns of a table."""
+        """Return the cells of a table by column."""
         return {
             "azimuth mm": f"{1e3 * self.resolution_m:.2f}",
             "PSLR dB": f"{self.pslr_db:.1f}",
@@ -222,32 +223,32 @@ class Quality:
 
 
 def profile(image: clsas.Image) -> np.ndarray:
-    """Return the thesis's azimuth point-spread function: the maximum over range."""
+    """Return the azimuth point-spread function of the thesis: the maximum over range."""
     return np.abs(image.pixels).max(axis=0)
 
 
 def decibels(amplitude: np.ndarray, reference: float) -> np.ndarray:
-    """Return levels over a reference, not below -200 dB."""
+    """Return levels over a reference, at least -200 dB."""
     return 20 * np.log10(np.maximum(amplitude / reference, 1e-10))
 
 
 def fraction(error_m: float) -> str:
-    """Write an error as a part of the wavelength."""
+    """Return an error as a fraction of the wavelength, in words."""
     return f"λ/{WAVELENGTH_M / error_m:.4g}"
 
 
 def name(stages: Stages) -> str:
-    """Write stages as QR x QI."""
+    """Return stages as text, QR x QI."""
     return " ".join(f"{beams}x{divisions}" for beams, divisions in stages) or "backprojection"
 
 
 def equal_stages(number: int) -> Stages:
-    """Return the thesis's plan of some stages with QR = QI = 2; one stage is backprojection."""
+    """Return the plan of the thesis for a number of stages, QR = QI = 2; 1 is backprojection."""
     return [(2, 2)] * (number - 1)
 
 
 def in_turn(work: dict[object, Callable[[], object]], repeats: int) -> dict[object, float]:
-    """Return the median seconds of every piece of work, done in turn after one warm-up."""
+    """Return the median seconds of each piece of work, done in turns after a warm-up."""
     taken: dict[object, list[float]] = {key: [] for key in work}
     for repeat in range(repeats + 1):
         for key, do in work.items():
@@ -259,19 +260,31 @@ def in_turn(work: dict[object, Callable[[], object]], repeats: int) -> dict[obje
 
 
 def arguments(description: str, repeats: int | None = None) -> tuple[argparse.Namespace, Scene]:
-    """Return what the command line says, and the scene for it."""
+    """Return the arguments of the command line, and their scene."""
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("thesis"), help="folder for CSV and PNG")
-    parser.add_argument("--device", help="as `clsas devices` lists it; the fastest unless given")
     parser.add_argument(
-        "--pixels", type=int, default=PIXELS, help="along either side, 4.9 mm each (%(default)s)"
+        "--out", type=Path, default=Path("thesis"), help="folder for CSV and PNG files"
     )
     parser.add_argument(
-        "--bistatic", action="store_true", help="with receivers apart from the transmitter"
+        "--device", help="device, as listed by `clsas devices` [default: the fastest]"
+    )
+    parser.add_argument(
+        "--pixels",
+        type=int,
+        default=PIXELS,
+        help="pixels along each side, 4.9 mm each [default: %(default)s]",
+    )
+    parser.add_argument(
+        "--bistatic",
+        action="store_true",
+        help="put receivers at their true positions, apart from the transmitter",
     )
     if repeats is not None:
         parser.add_argument(
-            "--repeats", type=int, default=repeats, help="timed runs of each (%(default)s)"
+            "--repeats",
+            type=int,
+            default=repeats,
+            help="timed runs of each image [default: %(default)s]",
         )
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
@@ -304,7 +317,7 @@ def figure(width: float = 6.0, height: float = 4.0):
 
 
 def save(drawn, out: Path, stem: str, dpi: float = 120.0, colours: int = 64) -> None:
-    """Write a figure as PNG of so many colours, so that it takes few bytes."""
+    """Write a figure as PNG with few colours, which makes a small file."""
     path = out / f"{stem}.png"
     plot.save(drawn, path, dpi=dpi)
     path.write_bytes(with_fewer_colours(path, colours))

@@ -1,7 +1,7 @@
-"""The scene of THESIS chapter 6 (Odegaard 2004), and what its figures' scripts share.
+"""Scene of THESIS chapter 6 (Odegaard 2004), and functions that its figures share.
 
-A wreck beside a track of 80 m, simulated in place of the thesis's recording (clsas.wreck), imaged
-as a whole and, with the same pixels, the part of it round the wreck.
+A wreck beside a track of 80 m, simulated in place of the thesis's recording (clsas.trials.wreck).
+Images show the whole scene or, with pixels of the same size, the part around the wreck.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from clsas.sonar.visibility import BeamTrack, Boxes, sines
 from clsas.trials import wreck
 
 PIXELS = 1024
-NEAR_M = 53.0  # where the part round the wreck begins, across the track
+NEAR_M = 53.0  # near edge, across the track, of the part around the wreck
 BEAM = clsas.BeamWindow(5.0, "hann")
-FIXED_BEAM = replace(BEAM, along=(1.0, 0.0, 0.0))  # as clsas.wavenumber has it
+FIXED_BEAM = replace(BEAM, along=(1.0, 0.0, 0.0))  # the direction that clsas.wavenumber assumes
 ACCURACY_DB = -60.0  # of plain backprojection
-STAGES = [(2, 2)]  # the thesis's Ns = 2: one stage, and the final backprojection
+STAGES = [(2, 2)]  # Ns = 2 of the thesis: one stage and the final backprojection
 WAVELENGTH_M = 12e-3
-SPACING_M = 0.1001  # of an array's phase centres
-VISIBLE_DB = -2.0  # a shadow that is less dark does not count
-_FLAT_M = 0.3  # height of what counts as sand
-_BESIDE_M = 1.5, 4.0  # of the mast's shadow: sand that it is compared to
-_PIXELS_LOOKED_AT = 200  # of a patch, for its range errors
+SPACING_M = 0.1001  # of the phase centres of the array
+VISIBLE_DB = -2.0  # largest level of a shadow that counts as visible
+_FLAT_M = 0.3  # largest height of a point that counts as sand
+_BESIDE_M = 1.5, 4.0  # distances from the mast's shadow of the sand that it is compared with
+_SAMPLE_PIXELS = 200  # of a patch, at which range errors are evaluated
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Scene:
     device : Device
     lines : RangeLines
     pixels : int
-        Along either side of the whole scene; the part round the wreck has half as many.
+        Number along each side of the whole scene; the part around the wreck has half as many.
     """
 
     device: Device
@@ -57,9 +57,10 @@ class Scene:
 
     @cached_property
     def thinned(self) -> Scene:
-        """The same with one line for each place along the track, as the thesis's data had it.
+        """The same scene with one line per position along the track, like the thesis's data.
 
-        There pings overlap by a third; its data had been put on a regular grid.
+        In this scene pings overlap by a third, while the data of the thesis had been resampled to a
+        regular grid.
         """
         along_m = self.lines.phase_centres_m[:, 0]
         order = np.argsort(along_m, kind="stable")
@@ -69,17 +70,17 @@ class Scene:
 
     @cached_property
     def fine(self) -> clsas.Grid:
-        """All of the scene, in 16 times the pixels."""
+        """Grid of the whole scene with 16 times as many pixels."""
         return wreck.grid(4 * self.pixels)
 
     @cached_property
     def whole(self) -> clsas.Grid:
-        """All of the scene."""
+        """Grid of the whole scene."""
         return wreck.grid(self.pixels)
 
     @cached_property
     def part(self) -> clsas.Grid:
-        """Its part round the wreck."""
+        """Grid of the part around the wreck."""
         first, half = round((NEAR_M - wreck.Y_M[0]) / np.ptp(wreck.Y_M) * self.pixels), self.pixels
         return self.whole.window(
             slice(first, first + half // 2), slice(half // 4, half // 4 + half // 2)
@@ -91,26 +92,26 @@ class Scene:
         accuracy_db: float = ACCURACY_DB,
         beam: clsas.BeamWindow | None = BEAM,
     ) -> clsas.Image:
-        """Form an exact image."""
+        """Return an exact image."""
         return clsas.backproject(
             self.lines, grid, accuracy_db=accuracy_db, beam=beam, device=self.device
         )
 
-    def mosaic(self, grid: clsas.Grid, **wish: object) -> tuple[clsas.Image, list[clsas.Patch]]:
-        """Form a mosaic by `stages` or `tolerance_db`."""
+    def mosaic(self, grid: clsas.Grid, **request: object) -> tuple[clsas.Image, list[clsas.Patch]]:
+        """Return the image and the patches of a mosaic for `stages` or `tolerance_db`."""
         patches: list[clsas.Patch] = []
-        wanted = clsas.mosaic(self.lines, grid, beam=BEAM, device=self.device, **wish)
-        return wanted.image(patches.append), patches
+        mosaic = clsas.mosaic(self.lines, grid, beam=BEAM, device=self.device, **request)
+        return mosaic.image(patches.append), patches
 
     def wavenumber(self, grid: clsas.Grid, strips: int = 1) -> clsas.Image:
-        """Form a wavenumber image, each of some strips of rows for its own middle range."""
+        """Return a wavenumber image, formed in strips of rows with a middle range for each."""
         rows = np.array_split(np.arange(grid.shape[0]), strips)
         windows = [grid.window(slice(some[0], some[-1] + 1)) for some in rows]
         pixels = [clsas.wavenumber(self.lines, each, beam=BEAM).pixels for each in windows]
         return clsas.Image(np.concatenate(pixels), grid)
 
     def formula_m(self, patch: clsas.Patch) -> float:
-        """Return the largest range error of a patch by [45]."""
+        """Return the largest range error of a patch according to [45], metres."""
         grid = patch.grid
         edges_m = grid.positions_m(slice(None, None, grid.shape[0] - 1)).reshape(-1, 3)
         nearest_m = cdist(edges_m, self.lines.phase_centres_m).min()
@@ -119,21 +120,21 @@ class Scene:
         return sum(nearest.stage_errors_m(STAGES, SPACING_M, side_m, nearest_m))
 
     def measured_m(self, patch: clsas.Patch) -> float:
-        """Return the largest range error of a patch by its plan, of channels that see the pixel."""
+        """Return the largest range error of a patch over visible channels, metres."""
         grid, along = patch.grid, BEAM.directions(self.lines)
         half_m = (np.array(grid.shape)[:, None] - 1) / 2 * [grid.row_step_m, grid.column_step_m]
-        # What the patch was formed from.
+        # Select the channels from which the patch was formed.
         centre_m = grid.origin_m + half_m.sum(axis=0)
         track = BeamTrack(BEAM.limits, self.lines.phase_centres_m, along)
         seen = track.touching(Boxes.equal(centre_m[None], half_m))[0]
         lines, along = self.lines.select(seen), along[seen]
         plan = clsas.Plan.from_json(json.dumps(patch.record.plan))
         random = np.random.default_rng(1)
-        pixels = random.integers(0, grid.shape, (_PIXELS_LOOKED_AT, 2))
+        pixels = random.integers(0, grid.shape, (_SAMPLE_PIXELS, 2))
         ends = ([0, count // 2 - 1, count // 2, count - 1] for count in grid.shape)
         pixels = np.concatenate([pixels, list(product(*ends))])
         errors_m = range_errors_m(plan, lines, grid, pixels)
-        # There channels are in the order of the track.
+        # The channels of `errors_m` are in the order of the track.
         order = np.argsort(lines.tx_m[:, 0] + lines.rx_m[:, 0], kind="stable")
         points_m = grid.positions_m()[tuple(pixels.T)]
         weight = BEAM.weights(sines(points_m, self.lines.phase_centres_m[seen], along))[order].T
@@ -142,7 +143,7 @@ class Scene:
 
 @lru_cache(maxsize=4)
 def mast_shadow(grid: clsas.Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Return which pixels' sand the mast alone hides from broadside, and lit ones beside them."""
+    """Return which pixels of sand only the mast hides from broadside, and lit ones beside them."""
     seabed, track = wreck.scene().need("targets", "track")
     without = seabeds.wreck(wreck.X_M, wreck.Y_M, mast_m=0.0)
     eye_m = track.positions_m.mean(axis=0)
@@ -168,16 +169,28 @@ def mast_db(image: clsas.Image) -> float:
 
 
 def arguments(description: str, repeats: int) -> tuple[argparse.Namespace, Scene]:
-    """Return what the command line says, and the scene for it."""
+    """Return the arguments of the command line, and their scene."""
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("thesis"), help="folder for CSV and PNG")
-    parser.add_argument("--device", help="as `clsas devices` lists it; the fastest unless given")
     parser.add_argument(
-        "--pixels", type=int, default=PIXELS, help="along either side of the scene (%(default)s)"
+        "--out", type=Path, default=Path("thesis"), help="folder for CSV and PNG files"
     )
-    parser.add_argument("--lines", type=Path, help="range lines; simulated and kept unless given")
     parser.add_argument(
-        "--repeats", type=int, default=repeats, help="timed runs of each (%(default)s)"
+        "--device", help="device, as listed by `clsas devices` [default: the fastest]"
+    )
+    parser.add_argument(
+        "--pixels",
+        type=int,
+        default=PIXELS,
+        help="pixels along each side of the scene [default: %(default)s]",
+    )
+    parser.add_argument(
+        "--lines", type=Path, help="file of range lines; by default they are simulated and kept"
+    )
+    parser.add_argument(
+        "--repeats",
+        type=int,
+        default=repeats,
+        help="timed runs of each image [default: %(default)s]",
     )
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
@@ -191,12 +204,12 @@ def arguments(description: str, repeats: int) -> tuple[argparse.Namespace, Scene
 
 
 def fraction(error_m: float) -> str:
-    """Write an error as a part of the wavelength."""
+    """Return an error as a fraction of the wavelength, in words."""
     return f"λ/{WAVELENGTH_M / error_m:.3g}"
 
 
 def levels(image: clsas.Image, together: int, reference: float) -> np.ndarray:
-    """Return the mean power of so many pixels squared, dB over a reference power."""
+    """Return the mean power of blocks of pixels, `together` a side, dB over a reference."""
     rows, columns = (count // together * together for count in image.grid.shape)
     power = np.abs(image.pixels[:rows, :columns]) ** 2
     power = power.reshape(rows // together, together, columns // together, together)
@@ -204,7 +217,7 @@ def levels(image: clsas.Image, together: int, reference: float) -> np.ndarray:
 
 
 def extent_m(grid: clsas.Grid) -> Sequence[float]:
-    """Return the outer edges of a grid: left, right, bottom, top."""
+    """Return the outer edges of a grid, metres: left, right, bottom, top."""
     ends = []
     for axis in grid.axes_m:
         half_m = (axis[1] - axis[0]) / 2

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""THESIS figure 18: seconds against the number of stages, QI = QR = 2; and interpolated plans."""
+"""THESIS figure 18: imaging time by number of stages, QI = QR = 2, and of interpolated plans."""
 
 from functools import partial
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""THESIS figure 19: range error against the number of stages, QI = QR = 2, by [45] and measured."""
+"""THESIS figure 19: range error by number of stages, QI = QR = 2, from [45] and measured."""
 
 import math
 
@@ -11,7 +11,7 @@ TOLERANCE_DB = -40
 
 
 def in_metres(error_db: float) -> float:
-    """Return the even spread of range errors, to plus and minus so much, that errs so an image."""
+    """Return the bound of uniformly distributed range errors that cause an image error, metres."""
     return WAVELENGTH_M * math.sqrt(3) / (4 * math.pi) * 10 ** (error_db / 20)
 
 
@@ -50,9 +50,9 @@ def main() -> None:
     figure = chapter5.figure()
     axes = figure.subplots()
     numbers = np.arange(1, 8)
-    axes.plot(numbers, by_formula, "o-", label="Nearest beam, by [45]")
+    axes.plot(numbers, by_formula, "o-", label="Nearest beam, from [45]")
     axes.plot(numbers, largest, "s-", label="Nearest beam, largest measured")
-    label = f"Interpolated, {TOLERANCE_DB} dB: from the image's error"
+    label = f"Interpolated, {TOLERANCE_DB} dB: from the image error"
     axes.plot(len(plan.sides) + 1, interpolated_m, "^", label=label)
     axes.axhline(WAVELENGTH_M / 4, color="grey", linestyle=":", label="λ/4")
     axes.set(xlabel="Number of stages (1: backprojection)", ylabel="Range error (m)")

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""THESIS figure 20: seconds against error for 2 to 6 stages; and for interpolated plans."""
+"""THESIS figure 20: imaging time by error for 2 to 6 stages, and for interpolated plans."""
 
 import math
 from functools import partial
@@ -8,13 +8,13 @@ from itertools import product
 import chapter5
 
 TOLERANCES_DB = (-10, -15, -20, -25, -30, -35, -40, -45, -50)
-MOST_DIVISIONS, MOST_BEAMS = 64, 80  # leave 16 pixels a side and 8 lines
+MOST_DIVISIONS, MOST_BEAMS = 64, 80  # these leave 16 pixels along each side and 8 lines
 
 
 def choices(number: int) -> list[chapter5.Stages]:
-    """Return plans of some stages: any powers of two in the first stage, then twos.
+    """Return plans for a number of stages: powers of two in the first stage, then twos.
 
-    High factors belong in the first stage, says the thesis; the fastest are there.
+    According to the thesis, high factors belong in the first stage; this gives the fastest plans.
     """
     rest = [(2, 2)] * (number - 2)
     found = [[first, *rest] for first in product((2, 4, 8), (2, 4, 8, 16))]
@@ -28,20 +28,20 @@ def choices(number: int) -> list[chapter5.Stages]:
 
 def main() -> None:
     given, scene = chapter5.arguments(__doc__, repeats=2)
-    wishes = {
+    requests = {
         (number, chapter5.name(stages)): {"stages": stages}
         for number in range(2, 7)
         for stages in choices(number)
     }
-    plans = {key: scene.plan(**wish) for key, wish in wishes.items()}
+    plans = {key: scene.plan(**request) for key, request in requests.items()}
     for db in TOLERANCES_DB:
         plan = scene.plan(tolerance_db=db)
         key = len(plan.sides) + 1, f"{db} dB"
-        wishes[key], plans[key] = {"tolerance_db": db}, plan
+        requests[key], plans[key] = {"tolerance_db": db}, plan
     work = {key: partial(scene.form, plan) for key, plan in plans.items()}
     seconds = chapter5.in_turn({"exact": scene.backproject} | work, given.repeats)
-    error_db = {key: scene.scattered.error_db(**wish) for key, wish in wishes.items()}
-    error_m = {key: scene.error_m(w["stages"]) for key, w in wishes.items() if "stages" in w}
+    error_db = {key: scene.scattered.error_db(**request) for key, request in requests.items()}
+    error_m = {key: scene.error_m(r["stages"]) for key, r in requests.items() if "stages" in r}
 
     rows = [{"stages": 1, "QR x QI, or tolerance": "", "[45] m": "", "log10": ""}]
     rows[0] |= {"scene error dB": "", "seconds": f"{seconds['exact']:.3f}"}
@@ -63,7 +63,7 @@ def main() -> None:
     thesis, ours = figure.subplots(1, 2, sharey=True)
     for number in range(2, 7):
         keys = [key for key in error_m if key[0] == number]
-        # Of the plans of one error the fastest.
+        # Keep the fastest of the plans with the same error.
         best = {}
         for key in keys:
             error = round(math.log10(error_m[key]), 6)
@@ -78,8 +78,8 @@ def main() -> None:
         axes.axhline(seconds["exact"], color="grey", linestyle=":", label="backprojection")
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
-    thesis.set(xlabel="log10 of the error by [45] (m)", ylabel="Imaging time (s)", ylim=(0, None))
-    thesis.set_title("nearest beam: the fastest plan for an error")
+    thesis.set(xlabel="log10 of the error from [45] (m)", ylabel="Imaging time (s)", ylim=(0, None))
+    thesis.set_title("nearest beam: the fastest plan for each error")
     ours.set(
         xlabel="Measured error of an image of 300 points (dB)",
         title="every plan, and interpolated ones",

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""THESIS figure 37: the largest error with a usable image, against 2 to 5 stages.
+"""THESIS figure 37: largest error of a usable image, for 2 to 5 stages.
 
-Usable is: -3 dB width in azimuth within 20 % of the exact one, highest side lobe at most 3 dB
-higher, peak at most 3 dB lower.
+An image is usable if its -3 dB width in azimuth is within 20 % of the exact one, its highest side
+lobe is at most 3 dB higher, and its peak is at most 3 dB lower.
 """
 
 import math
@@ -11,16 +11,16 @@ from itertools import combinations_with_replacement, product
 import chapter5
 from chapter5 import WAVELENGTH_M
 
-MOST_DIVISIONS, MOST_BEAMS = 64, 80  # leave 16 pixels a side and 8 lines
-PLANS = 12  # for a number of stages
+MOST_DIVISIONS, MOST_BEAMS = 64, 80  # these leave 16 pixels along each side and 8 lines
+PLANS = 12  # for each number of stages
 LEAST_M, MOST_M = WAVELENGTH_M / 16, WAVELENGTH_M / 1.5
-THESIS = (2, 5), (4, 10)  # stages, and parts of the wavelength: read off its figure
+THESIS = (2, 5), (4, 10)  # stages, and fractions of the wavelength, read from its figure
 TOLERANCES_DB = (-10, -12, -15, -20)
 
 
 def choices(scene: chapter5.Scene, number: int) -> list[chapter5.Stages]:
-    """Return plans of some stages, with errors by [45] that are spread evenly in logarithm."""
-    # High factors first, as the thesis advises.
+    """Return plans for a number of stages, whose errors from [45] are evenly spread in log."""
+    # High factors come first, as the thesis recommends.
     pairs = sorted(product((2, 3, 4, 5, 6), (2, 4, 8, 16, 32)), reverse=True)
     found = {}
     for stages in combinations_with_replacement(pairs, number - 1):
@@ -33,8 +33,8 @@ def choices(scene: chapter5.Scene, number: int) -> list[chapter5.Stages]:
     errors = sorted(found)
     if len(errors) > PLANS:
         ratio = (errors[-1] / errors[0]) ** (1 / (PLANS - 1))
-        wanted = [errors[0] * ratio**step for step in range(PLANS)]
-        errors = sorted({min(errors, key=lambda e: abs(math.log(e / w))) for w in wanted})
+        targets = [errors[0] * ratio**step for step in range(PLANS)]
+        errors = sorted({min(errors, key=lambda e: abs(math.log(e / w))) for w in targets})
     return [found[error] for error in errors]
 
 
@@ -71,7 +71,7 @@ def main() -> None:
         usable, unusable = (tried.get((number, yes), []) for yes in (True, False))
         least, most = min(unusable, default=math.nan), max(usable, default=math.nan)
         print(
-            f"{number} stages: not usable from {chapter5.fraction(least)} by [45] on, usable up to "
+            f"{number} stages, by [45]: unusable from {chapter5.fraction(least)}, usable up to "
             f"{chapter5.fraction(most)}"
         )
         largest[number] = WAVELENGTH_M / most
@@ -83,12 +83,12 @@ def main() -> None:
             style = "go" if row["usable"] == "yes" else "rx"
             axes.semilogy(row["stages"], float(row["[45]"].removeprefix("λ/")), style)
     axes.plot(largest.keys(), largest.values(), "k-", label="The largest usable of these")
-    axes.plot(*THESIS, "b--", label="The thesis's figure, its ends")
+    axes.plot(*THESIS, "b--", label="Ends of the thesis's figure")
     axes.axhline(4, color="grey", linestyle=":", label="λ/4")
     ticks = (1, 2, 3, 4, 6, 8, 12, 16)
     axes.set_yticks(ticks, [f"λ/{tick}" for tick in ticks])
     axes.minorticks_off()
-    axes.set(xlabel="Number of stages", ylabel="Error by [45]", xticks=range(2, 6))
+    axes.set(xlabel="Number of stages", ylabel="Error from [45]", xticks=range(2, 6))
     axes.set_title("Nearest beam: usable (o) and not (x)")
     axes.grid(alpha=0.3)
     figure.legend(loc="outside lower center", ncols=3)

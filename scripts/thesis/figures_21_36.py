@@ -1,23 +1,24 @@
 #!/usr/bin/env python3
-"""THESIS figures 21 to 36: images and azimuth responses by errors; and of interpolated plans."""
+"""THESIS figures 21 to 36: images and azimuth responses by error, and of interpolated plans."""
 
 import chapter5
 import numpy as np
 from chapter5 import decibels
 
-# Three beams into one, and sides divided by powers of two: within 3 % of lambda/121.2, /60.6,
-# /30.3 ... /1.9, of which the thesis's labels 121, 60, 30, 15, 7, 3 and 1 are the whole parts.
+# Three beams are combined into one, and sides divided by powers of two. The errors are within 3 %
+# of lambda/121.2, /60.6, /30.3 ... /1.9, whose integer parts are the labels 121, 60, 30, 15, 7, 3
+# and 1 of the thesis.
 ERRORS = {121: (3, 64), 60: (3, 32), 30: (3, 16), 15: (3, 8), 7: (3, 4), 3: (3, 2), 1: (6, 2)}
-# The halving from 30.3, which the thesis gives for QR = 2 and QI = 4, by powers of two.
+# Errors that halve from 30.3, which the thesis states for QR = 2 and QI = 4, by powers of two.
 HALVINGS = {121: (2, 16), 60: (2, 8), 30: (2, 4), 15: (2, 2), 7: (4, 2), 3: (8, 2), 1: (16, 2)}
 TOLERANCES_DB = (-20, -40)
 TAPS = (4, 6, 8)  # in range and along the aperture, at -40 dB
-DYNAMIC_RANGE_DB = 40  # as in the thesis's pictures
-PANEL = 256  # dots along a picture's side
+DYNAMIC_RANGE_DB = 40  # as in the pictures of the thesis
+PANEL = 256  # dots along each side of a picture
 
 
 def coarse(amplitude: np.ndarray) -> np.ndarray:
-    """Return the greatest of the pixels that share a dot."""
+    """Return the maximum of the pixels in each dot."""
     for axis in (0, 1):
         count = amplitude.shape[axis]
         first = np.linspace(0, count, min(count, PANEL), endpoint=False).astype(int)
@@ -35,8 +36,8 @@ def main() -> None:
         }
     ]  # fmt: skip
 
-    def add(title: str, kept: bool = True, **wish: object) -> None:
-        plan, stages = scene.plan(**wish), wish.get("stages")
+    def add(title: str, kept: bool = True, **request: object) -> None:
+        plan, stages = scene.plan(**request), request.get("stages")
         image = scene.form(plan)
         quality = scene.measure(image)
         rows.append(
@@ -46,7 +47,7 @@ def main() -> None:
                 "[45]": chapter5.fraction(scene.error_m(stages)) if stages else "",
                 "measured": chapter5.fraction(scene.largest_error_m(plan)) if stages else "",
                 **quality.cells(),
-                "scene error dB": f"{scene.scattered.error_db(**wish):.1f}",
+                "scene error dB": f"{scene.scattered.error_db(**request):.1f}",
                 "usable": "yes" if quality.usable(scene.exact_quality) else "no",
             }
         )
@@ -77,7 +78,7 @@ def main() -> None:
         )
         panel.set(title=title, aspect="equal")
         response = chapter5.profile(image)
-        # The thesis's responses are each over their own peak; over the exact one the loss shows.
+        # The thesis normalises each response by its own peak; the exact peak reveals the loss.
         curve.plot(x_m, decibels(response, chapter5.profile(scene.exact).max()), linewidth=0.8)
         curve.set(title=title, ylim=(-80, 3))
         curve.grid(alpha=0.3)

@@ -16,22 +16,26 @@ import numpy as np
 import clsas
 from clsas.trials import wreck
 
-THESIS = {"42": (8, "λ/13"), "43": (4, "λ/6"), "44": (1, "λ/1")}  # patches a side, worst error
+THESIS = {
+    "42": (8, "λ/13"),
+    "43": (4, "λ/6"),
+    "44": (1, "λ/1"),
+}  # patches along each side, largest error
 TOLERANCES_DB = (-20, -30, -40, -50)
 ALL = "all channels"  # without a beam
 STRIPS = 4  # of a wavenumber image, each with its own middle range
 DYNAMIC_RANGE_DB = 40
-BRIGHTEST = 99.5  # percentile of the exact image's power that is the pictures' 0 dB
-PANEL = 256  # pixels along a picture's side, about
+BRIGHTEST = 99.5  # percentile of the exact image's power that is 0 dB in the pictures
+PANEL = 256  # approximate number of dots along each side of a picture
 STEPS = 16  # of the grey scale
-DPI = {1: 180, 2: 110}  # by pictures a side: files of less than 200 kB
+DPI = {1: 180, 2: 110}  # by pictures along each side, for files of less than 200 kB
 
 Picture = tuple[str, clsas.Image, float]  # title, image, power of its 0 dB
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
-    """A way to an image: its figure, what is imaged, from which lines, and how."""
+class Method:
+    """A method to form an image: figure, part of the scene, lines, name, and function."""
 
     figure: str
     extent: str
@@ -41,40 +45,44 @@ class Way:
 
     @property
     def grid(self) -> clsas.Grid:
-        """Of the image."""
+        """Grid of the image."""
         return getattr(self.scene, self.extent)
 
     def __call__(self) -> tuple[clsas.Image, list[clsas.Patch]]:
-        """Form the image; say what it warns of."""
-        with warnings.catch_warnings(record=True) as told:
+        """Return the image and its patches, and print the first warning."""
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", clsas.ClsasWarning)
             formed = self.form(self.grid)
-        for each in told[:1]:
+        for each in caught[:1]:
             print(f"{self.name}, {self.extent}: {each.message}")
         return formed if isinstance(formed, tuple) else (formed, [])
 
 
 def patched(side: int) -> str:
-    """Name a mosaic of the thesis."""
+    """Return the name of a mosaic of the thesis."""
     return f"nearest, {side * side} patches" if side > 1 else "nearest, 1 patch"
 
 
-def ways(full: chapter6.Scene) -> list[Way]:
-    """Return all of them; each extent's first is exact."""
+def methods(full: chapter6.Scene) -> list[Method]:
+    """Return all methods; the first for each part of the scene is exact."""
 
-    def exact(figure: str, extent: str, name: str, scene=full, **options) -> Way:
-        return Way(figure, extent, scene, name, partial(scene.backproject, **options))
+    def exact(figure: str, extent: str, name: str, scene=full, **options) -> Method:
+        return Method(figure, extent, scene, name, partial(scene.backproject, **options))
 
-    def mosaic(figure: str, extent: str, name: str, side: int | None, scene=full, **wish) -> Way:
+    def mosaic(
+        figure: str, extent: str, name: str, side: int | None, scene=full, **request
+    ) -> Method:
         patches = side and (side, side)
-        return Way(figure, extent, scene, name, partial(scene.mosaic, patches=patches, **wish))
+        return Method(
+            figure, extent, scene, name, partial(scene.mosaic, patches=patches, **request)
+        )
 
     found = [
         exact("40", "whole", "exact"),
         exact("", "whole", "exact, −40 dB", accuracy_db=-40),
         exact("", "whole", f"exact, −40 dB, {ALL}", accuracy_db=-40, beam=None),
         mosaic("", "whole", "tolerance −40 dB", None, tolerance_db=-40),
-        Way("", "whole", full, "wavenumber", full.wavenumber),
+        Method("", "whole", full, "wavenumber", full.wavenumber),
         exact("41", "part", "exact"),
         exact("", "part", "exact, −40 dB", accuracy_db=-40),
         exact("", "part", "exact, heading fixed", beam=chapter6.FIXED_BEAM),
@@ -84,16 +92,16 @@ def ways(full: chapter6.Scene) -> list[Way]:
         if scene is not full:
             found.append(exact("", "part", "exact", scene))
         for figure, (side, _) in THESIS.items():
-            wish = {"scene": scene, "stages": chapter6.STAGES}
-            found.append(mosaic(figure, "part", patched(side), side, **wish))
+            request = {"scene": scene, "stages": chapter6.STAGES}
+            found.append(mosaic(figure, "part", patched(side), side, **request))
     for db in TOLERANCES_DB:
         found.append(mosaic("", "part", f"tolerance −{-db} dB", None, tolerance_db=db))
     for side in (4, 8):
         name = f"tolerance −40 dB, {side * side} patches"
         found.append(mosaic("", "part", name, side, tolerance_db=-40))
     found += [
-        Way("45", "part", full, "wavenumber", full.wavenumber),
-        Way(
+        Method("45", "part", full, "wavenumber", full.wavenumber),
+        Method(
             "",
             "part",
             full,
@@ -112,16 +120,16 @@ def ways(full: chapter6.Scene) -> list[Way]:
 def main() -> None:
     given, full = chapter6.arguments(__doc__, repeats=3)
     shadow = wreck.Shadow(wreck.scene())
-    thin, todo = full.thinned, ways(full)
+    thin, todo = full.thinned, methods(full)
     exact, images, rows = {}, {}, {}
-    for way in todo:
-        image, patches = way()
-        reference = exact.setdefault((way.scene, way.extent), image)
-        rows[way] = row(way, image, patches, reference, shadow)
-        if way.extent != "fine":
-            images[way.scene, way.extent, way.name] = image
-    for way, seconds in in_turn(todo, given.repeats).items():
-        rows[way]["seconds"] = f"{seconds:.3f}"
+    for method in todo:
+        image, patches = method()
+        reference = exact.setdefault((method.scene, method.extent), image)
+        rows[method] = row(method, image, patches, reference, shadow)
+        if method.extent != "fine":
+            images[method.scene, method.extent, method.name] = image
+    for method, seconds in in_turn(todo, given.repeats).items():
+        rows[method]["seconds"] = f"{seconds:.3f}"
     chapter5.report(given.out, "figures_39_45", list(rows.values()))
     fixed = images[full, "part", "exact, heading fixed"]
     for name in ("wavenumber", f"wavenumber, {STRIPS} strips"):
@@ -148,44 +156,44 @@ def main() -> None:
     draw(mosaics, given.out, "figures_42_44")
 
 
-def in_turn(todo: list[Way], repeats: int) -> dict[Way, float]:
-    """Return the median seconds of every way, done in turn; all have been done before."""
-    taken: dict[Way, list[float]] = {way: [] for way in todo}
+def in_turn(todo: list[Method], repeats: int) -> dict[Method, float]:
+    """Return the median seconds of every method, run in turns; all have been run before."""
+    taken: dict[Method, list[float]] = {method: [] for method in todo}
     for _ in range(repeats):
-        for way in todo:
+        for method in todo:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", clsas.ClsasWarning)
                 start = time.perf_counter()
-                way.form(way.grid)
-                taken[way].append(time.perf_counter() - start)
-    return {way: statistics.median(each) for way, each in taken.items()}
+                method.form(method.grid)
+                taken[method].append(time.perf_counter() - start)
+    return {method: statistics.median(each) for method, each in taken.items()}
 
 
 def row(
-    way: Way,
+    method: Method,
     image: clsas.Image,
     patches: list[clsas.Patch],
     exact: clsas.Image,
     shadow: wreck.Shadow,
 ) -> dict[str, object]:
-    """Return what there is to say of an image, but for its seconds."""
-    scene, worst = way.scene, {"thesis": "", "[45]": "", "measured": ""}
-    if way.figure in THESIS:
+    """Return the row of an image in the table, without its seconds."""
+    scene, worst = method.scene, {"thesis": "", "[45]": "", "measured": ""}
+    if method.figure in THESIS:
         worst = {
-            "thesis": THESIS[way.figure][1],
+            "thesis": THESIS[method.figure][1],
             "[45]": chapter6.fraction(max(map(scene.formula_m, patches))),
             "measured": chapter6.fraction(max(map(scene.measured_m, patches))),
         }
     plans = [patch.record.plan for patch in patches]
     stages = [1 + len(plan["image"]["sides"]) if plan else 1 for plan in plans]
-    other = image is exact or ALL in way.name  # not to be compared
+    other = image is exact or ALL in method.name  # images that are not compared
     error_db = None if other else clsas.relative_error_db(image, exact)
     mast_db = chapter6.mast_db(image)
     return {
-        "figure": way.figure,
+        "figure": method.figure,
         "pixels": " x ".join(map(str, image.grid.shape)),
         "lines": scene.lines.channels,
-        "image": way.name,
+        "image": method.name,
         "stages": max(stages, default=""),
         **worst,
         "seconds": "",
@@ -197,7 +205,7 @@ def row(
 
 
 def draw_track(scene: chapter6.Scene, out: Path) -> None:
-    """Draw where the transmitter was at every ping."""
+    """Draw the positions of the transmitter."""
     tx_m = np.unique(scene.lines.tx_m, axis=0)
     figure = chapter5.figure(8, 2.8)
     axes = figure.subplots()
@@ -209,7 +217,7 @@ def draw_track(scene: chapter6.Scene, out: Path) -> None:
 
 
 def draw(pictures: list[Picture], out: Path, stem: str) -> None:
-    """Draw one image or four, in dB over a power."""
+    """Draw one or four images, in dB over a reference power."""
     from matplotlib import colormaps
 
     side = 1 if len(pictures) == 1 else 2
@@ -224,7 +232,7 @@ def draw(pictures: list[Picture], out: Path, stem: str) -> None:
             cmap=colormaps["gray"].resampled(STEPS),
             vmin=-DYNAMIC_RANGE_DB,
             vmax=0,
-            interpolation="nearest",  # no shades between these
+            interpolation="nearest",  # no shades in between
         )
         axes.set(title=title, aspect="equal")
     for axes in panels[-side:]:

@@ -9,43 +9,44 @@ import clsas
 from clsas.aperture.mean_track import mean_track
 from clsas.aperture.nearest import NearestBeams
 from clsas.core.geometry import pairwise_range_m
+from clsas.core.wavelengths import band_wavelength_m
 from clsas.factorized.surface import surface_of
 from clsas.factorized.tree import Division
-from clsas.signal.spectrum import band_wavelength_m
 
 
 def range_errors_m(
     plan: clsas.Plan, lines: clsas.RangeLines, grid: clsas.Grid, pixels: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return the range errors that a plan of nearest beams makes, followed stage by stage.
+    """Return the range errors of a plan of nearest beams, followed stage by stage.
 
     Parameters
     ----------
     plan : Plan
-        Made with `stages`, at least one.
+        Plan made with at least one of `stages`.
     lines : RangeLines
-        Without motion during flight.
+        Lines without motion during flight.
     grid : Grid
-        A plane.
+        Grid on a plane.
     pixels : array_like of int, [n, 2]
-        Rows and columns.
+        Rows and columns of the pixels.
 
     Returns
     -------
     ndarray of float64, shape [n, channels]
-        The range at which a pixel takes a channel's line, less the right one; channels in order
-        along the track.
+        Range at which a pixel reads the line of a channel, minus the true range, metres. Channels
+        are in order along the track.
 
     Notes
     -----
-    [42] and [43] applied to every channel: in each stage its line is shifted so that the range of
-    the subimage's centre is right for the mean of its neighbours, which then stands for it.
+    [42] and [43] are applied to every channel. In each stage, the line of a channel is shifted so
+    that the range of the subimage's centre is correct for the mean position of the channels that
+    are combined, which then replaces the position of the channel.
     """
     image = plan.factorization
     wavelength_m = band_wavelength_m(lines, image.resampling.centre_cycles_per_sample)
     track = mean_track(lines, wavelength_m)
     if track is None or not isinstance(image.aperture, NearestBeams) or not grid.is_planar:
-        raise ValueError("plan must be one of stages, for lines and a plane that it was made for")
+        raise ValueError("plan must be made with stages, for these lines and a plane grid")
     order = np.argsort(track.coordinate, kind="stable")
     ends_m = lines.tx_m[order], lines.rx_m[order]
     division = Division(surface_of(grid), image.sides)
@@ -53,7 +54,7 @@ def range_errors_m(
     points_m = np.asarray(grid.origin_m) + index @ division.surface.steps_m
     errors_m = -pairwise_range_m(points_m, *ends_m)
     position_m = lines.phase_centres_m[order]
-    beam = np.arange(lines.channels)  # of the stage before, that holds each channel
+    beam = np.arange(lines.channels)  # the beam of the previous stage to which each channel belongs
     for level, (side, beams) in enumerate(zip(image.sides, image.aperture.factors, strict=True)):
         centres_m = division.centres_m(level, index // side * side)
         errors_m += pairwise_range_m(centres_m, *ends_m)[:, beam]

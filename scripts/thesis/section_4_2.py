@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""THESIS 4.2: operations of its worked example, and of the same plan here."""
+"""THESIS 4.2: number of operations in its worked example, and in the same plan here."""
 
 import chapter5
 
 from clsas.aperture import nearest
 
 STAGES = [(2, 2), (2, 2)]
-SAMPLES = (3757, 1990)  # that the thesis's subimages need in its two stages
+SAMPLES = (3757, 1990)  # samples that the subimages of the thesis need in its two stages
 
 
 def main() -> None:

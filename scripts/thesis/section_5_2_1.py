@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""THESIS 5.2.1: two ways said to lead to one error, and interpolated plans beside them."""
+"""THESIS 5.2.1: two plans with the same error according to [45], and interpolated plans."""
 
 from functools import partial
 
@@ -11,9 +11,9 @@ TOLERANCES_DB = (-15, -20, -30, -40, -50)
 
 def main() -> None:
     given, scene = chapter5.arguments(__doc__, repeats=5)
-    wishes = {title: {"stages": stages} for title, stages in STAGES.items()}
-    wishes |= {f"interpolated, {db} dB": {"tolerance_db": db} for db in TOLERANCES_DB}
-    plans = {title: scene.plan(**wish) for title, wish in wishes.items()}
+    requests = {title: {"stages": stages} for title, stages in STAGES.items()}
+    requests |= {f"interpolated, {db} dB": {"tolerance_db": db} for db in TOLERANCES_DB}
+    plans = {title: scene.plan(**request) for title, request in requests.items()}
     work = {"backprojection": scene.backproject}
     work |= {title: partial(scene.form, plan) for title, plan in plans.items()}
     seconds = chapter5.in_turn(work, given.repeats)
@@ -30,7 +30,7 @@ def main() -> None:
                 "[45]": chapter5.fraction(error_m),
                 "measured": chapter5.fraction(scene.largest_error_m(plans[title])),
             }
-        error = "-inf" if exact else f"{scene.scattered.error_db(**wishes[title]):.1f}"
+        error = "-inf" if exact else f"{scene.scattered.error_db(**requests[title]):.1f}"
         measured = {"scene error dB": error, "seconds": f"{seconds[title]:.3f}"}
         rows.append(row | quality.cells() | measured)
     chapter5.report(given.out, "section_5_2_1", rows)

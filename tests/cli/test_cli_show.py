@@ -248,7 +248,7 @@ def test_a_mosaic_is_read_patch_by_patch(store, monkeypatch):
         (["short.json"], 1, "must be a plan of `clsas plan --json --filters`: it lacks 'digest'"),
         (["scene.toml"], 1, "scene.toml is a scene"),
         (["grid.h5"], 1, "must hold an image, range lines or echoes, got only a Grid"),
-        (["text.h5"], 1, "text.h5 is not an HDF5 file"),
+        (["text.h5"], 1, "text.h5 is neither an HDF5 file, nor CPHD"),
         (["."], 1, "is not a mosaic of clsas"),
     ],
 )
@@ -270,4 +270,4 @@ def test_a_name_with_dollar_signs_is_drawn_as_it_is(folder, figures):
 
 def test_without_matplotlib_nothing_is_read(folder, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert "pip install 'matplotlib>=3.8'" in run("image.h5", code=1)
+    assert "pip install 'matplotlib>=3.10'" in run("image.h5", code=1)

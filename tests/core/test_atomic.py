@@ -1,4 +1,4 @@
-"""Files appear whole or not at all; leftovers of killed writers are removed."""
+"""Files appear complete or not at all, and leftovers of killed writers are removed."""
 
 import errno
 import fcntl
@@ -16,7 +16,7 @@ from clsas.core.atomic import creating, locked, replacing
 
 @pytest.mark.parametrize("names", [None, "the temporary one"])
 def test_a_full_disk_names_the_file_that_was_to_be_written(tmp_path, names):
-    """Not the temporary one, nor nothing as the system does; what was there stays."""
+    """The error names the user's file, not the temporary one, and the old file stays."""
     path = tmp_path / "image.h5"
     path.write_text("before")
 
@@ -33,7 +33,7 @@ def test_a_full_disk_names_the_file_that_was_to_be_written(tmp_path, names):
 
 
 def killed_in(statement, folder):
-    """Kill a process while it writes; return what it left."""
+    """Kill a process while it writes, and return the files that it leaves behind."""
     program = f"""
 import os, signal
 from pathlib import Path
@@ -68,7 +68,7 @@ def test_what_another_writer_is_at_stays(tmp_path):
 
 
 def test_names_alike_stay(tmp_path):
-    """Another program's, and what cannot be opened as a file of ours: a link, a pipe."""
+    """Files of other programs stay, and so do links and pipes with such a name."""
     (tmp_path / ".other-0.part").touch()
     (tmp_path / "precious").write_text("precious")
     (tmp_path / ".clsas-0.part").symlink_to(tmp_path / "precious")
@@ -80,7 +80,7 @@ def test_names_alike_stay(tmp_path):
 
 
 def test_a_temporary_taken_for_a_leftover_is_made_anew(tmp_path, monkeypatch):
-    """Another writer may remove it after it was made and before it is locked."""
+    """Another writer may remove a file after it was created and before it is locked."""
     flock, calls = fcntl.flock, []
 
     def raced(descriptor, operation):
@@ -113,7 +113,7 @@ def test_contents_reach_the_disk_before_the_name(tmp_path, monkeypatch):
 
 
 def test_a_file_may_be_read_under_a_lock_once_it_has_its_name(tmp_path, monkeypatch):
-    """As HDF5 does. The folder is still to reach the disk then."""
+    """HDF5 takes a shared lock for reading. The folder has not reached the disk by then."""
     path, seen = tmp_path / "a", []
 
     def read(_folder):
@@ -139,7 +139,7 @@ def test_a_folder_that_another_made_meanwhile_stays(tmp_path):
 def test_a_symbolic_link_stays_and_its_target_is_replaced(tmp_path):
     (tmp_path / "disk").mkdir()
     target = tmp_path / "disk" / "image.h5"
-    for before in (None, "before"):  # a link may lead to what is not there yet
+    for before in (None, "before"):  # a link may point to a file that does not exist yet
         if before is not None:
             target.write_text(before)
         link = tmp_path / f"link-{before}"

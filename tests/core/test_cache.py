@@ -50,6 +50,28 @@ def test_folders_are_made_for_their_user_alone(folder, umask):
         assert stat.S_IMODE((folder / each).stat().st_mode) == 0o700
 
 
+@pytest.mark.parametrize(
+    ("platform", "given", "expected"),
+    [
+        ("linux", None, "home/.cache/clsas"),
+        ("linux", "", "home/.cache/clsas"),
+        ("linux", "relative", "home/.cache/clsas"),
+        ("linux", "/caches", "/caches/clsas"),
+        ("darwin", None, "home/Library/Caches/clsas"),
+    ],
+)
+def test_without_a_variable_it_lies_where_the_system_keeps_caches(
+    tmp_path, monkeypatch, platform, given, expected
+):
+    monkeypatch.delenv("CLSAS_CACHE", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("sys.platform", platform)
+    if given is not None:
+        monkeypatch.setenv("XDG_CACHE_HOME", given)
+    assert cache.cache_folder() == tmp_path / expected
+
+
 def test_a_folder_that_does_not_exist_is_trusted_and_not_made(folder):
     assert cache.trusted_cache() == folder
     assert not folder.parent.exists()
@@ -77,7 +99,7 @@ def test_a_folder_that_others_can_write_to_is_refused(shared, monkeypatch, mode)
 
 
 def test_a_folder_in_one_that_others_can_write_to_is_refused(shared, monkeypatch):
-    """They could rename it and put theirs in its place, unless the outer one is sticky."""
+    """Others could replace the folder by their own, unless the outer folder is sticky."""
     shared.chmod(0o777)
     (shared / "cache").mkdir(0o700)
     refused(shared / "cache", monkeypatch, f"other users can write to {shared}")
@@ -86,7 +108,7 @@ def test_a_folder_in_one_that_others_can_write_to_is_refused(shared, monkeypatch
 
 
 def test_what_lies_in_a_closed_folder_may_have_any_mode(shared, monkeypatch):
-    """As ~/.cache of mode 0775 in a home of mode 0700."""
+    """An example is ~/.cache with mode 0775 in a home folder with mode 0700."""
     shared.chmod(0o700)
     (shared / "cache").mkdir()
     (shared / "cache").chmod(0o775)
@@ -113,7 +135,7 @@ def test_a_folder_in_one_of_another_user_is_refused(shared, monkeypatch):
 
 @as_root
 def test_a_symbolic_link_of_another_user_is_refused(shared, tmp_path, monkeypatch):
-    """It could lead to another folder by the time that the cache is used."""
+    """The link could point to another folder by the time that the cache is used."""
     own = tmp_path / "own"
     own.mkdir(0o700)
     (shared / "link").symlink_to(own)
@@ -143,7 +165,7 @@ def test_a_loop_of_symbolic_links_ends(shared, monkeypatch):
 
 @as_root
 def test_a_folder_made_by_another_user_meanwhile_is_refused(shared, monkeypatch):
-    """Between the check and the creation."""
+    """The other user creates it between the check and the creation."""
     make = Path.mkdir
 
     def raced(path, *args, **options):
@@ -159,7 +181,7 @@ def test_a_folder_made_by_another_user_meanwhile_is_refused(shared, monkeypatch)
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="becomes another user")
 def test_another_users_private_cache_is_named(shared, monkeypatch):
-    """Where the next user got nothing but 'Permission denied'."""
+    """The message names the folder, where the system says only 'Permission denied'."""
     (shared / "cache").mkdir(0o700)
     os.setegid(OTHER)
     os.seteuid(OTHER)

@@ -13,7 +13,7 @@ def lines_of(samples, carrier_hz=0.0, tx_m=(0, 0, 0), first_range_m=0.0):
 
 
 def tone(frequency_hz, length=2000):
-    """A tone of the recorded signal, as it lies in lines that still have their carrier."""
+    """Return a tone of the recorded signal, as it appears in lines on their carrier."""
     return np.exp(2j * np.pi * frequency_hz * np.arange(length) / RATE)[None]
 
 
@@ -71,7 +71,7 @@ def test_tapers_longer_than_half_a_line_are_refused(length_m):
 
 
 def survey(pings=40, receivers=2, length=300):
-    """Echoes that move through the lines, over a background that every receiver has of its own."""
+    """Return echoes that move through the lines, and a background for each receiver."""
     random = np.random.default_rng(5)
     background = random.normal(size=(receivers, length)) + 1j * random.normal(
         size=(receivers, length)
@@ -106,7 +106,7 @@ def test_pings_that_stand_still_need_the_number_of_receivers():
 def test_backgrounds_at_different_delays_are_refused():
     lines, _ = survey()
     moved = lines_of(lines.samples, 20e3, lines.tx_m, np.arange(80) * 1e-4)
-    with pytest.raises(ValueError, match=r"differ by up to 0\.0078 m"):
+    with pytest.raises(ValueError, match=r"differs by up to 0\.0078 m"):
         moved.without_background()
 
 

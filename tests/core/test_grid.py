@@ -69,7 +69,7 @@ def test_axes_exist_only_along_x_and_y():
     swapped = Grid.oriented([0, 0, 0], [1, 0, 0], [0, 1, 0], (2, 2))
     for grid in (GRIDS["oriented"], GRIDS["points"], swapped):
         assert not grid.has_axes
-        with pytest.raises(ValueError, match="columns must run along x and its rows along y"):
+        with pytest.raises(ValueError, match="grid must have columns along x and rows along y"):
             _ = grid.axes_m
 
 
@@ -123,7 +123,7 @@ def test_steps_are_parallel_by_their_angle(scale):
 
 @EVERY_GRID
 def test_window_must_hold_a_pixel(grid):
-    with pytest.raises(ValueError, match=r"must hold a pixel|no empty axis"):
+    with pytest.raises(ValueError, match=r"must contain a pixel|no empty axis"):
         grid.window(slice(3, 3), slice(None))
 
 
@@ -162,7 +162,7 @@ def test_arrays_are_read_only():
         for name in ("origin_m", "row_step_m", "column_step_m", "height_m", "points_m"):
             value = getattr(grid, name)
             assert value is None or not value.flags.writeable
-        grid.positions_m()[...] = 0  # a result is the caller's own
+        grid.positions_m()[...] = 0  # results may be changed by the caller
 
 
 ZERO, ONE, TWO = [0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]
@@ -176,11 +176,11 @@ ZERO, ONE, TWO = [0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]
         (lambda: Grid.plane(x=(0, 1, 0), y=(0, 1, 2)), ValueError, "x count must be at least 1"),
         (lambda: Grid.plane(x=(0, 1, 2.5), y=(0, 1, 2)), TypeError, "x count must be a whole"),
         (lambda: Grid.plane(x=(0, np.nan, 2), y=(0, 1, 2)), ValueError, "x stop must be finite m"),
-        (lambda: Grid.plane(x=(0, 1, 2), y=(3, 3, 2)), ValueError, "y must end elsewhere"),
+        (lambda: Grid.plane(x=(0, 1, 2), y=(3, 3, 2)), ValueError, "y must start and stop at d"),
         (
             lambda: Grid.plane(x=(0, 1, 2), y=(3, 4, 1)),
             ValueError,
-            "y must be one position for 1 pixel, got 3.0 m to 4.0 m",
+            "y must start and stop at one position for 1 pixel, got 3.0 m to 4.0 m",
         ),
         (lambda: Grid.plane((0, 1, 2), (0, 1, 2), z=np.inf), ValueError, "z must be finite m"),
         (lambda: Grid.oriented(ZERO, ONE, TWO, (2, 2)), ValueError, "must not be parallel"),
@@ -193,13 +193,13 @@ ZERO, ONE, TWO = [0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]
         (lambda: Grid.oriented(ZERO, ONE, TWO, (2, 2, 2)), ValueError, r"\(rows, columns\)"),
         (lambda: GRIDS["plane"].with_height(HEIGHT.T), ValueError, r"height_m.*shape \(3, 5\)"),
         (lambda: GRIDS["plane"].with_height(HEIGHT * np.nan), ValueError, "height_m must be fin"),
-        (lambda: GRIDS["height map"].with_height(HEIGHT), ValueError, "only on a plane, and once"),
-        (lambda: GRIDS["points"].with_height(HEIGHT), ValueError, "only on a plane"),
+        (lambda: GRIDS["height map"].with_height(HEIGHT), ValueError, "only to a plane, and only"),
+        (lambda: GRIDS["points"].with_height(HEIGHT), ValueError, "only to a plane"),
         (lambda: Grid.points([1.0, 2, 3]), ValueError, r"points_m must have shape \(any, 3\)"),
         (lambda: Grid.points(np.zeros((0, 3))), ValueError, "no empty axis"),
         (lambda: Grid.points(np.zeros((5, 2))), ValueError, r"shape \(any, 3\)"),
         (lambda: Grid.points(np.full((5, 3), np.nan)), ValueError, "points_m must be finite"),
-        (lambda: Grid.points(np.ma.masked_equal([ZERO], 0)), ValueError, "points_m must hold no m"),
+        (lambda: Grid.points(np.ma.masked_equal([ZERO], 0)), ValueError, "points_m must have no m"),
         (lambda: Grid.points(np.zeros((5, 3), complex)), TypeError, "points_m must be real"),
         (lambda: Grid(ZERO, None, None, (1,), points_m=[ZERO]), ValueError, "must stand alone"),
     ],

@@ -33,7 +33,7 @@ def test_a_copy_is_made_when_asked_for():
     assert np.asarray(IMAGE).any()
     assert not np.shares_memory(IMAGE.__array__(copy=True), IMAGE.pixels)
     assert np.shares_memory(IMAGE.__array__(copy=False), IMAGE.pixels)
-    with pytest.raises(ValueError, match="copy must not be False where complex64 becomes"):
+    with pytest.raises(ValueError, match="copy must not be False if complex64 is to become"):
         IMAGE.__array__(np.complex128, copy=False)
 
 

@@ -59,7 +59,7 @@ def test_it_cannot_be_changed():
         lines.samples[0, 0] = 0
     with pytest.raises(dataclasses.FrozenInstanceError):
         lines.carrier_hz = 1.0
-    samples[0, 0] = 2  # the caller's own array stays the caller's
+    samples[0, 0] = 2  # the caller's array stays writeable
 
 
 @pytest.mark.parametrize(
@@ -140,11 +140,13 @@ def test_it_is_shown_in_one_line():
 def test_samples_that_float32_does_not_hold_are_refused():
     for scale in (1e-50, 1e50):
         samples = scale * np.ones((2, 3), np.complex128)
-        with pytest.raises(ValueError, match=r"samples must have .* got 1e[+-]50: scale them"):
+        with pytest.raises(
+            ValueError, match=r"samples must have .* got 1e[+-]50: scale the values"
+        ):
             RangeLines(samples, 1.0, 0.1, (0, 0, 0), (0, 0, 0), 1e5, 1500.0)
-        with pytest.raises(ValueError, match="scale them"):
+        with pytest.raises(ValueError, match="scale the values"):
             Echoes(samples, 0.0, 1e5, 1e5, (0, 0, 0), (0, 0, 0), 1500.0)
-        with pytest.raises(ValueError, match="scale them"):
+        with pytest.raises(ValueError, match="scale the values"):
             Echoes(samples.real, 0.0, 1e5, 1e5, (0, 0, 0), (0, 0, 0), 1500.0)
-        with pytest.raises(ValueError, match="scale them"):
+        with pytest.raises(ValueError, match="scale the values"):
             Image(samples, Grid.plane((0, 1, 3), (0, 1, 2)))

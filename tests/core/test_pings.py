@@ -1,4 +1,4 @@
-"""Transmissions, and those taken standing still."""
+"""Pings, also several from one position, and pings taken standing still."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from clsas.core.pings import Transmissions
 
 
 def lines_at(x, receivers=1):
-    """Lines of pings at places along x, each with receivers 0.1 m apart."""
+    """Return lines of pings at positions along x, each with receivers 0.1 m apart."""
     tx_m = np.repeat(np.stack([x, 0 * x, 0 * x], axis=1), receivers, axis=0)
     rx_m = tx_m + np.tile(np.outer(np.arange(receivers), [0.1, 0, 0]), (len(x), 1))
     samples = np.arange(len(tx_m))[:, None] * np.ones(3) + 1j
@@ -37,7 +37,7 @@ def test_lines_without_halts_are_returned_as_they_are():
 
 
 def test_the_usual_advance_is_that_of_the_pings_that_move():
-    """With 355 of 608 pings at rest, jitter of their places, and a gap."""
+    """355 of 608 pings are at rest, with jitter of their positions, and there is a gap."""
     x = np.concatenate([np.full(355, 0.0), 0.01 * np.arange(1, 254)])
     x[500:] += 3.0
     x[:355] += 1e-5 * np.random.default_rng(0).standard_normal(355)
@@ -68,7 +68,7 @@ def test_a_platform_that_never_moves_and_a_single_ping():
     assert Transmissions.of(lines_at(np.zeros(1))).turns.size == 0
 
 
-def test_turns_are_told_on_any_course():
+def test_turns_are_found_on_any_course():
     x = np.arange(40.0)
     assert Transmissions.of(lines_at(x[::-1])).turns.size == 0
     x[[20, 24]] = x[[24, 20]]

@@ -33,7 +33,7 @@ def test_a_text_too_large_to_be_parsed_is_refused_unread(tmp_path, monkeypatch):
 
 @pytest.fixture
 def usual_recursion_limit():
-    """Python's own limit: Hypothesis raises it in a process that ran its tests."""
+    """Set Python's default limit, which Hypothesis raises in the process of its tests."""
     limit = sys.getrecursionlimit()
     sys.setrecursionlimit(1000)
     yield

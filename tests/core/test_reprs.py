@@ -1,4 +1,4 @@
-"""What objects say of themselves: short, with units, never whole arrays."""
+"""The repr of every public class is short, has units, and contains no whole arrays."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Threads, and Ctrl-C at any place in the main thread."""
+"""Work in threads, with Ctrl-C at any point of the main thread."""
 
 import signal
 import subprocess
@@ -59,7 +59,7 @@ def test_ctrl_c_never_leaves_a_lock_taken():
 
 @pytest.fixture
 def heeded():
-    """As at a terminal: a shell's background jobs ignore Ctrl-C."""
+    """Let Ctrl-C interrupt, as at a terminal. Background jobs of a shell ignore it."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

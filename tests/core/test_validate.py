@@ -136,7 +136,7 @@ def test_array_speaks_of_phase_only_where_samples_are_real(name, given, got):
 
 def test_array_refuses_masked_values():
     given = np.ma.array([1.0, 2.0, 3.0], mask=[False, True, False])
-    with pytest.raises(ValueError, match="x must hold no masked value, got 1 of 3"):
+    with pytest.raises(ValueError, match="x must have no masked value, got 1 of 3"):
         validate.array("x", given, np.float64, (None,))
     result = validate.array("x", np.ma.array([1.0, 2.0]), np.float64, (None,))
     np.testing.assert_array_equal(result, [1.0, 2.0])
@@ -179,7 +179,7 @@ def test_array_refuses_values_that_a_narrower_type_does_not_hold(scale, part):
 @pytest.mark.parametrize("scale", [1.2e-38, 1e38])
 def test_array_keeps_float32s_digits_to_the_ends_of_its_range(scale):
     given = scale * np.random.default_rng(1).uniform(-1, 1, (50, 3))
-    given[0] = scale, 1e-60, 0  # what is lost beside the largest value
+    given[0] = scale, 1e-60, 0  # lost in float32, relative to the largest value
     held = validate.array("x", given, np.float32, (None, None))
     np.testing.assert_allclose(held, given, rtol=0, atol=6e-8 * scale)
 
@@ -246,7 +246,7 @@ def test_memory_heeds_the_limit_of_the_address_space():
 
 
 def test_memory_counts_what_the_process_holds():
-    """Pages that were written; not those of libraries."""
+    """Pages that the process has written count, those of libraries do not."""
     before = validate._memory_bytes()
     held = np.ones(100 << 20, np.uint8)
     assert before - validate._memory_bytes() == pytest.approx(held.nbytes, rel=0.2)
@@ -266,7 +266,7 @@ def test_a_budget_adds_up(monkeypatch):
 
 
 def test_array_checks_the_memory_of_its_copy_before_it_is_made(monkeypatch):
-    """Bytes to float64 take eight times as much; what needs no conversion takes nothing."""
+    """As float64, int8 takes eight times as much; without a conversion nothing is taken."""
     given = np.zeros((1 << 20, 3), np.int8)
     monkeypatch.setattr(validate, "_memory_bytes", lambda: 8 << 20)
     with pytest.raises(ValueError, match=r"tx_m must ask for at most .* got 0\.0234 GiB"):

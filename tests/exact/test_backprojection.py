@@ -62,14 +62,14 @@ def test_rounding_does_not_depend_on_the_interpolator(case, device, taps, upsamp
 
 @pytest.mark.slow
 def test_the_cases_take_both_ways():
-    """A plane far away is expanded in tiles, everything else goes in groups."""
+    """A distant plane is divided into tiles, all other grids into groups."""
     assert isinstance(prepare(*made(thesis)).layout, Tiles)
     assert isinstance(prepare(*made(moving)).layout, Tiles)
     assert isinstance(prepare(*made(height_map)).layout, Groups)
     assert isinstance(prepare(*made(points)).layout, Groups)
 
 
-# How far a mean over a few hundred pixels strays from what is expected, dB.
+# Scatter of a mean over a few hundred pixels around its expected value, dB.
 SCATTER_DB = 0.6
 
 
@@ -102,7 +102,7 @@ def test_the_predicted_error_is_the_measured_one(taps, upsampling):
 @pytest.mark.parametrize(("vectors", "parts"), [(1, STACK), (2, 1), (2, 2), (2, STACK)])
 @pytest.mark.parametrize("taps", [2, 4, 6, 8])
 def test_samples_are_looked_up_wherever_pixels_lie(device, taps, vectors, parts, mirrored):
-    """The furthest pixel of a part of a work-item lies in range, just within a window."""
+    """The farthest pixel of a part of a work-item lies just within a window."""
     track = APERTURE[len(APERTURE) // 2 :][:16]
     upsampling, nowhere = 8.0, patch(1.3, 41)
     some = prepare(
@@ -192,7 +192,7 @@ def test_a_point_keeps_its_amplitude_and_phase(platform, amplitude):
 
 
 def test_a_gaussian_pulse_gives_the_closed_form(platform):
-    """Lines p(r) exp(-2jk rho) with a pulse known everywhere need no reference code."""
+    """For lines p(r) exp(-2jk rho) with a Gaussian p the image is known in closed form."""
     track, target = along_x(40, 0.02), np.array([[0.1, 8.0, -1.0]])
     grid = patch(0.08, 7.95, 21, 17, z=-1.0)
     rho = np.linalg.norm(target - track, axis=1)
@@ -222,7 +222,7 @@ def test_a_point_beyond_a_line_gets_exactly_nothing(device):
 
 
 def test_far_parts_of_a_grid_get_exactly_nothing(device):
-    """Points from 1 m to 1000 km, of which one line sees 40 to 43 m."""
+    """Points lie from 1 m to 1000 km, and the line extends from 40 m to 43 m."""
     rng = np.random.default_rng(4)
     away = np.concatenate([10 ** rng.uniform(0, 6, 500), rng.uniform(40.5, 42.5, 50)])
     way = rng.normal(size=(550, 3))
@@ -257,7 +257,7 @@ def test_a_receiver_that_stands_still_may_be_called_moving(case, platform):
 
 
 def similar_lines(grid):
-    """Lines of one power spectrum, so that any part of them gets the same interpolator."""
+    """Return lines with one power spectrum, so that all parts get the same interpolator."""
     lines = lines_over(grid, APERTURE, carrier_hz=CARRIER, step_m=STEP)
     turn = np.exp(2j * np.pi * np.random.default_rng(5).random((640, 1)))
     return dataclasses.replace(lines, samples=lines.samples[:1] * turn)
@@ -266,7 +266,7 @@ def similar_lines(grid):
 @pytest.mark.parametrize("case", ["plane", "heights"])
 @pytest.mark.parametrize(("first", "most_db"), [(70, -120), (7, -105)])
 def test_parts_add_up_to_the_whole(platform, case, first, most_db):
-    """Few channels may be computed in smaller tiles, which round otherwise."""
+    """Images of few channels may have smaller tiles, which are rounded differently."""
     grid = patch(1.3, 42)
     if case == "heights":
         grid = grid.with_height(np.full(grid.shape, 0.25))
@@ -335,7 +335,7 @@ def test_the_warning_points_at_the_caller(good):
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", [(1, 1), (4, 4)])
 def test_a_small_grid_just_short_of_a_line_warns_too(platform, shape):
-    """What a tile holds beyond the grid's own pixels does not count."""
+    """Padding pixels of a tile beyond the grid do not count as reached."""
     grid = Grid.oriented([0, 42, 0], [0, 0.01, 0], [0.01, 0, 0], shape)
     lines = RangeLines(noise(1, 500), 42.08, STEP, [0, 0, 0], [0, 0, 0], CARRIER, 1500.0)
     with pytest.warns(ClsasWarning, match="no pixel"):

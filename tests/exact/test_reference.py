@@ -1,4 +1,4 @@
-"""The references themselves, against closed forms that need none of the library's code."""
+"""The references against closed forms that use none of the library's code."""
 
 from functools import partial
 
@@ -70,7 +70,7 @@ def test_a_fine_interpolator_is_the_closed_form(centres):
 
 
 def test_linear_interpolation_by_hand():
-    """Without upsampling, between two samples of a line, each weighs by its distance."""
+    """Without upsampling, a value between two samples is weighted by their distances."""
     samples = np.zeros((1, 31), complex)
     samples[0, 15:17] = 1, 3j
     lines = RangeLines(samples, 10.0, 0.25, [0, 0, 0], [0, 0, 0], 0.0, 1500.0)

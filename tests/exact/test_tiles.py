@@ -67,7 +67,7 @@ def test_tiles_shrink_towards_the_antennas():
 
 
 def test_tiles_shrink_where_a_beam_amplifies_errors_of_weights():
-    """As in a normalised image next to the edge of what is seen."""
+    """This happens in normalised images, next to the edge of the visible area."""
     grid, beam = patch(0, 4, pitch=2e-2), BeamWindow(18, "hamming")
     found = [
         laid_out(grid, 20.0, 8, error=allowed(-31), beam=beam, fullness=fullness)
@@ -211,7 +211,7 @@ def test_no_pixel_is_further_than_allowed_from_where_its_samples_are_looked_up(w
 @pytest.mark.parametrize("width", [8, 16])
 @pytest.mark.parametrize("seed", range(4))
 def test_ranges_change_within_a_block_by_no_more_than_allowed(width, seed):
-    """Bounds of directions let blocks be larger where no antenna lies along their diagonal."""
+    """Bounds on directions allow larger blocks if no antenna lies along their diagonal."""
     rng = np.random.default_rng(seed)
     turn = Rotation.random(random_state=seed).as_matrix()
     grid = Grid.oriented([0, 40, 0], 0.01 * turn[0], 0.02 * turn[1], (128, 64))
@@ -234,7 +234,7 @@ def test_ranges_change_within_a_block_by_no_more_than_allowed(width, seed):
 @pytest.mark.parametrize("squint", [0.0, 25.0])
 @pytest.mark.parametrize("heading", [0.0, 20.0, 90.0])
 def test_ranges_change_within_a_block_by_no_more_than_allowed_in_a_beam(heading, squint):
-    """Ways that the beam covers are bounded by it, wherever the antennas of a turning track are."""
+    """The beam bounds lines of sight, wherever the antennas of a turning track are."""
     rng = np.random.default_rng(3)
     grid = Grid.plane((0, 1.27, 128), (40, 40.63, 64))
     bare, (rows, columns) = Tiles(grid, 64, 8), BLOCKS[8]
@@ -242,7 +242,7 @@ def test_ranges_change_within_a_block_by_no_more_than_allowed_in_a_beam(heading,
     angle = np.deg2rad(heading + np.linspace(-10, 10, 7))
     along = np.stack([np.cos(angle), np.sin(angle), np.zeros(7)], axis=1)
     tiles = dataclasses.replace(bare, cosines=bare.cosines_in_beam(beam, along))
-    # Directions of the track between the given ones, and ways at all angles within the beam.
+    # Directions of the track between the given ones, and all lines of sight in the beam.
     between = np.deg2rad(heading + rng.uniform(-10, 10, 4000))
     forward = np.stack([np.cos(between), np.sin(between), np.zeros(4000)], axis=1)
     sine = rng.uniform(*beam.limits, 4000)[:, None]

@@ -1,4 +1,4 @@
-"""The wavenumber image against the exact one: 125 kHz, 15 kHz, 60 m away, unless told otherwise."""
+"""Wavenumber images against exact ones, usually at 125 kHz, with 15 kHz, at 60 m."""
 
 import dataclasses
 from functools import cache, partial
@@ -104,7 +104,7 @@ def test_inverse_beams():
 
 @pytest.mark.slow
 def test_the_error_falls_with_range_and_beamwidth_as_a_hann_windows_edges():
-    """As (K R width^2)^(-5/4): 7.5 dB per doubling."""
+    """It falls as (K R width^2)^(-5/4), which is 7.5 dB per doubling."""
     errors = []
     for scale, width in ((1, 8), (2, 8), (1, 11.3)):
         grid = Grid.plane((-1, 1, 51), (scale * 40, scale * 40 + 2, 51))
@@ -116,7 +116,7 @@ def test_the_error_falls_with_range_and_beamwidth_as_a_hann_windows_edges():
 
 @pytest.mark.slow
 def test_grating_lobes_are_those_of_the_exact_image():
-    """Phase centres far apart: the spectrum repeats within the beam."""
+    """Phase centres are so far apart that the spectrum repeats within the beam."""
     assert error_db(echoes(along_x(60, 0.4)), beam=BeamWindow(16, "hann")) <= -60
 
 
@@ -226,7 +226,7 @@ def test_motion_compensation_fails_for_wide_beams_and_wide_swaths():
 
 @pytest.mark.slow
 def test_it_warns_of_the_errors_that_remain():
-    """Seen from 30 m and aimed at 60 m, a sway of 0.2 m at 15 m of altitude."""
+    """The track sways by 0.2 m at 15 m altitude; it is corrected for 60 m, not for 30 m."""
     swath = Grid.plane((-2, 2, 3), (20, 100, 3))
     with pytest.warns(ClsasWarning) as caught:
         wavenumber(swaying(0.2, swath, 15.0), swath, beam=HANN)

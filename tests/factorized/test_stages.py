@@ -746,7 +746,9 @@ def test_a_plan_for_something_else_is_refused(what):
         lines = dataclasses.replace(lines, tx_m=beside(lines.tx_m, 1e-6, 0, 0))
     else:
         grid = around(0, 40 + 1e-6)
-    with pytest.raises(ValueError, match=f"plan was made for another {what} geometry"):
+    with pytest.raises(
+        ValueError, match=f"{what}s? must have the geometry for which the plan was made"
+    ):
         factorize(lines, grid, planned(straight, -50))
 
 

@@ -1,4 +1,4 @@
-"""AirSAS scenes: synthetic files of the public schema."""
+"""AirSAS scenes, from synthetic files with the schema of the public data set."""
 
 import shutil
 
@@ -27,7 +27,7 @@ PARAMETERS = [
 
 
 def samples_of(microphone_m, speed_m_s, length=1900):
-    """Real echoes of the points, with the recorder's delay, a constant and the transmission."""
+    """Return real-valued echoes with the recorder's delay, an offset and the transmission."""
     pulse = clsas.Pulse(
         (START_HZ + STOP_HZ) / 2, abs(STOP_HZ - START_HZ), DURATION_S, "down", TAPER
     )
@@ -50,7 +50,7 @@ def samples_of(microphone_m, speed_m_s, length=1900):
 
 
 def scene(folder, drift_c=0.0, header=True):
-    """A scene whose temperature drifts while the array moves along the rail."""
+    """Write a scene whose temperature drifts while the array moves along the rail."""
     shared = folder / "characterization data"
     shared.mkdir()
     (folder / "scenes").mkdir()
@@ -93,7 +93,7 @@ def test_points_focus_where_they_are(still, point_m):
     image = image_of(lines, point_m)
     row, column = np.unravel_index(np.abs(image.pixels).argmax(), image.grid.shape)
     assert (row, column) == (20, 20)
-    # All echoes of amplitude 1 add up in phase.
+    # Echoes of amplitude 1 from all channels add up in phase.
     peak = image.pixels[20, 20] / lines.channels
     assert peak == pytest.approx(1.0, abs=0.06)
 
@@ -127,10 +127,10 @@ def test_the_folder_of_what_scenes_share_can_be_given(still, tmp_path):
     ("name", "value", "said"),
     [
         ("na/position", np.zeros((1, 7)), "/ch1/ts of shape .pings, time., 7 by 1900"),
-        ("na/position", np.full((1, 201), np.nan), "finite numbers as /na/position"),
-        ("na/temperature", np.zeros((2, 7)), "/na/temperature of 201 pings"),
+        ("na/position", np.full((1, 201), np.nan), "finite numbers in /na/position"),
+        ("na/temperature", np.zeros((2, 7)), "/na/temperature for 201 pings"),
         ("na/temperature", np.full((2, 201), 900.0), "degrees Celsius, got 900 to 900"),
-        ("na/temperature", None, "numbers as /na/temperature"),
+        ("na/temperature", None, "numbers in /na/temperature"),
         ("ch2/ts", np.zeros((201, 5)), "/ch2/ts of shape"),
         ("ch2/ts", b"text", "ts as numbers"),
         ("ch2/ts", h5py.ExternalLink("/etc/hostname", "/x"), "got a link to another place"),
@@ -155,7 +155,7 @@ def swapped(rail):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (np.zeros_like, "all 201 pings have one position"),
+        (np.zeros_like, "all 201 pings have the same position"),
         (swapped, r"turns back \d times \(first after ping 9\d\)"),
     ],
 )
@@ -177,7 +177,7 @@ def test_other_hdf5_files_are_refused_by_name(tmp_path):
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["na/position"] = [1.0]
     for name, got in (("lines.h5", "first_range_m"), ("other.h5", "na")):
-        said = rf"{name} is an HDF5 file, but no scene of AirSAS: .* got \['{got}'"
+        said = rf"{name} is an HDF5 file, but not an AirSAS scene: .* got \['{got}'"
         with pytest.raises(FileFormatError, match=said):
             read_airsas(tmp_path / name)
 
@@ -207,7 +207,7 @@ def test_tables_that_disagree_are_refused(still, tmp_path, file, old, new, said)
 
 
 def test_microphones_must_fit_into_memory_together_before_any_is_read(still, tmp_path, monkeypatch):
-    """A byte of a file takes 4 in memory, and 3.2 more as lines."""
+    """Every byte of the file takes 4 bytes in memory, and 3.2 more as lines."""
     shutil.copytree(still.parent.parent, tmp_path / "copy")
     path = tmp_path / "copy" / "scenes" / still.name
     with h5py.File(path, "r+") as file:
@@ -217,7 +217,7 @@ def test_microphones_must_fit_into_memory_together_before_any_is_read(still, tmp
             file.create_dataset(name, data=silent, compression="gzip")
 
     def compressed(*_, **__):
-        raise ValueError("as far as this")  # compression has a budget of its own
+        raise ValueError("as far as this")  # stop before compression, which has another budget
 
     monkeypatch.setattr(airsas, "compress", compressed)
     monkeypatch.setattr(validate, "_memory_bytes", lambda: 16 << 20)

@@ -1,4 +1,4 @@
-"""CPHD files, written and read, of both domains, monostatic and bistatic."""
+"""CPHD files in both domains, monostatic and bistatic, written and read."""
 
 import subprocess
 import sys
@@ -42,7 +42,7 @@ def at(lines, origin_m):
 
 
 def on_carrier(lines):
-    """The same lines with their carrier, sampled densely enough to hold it."""
+    """Return the lines with their carrier, sampled densely enough for it."""
     dense = clsas.simulate_lines(
         lines.tx_m, lines.rx_m, clsas.PointTargets(POINTS_M), carrier_hz=20e3,
         bandwidth_hz=15e3, oversampling=4.0,
@@ -65,7 +65,7 @@ CASES = {
 
 
 def findings(path):
-    """What the consistency checker of the standard finds in a file."""
+    """Return what the consistency checker for the standard finds in a file."""
     with path.open("rb") as file:
         checker = sarkit.verification.CphdConsistency.from_file(file, thorough=True)
         checker.check()
@@ -89,7 +89,7 @@ def test_what_was_written_passes_the_checker_and_gives_the_same_image(name, tmp_
 
 
 def test_a_radar_sees_the_wavelengths_of_the_sonar(tmp_path):
-    """Another processor takes the waves for light: the file must focus without our parameter."""
+    """Another processor assumes the speed of light: the file must focus without our parameter."""
     lines = sonar_lines()
     write_cphd(tmp_path / "lines.cphd", lines)
     content = (tmp_path / "lines.cphd").read_bytes()
@@ -104,7 +104,7 @@ def test_a_radar_sees_the_wavelengths_of_the_sonar(tmp_path):
 
 
 def foreign(path, *, sign=-1, bistatic=True, kind="CF8", domain="FX", hae=False, pulses=48):
-    """A file of the FX or TOA domain that did not come from range lines: a point in closed form.
+    """Write a file in the FX or TOA domain with the analytic signal of a point.
 
     Bands, frequency steps and scale factors differ from vector to vector; one vector is not normal.
     """
@@ -181,7 +181,7 @@ def test_a_point_of_a_foreign_file_focuses_in_phase(name, tmp_path):
     x, y, z = foreign(path, **FOREIGN[name])
     assert findings(path) == {} or name == "FX over the ellipsoid"
     lines = read_cphd(path)
-    assert lines.channels == 47  # one vector is not normal
+    assert lines.channels == 47  # one vector is not flagged as normal
     grid = clsas.Grid.plane((x - 2, x + 2, 81), (y - 2, y + 2, 81), z)
     image = clsas.backproject(lines, grid, accuracy_db=-60)
     row, column = np.unravel_index(np.abs(image.pixels).argmax(), grid.shape)
@@ -211,7 +211,7 @@ def test_lines_that_cphd_cannot_hold_are_refused(tmp_path):
 
 
 def run(*args):
-    """Run a command of clsas; return its exit code."""
+    """Return the exit code of a clsas command."""
     with pytest.raises(SystemExit) as end:
         cli.main([str(arg) for arg in args], prog_name="clsas")
     return end.value.code
@@ -240,7 +240,8 @@ import clsas
 clsas.load({str(tmp_path / "pass.cphd")!r})
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert "CPHD files need sarkit: pip install 'sarkit>=" in done.stderr
+    assert "sarkit is not installed, and is needed for CPHD files: pip install " in done.stderr
+    assert "'sarkit>=" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -248,14 +249,14 @@ clsas.load({str(tmp_path / "pass.cphd")!r})
     [
         (b"<NumSamples>200<", b"<NumSamples>201<", "exceed its SIGNAL block"),
         (b"<NumVectors>48<", b"<NumVectors>49<", "exceed its"),
-        (b"<NumVectors>48<", b"<NumVectors>-8<", "must hold lines|is damaged"),
+        (b"<NumVectors>48<", b"<NumVectors>-8<", "must contain vectors|is damaged"),
         (b"<SignalArrayFormat>CF8<", b"<SignalArrayFormat>CF4<", "unknown format 'CF4'"),
         (b"<DomainType>FX<", b"<DomainType>XX<", "its domain must be one of"),
         (b"<SGN>-1<", b"<SGN>-7<", "sign"),
         (b"PVP_BLOCK_SIZE := ", b"PVP_BLOCK_SIZE := 99999", "is damaged: its PVP block ends"),
         (b"XML_BLOCK_BYTE_OFFSET", b"XML_BLOCK_BYTE_OFFSER", "lacks XML_BLOCK_BYTE_OFFSET"),
         (b"<uIAX>", b"<uIAQ>", "is damaged"),
-        (b"<X>0.0</X>", b"<X>2.0</X>", "orthogonal axes|is damaged"),
+        (b"<X>0.0</X>", b"<X>2.0</X>", "orthogonal image area axes|is damaged"),
     ],
 )
 def test_files_that_claim_something_else_are_refused(tmp_path, old, new, said):
@@ -287,10 +288,10 @@ def at_one_place(vectors):
 @pytest.mark.parametrize(
     ("change", "said", "channels"),
     [
-        (lost, r"3 of 48 vectors lack finite positions .* vector 20\): they are left out", 44),
+        (lost, r"3 of 48 vectors lack finite positions .* vector 20\) and are left out", 44),
         (repeated, r"TxTime does not ascend after 1 of 47 vectors \(first after vector 29\)", 47),
-        (at_one_place, "all 47 pings have one position", 47),
-        (everywhere, "must hold vectors with a signal and complete positions, got none", None),
+        (at_one_place, "all 47 pings have the same position", 47),
+        (everywhere, "must contain vectors with a signal and complete positions, got none", None),
     ],
 )
 @pytest.mark.parametrize("domain", ["FX", "TOA"])
@@ -309,7 +310,7 @@ def test_navigation_that_is_missing_or_repeated_is_reported(
 
 
 def change_vectors(path, change):
-    """Change the parameters of a file's vectors."""
+    """Change parameters of the vectors in a file."""
     with path.open("rb") as file:
         reader = sarkit.cphd.Reader(file)
         tree = reader.metadata.xmltree

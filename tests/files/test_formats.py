@@ -1,4 +1,4 @@
-"""Files of every kind, told apart by their contents."""
+"""Files of all kinds, which are recognised by their contents."""
 
 import os
 
@@ -35,20 +35,20 @@ def write_hdf5(*names):
 
 UNKNOWN = {
     "empty": (write_bytes(b""), "is empty"),
-    "text": (write_bytes(b"hello\n" * 100), "is not an HDF5 file, nor one of CPHD or of MATLAB"),
+    "text": (write_bytes(b"hello\n" * 100), "is neither an HDF5 file, nor CPHD, nor a MATLAB file"),
     "noise": (
         write_bytes(np.random.default_rng(0).bytes(4096)),
-        "is not an HDF5 file, nor one of CPHD or of MATLAB",
+        "is neither an HDF5 file, nor CPHD, nor a MATLAB file",
     ),
-    "foreign HDF5": (write_hdf5("a/b"), "is an HDF5 file, but not one of clsas"),
+    "foreign HDF5": (write_hdf5("a/b"), "is an HDF5 file, but was not written by clsas"),
     "MATLAB without a recording": (
         lambda path: savemat(path.open("wb"), {"a": 1}),
-        "must hold one structure with the fields fp, freq, x, y, z, r0 or time_data",
+        "must contain one structure with the fields fp, freq, x, y, z, r0 or time_data",
     ),
-    "a start of MATLAB's": (write_bytes(b"MATLAB 5.0"), "is not an HDF5 file, nor"),
+    "a start of MATLAB's": (write_bytes(b"MATLAB 5.0"), "is neither an HDF5 file"),
     "a header of MATLAB's": (
         write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM"),
-        "must hold one structure",
+        "must contain one structure",
     ),
     "a pipe": (os.mkfifo, "must be an ordinary file, got a pipe"),
     "a device": (lambda path: path.symlink_to("/dev/zero"), "an ordinary file, got a device"),

@@ -32,7 +32,7 @@ def objects():
         return random.normal(size=shape)
 
     tx_m, rx_m = 1e7 + noise(4, 3), 1e7 + noise(4, 3)
-    # -0, the smallest and the largest number are among the bits to be kept.
+    # -0, the smallest and the largest number must be kept bit for bit.
     samples = complex_noise(random, 4, 6)
     samples[0, :3] = [complex(-0.0, 0.0), np.finfo(np.float32).smallest_subnormal, 3.4e38]
     return {
@@ -61,7 +61,7 @@ EVERY_OBJECT = pytest.mark.parametrize("obj", OBJECTS.values(), ids=OBJECTS.keys
 
 
 def digest(obj):
-    """One number for every bit, type and name in an object."""
+    """Return a digest of every bit, type and name in an object."""
     if dataclasses.is_dataclass(obj):
         text = repr([(f.name, digest(getattr(obj, f.name))) for f in dataclasses.fields(obj)])
         text = type(obj).__name__ + text
@@ -73,7 +73,7 @@ def digest(obj):
 
 
 def run_beside(code, *arguments):
-    """What Python code that may import this module prints in another process."""
+    """Return what Python code that may import this module prints in another process."""
     folders = [os.path.dirname(__file__), *sys.path]
     return subprocess.run(
         [sys.executable, "-c", code, *arguments],
@@ -139,7 +139,9 @@ def test_an_interrupted_save_leaves_nothing(error, exists, tmp_path, monkeypatch
     monkeypatch.setattr(io.os, "fsync", interrupted)
     with pytest.raises(error):
         save(path, OBJECTS["lines"])
-    assert len(set(begun) - {"file.h5"}) == 1  # it was being written, under another name
+    assert (
+        len(set(begun) - {"file.h5"}) == 1
+    )  # the file that was being written under a temporary name
     assert os.listdir(tmp_path) == (["file.h5"] if exists else [])
     assert not exists or path.read_bytes() == b"what was there"
 
@@ -159,7 +161,7 @@ for path in sys.argv[1:]:
 def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path):
     (tmp_path / "old.h5").write_bytes(b"what was there")
     done = run_beside(FULL_DISK, str(tmp_path / "new.h5"), str(tmp_path / "old.h5"))
-    assert done.split() == ["EFBIG", "EFBIG"]  # and the interpreter ended well
+    assert done.split() == ["EFBIG", "EFBIG"]  # and the interpreter exited normally
     assert os.listdir(tmp_path) == ["old.h5"]
     assert (tmp_path / "old.h5").read_bytes() == b"what was there"
 
@@ -200,7 +202,7 @@ def test_load_refuses_what_is_not_hdf5(content, tmp_path):
 
 
 def change(file, name):
-    """Damage an open file of range lines in a way."""
+    """Damage an open file of range lines in one of several ways."""
     match name:
         case "foreign":
             del file.attrs["format"]
@@ -234,14 +236,14 @@ def change(file, name):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("foreign", "is an HDF5 file, but not one of clsas"),
-        ("of another format", "is an HDF5 file, but not one of clsas"),
-        ("newer", "is of format version 2, newer than this clsas, which reads up to 1"),
+        ("foreign", "is an HDF5 file, but was not written by clsas"),
+        ("of another format", "is an HDF5 file, but was not written by clsas"),
+        ("newer", "is of format version 2, but this clsas reads versions up to 1"),
         ("of version 0", "is of format version 0, but the first one is 1"),
-        ("of a version in words", "is damaged: attribute version is 'zzz', not a number"),
+        ("of a version in words", "is damaged: its attribute version must be a number, got 'zzz'"),
         ("without version", "is damaged: .*version"),
-        ("of unknown kind", "holds an object of unknown kind 'hologram'"),
-        ("without kind", "holds an object of unknown kind None"),
+        ("of unknown kind", "contains an object of unknown kind 'hologram'"),
+        ("without kind", "contains an object of unknown kind None"),
         ("without samples", "lacks samples of the range_lines"),
         ("without step", "lacks range_step_m of the range_lines"),
         ("of one channel too many", r"is damaged: tx_m must have shape \(4, 3\)"),
@@ -273,7 +275,7 @@ def test_samples_never_written_are_refused(shape, chunks, tmp_path):
 
 
 def elsewhere(file, name, folder):
-    """Put something in the place of a dataset whose values lie in another file or place."""
+    """Replace a dataset by one whose values are in another file or place."""
     del file[name]
     match folder.name:
         case "external link":
@@ -300,12 +302,12 @@ def test_only_the_file_itself_is_read(way, name, tmp_path):
         save(each, OBJECTS["lines"])
     with h5py.File(path, "r+") as file:
         elsewhere(file, name, folder)
-    with pytest.raises(FileFormatError, match=rf"file\.h5 must hold {name} itself, got a "):
+    with pytest.raises(FileFormatError, match=rf"file\.h5 must contain {name} itself, got a "):
         load(path)
-    with pytest.raises(FileFormatError, match=rf"file\.h5 must hold {name} itself, got a "):
+    with pytest.raises(FileFormatError, match=rf"file\.h5 must contain {name} itself, got a "):
         read_geometry(path)
     if name == "samples":
-        with pytest.raises(FileFormatError, match=r"file\.h5 must hold samples itself"):
+        with pytest.raises(FileFormatError, match=r"file\.h5 must contain samples itself"):
             read_samples(path, slice(1), slice(1))
 
 
@@ -315,7 +317,7 @@ def test_an_object_is_no_part_of_itself(tmp_path):
     with h5py.File(path, "r+") as file:
         del file["pulse"]
         file["pulse"] = file["/"]
-    with pytest.raises(FileFormatError, match="holds another object as pulse of the echoes"):
+    with pytest.raises(FileFormatError, match="contains another object as pulse of the echoes"):
         load(path)
 
 
@@ -356,7 +358,7 @@ def test_other_than_numbers_are_refused(values, tmp_path):
     with h5py.File(path, "r+") as file:
         del file["first_range_m"]
         file["first_range_m"] = values
-    with pytest.raises(FileFormatError, match="must hold first_range_m as numbers, got"):
+    with pytest.raises(FileFormatError, match="must contain first_range_m as numbers, got"):
         load(path)
 
 
@@ -373,7 +375,7 @@ def test_a_pulse_alone_is_no_file(tmp_path):
     with h5py.File(path, "r+") as file:
         for name, value in file["pulse"].attrs.items():
             file.attrs[name] = value
-    with pytest.raises(FileFormatError, match="holds only a Pulse"):
+    with pytest.raises(FileFormatError, match="contains only a Pulse"):
         load(path)
 
 
@@ -399,7 +401,7 @@ def test_damaged_bytes_never_become_data(tmp_path):
         damaged[position] ^= 1 << random.integers(8)
         path.write_bytes(damaged)
         try:
-            assert digest(load(path)) == digest(OBJECTS["lines"])  # bytes that nothing uses
+            assert digest(load(path)) == digest(OBJECTS["lines"])  # the changed bytes are unused
         except FileFormatError:
             found += 1
     assert found > 200

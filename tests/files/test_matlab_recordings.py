@@ -20,7 +20,7 @@ POINT_M = np.array([3.0, -4.0, 0.0])
 
 
 def phase_history(pulses=90, count=128, kind=np.float32, offset_m=0.0):
-    """A radar's pass over one point, as the public radar files have it: in single precision."""
+    """Write a radar pass over one point in single precision, as the public radar files do."""
     angle = np.linspace(-0.03, 0.03, pulses)
     antenna_m = 7000 * np.stack([np.cos(angle), np.sin(angle), 1 + 0 * angle], axis=1)
     antenna_m = antenna_m.astype(kind).astype(float)
@@ -73,7 +73,7 @@ NOTCH_M = np.array([2e-3, 15e-3, 0.0])
 
 
 def capture(every=False):
-    """A full matrix capture of one point; without `every`, of the pairs tx <= rx."""
+    """Write a full matrix capture of one point; without `every`, only pairs with tx <= rx."""
     tx, rx = np.indices((32, 32)).reshape(2, -1)
     if not every:
         tx, rx = tx[tx <= rx], rx[tx <= rx]
@@ -129,7 +129,9 @@ def test_the_sound_speed_may_be_given_and_must_be_known(tmp_path):
     assert read_full_matrix(path, sound_speed_m_s=6320).sound_speed_m_s == 6320
     del given["ph_velocity"]
     path = save(path, given)
-    with pytest.raises(ValueError, match=r"sound_speed_m_s must be given: .* has no ph_velocity"):
+    with pytest.raises(
+        ValueError, match=r"sound_speed_m_s must be given, since .* has no ph_velocity"
+    ):
         read_full_matrix(path)
 
 
@@ -156,7 +158,7 @@ def test_captures_that_disagree_are_refused(tmp_path, change, said):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"x": np.ones((1, 3))}, "x, y, z and r0 of every pulse"),
+        ({"x": np.ones((1, 3))}, "x, y, z and r0 for every pulse"),
         ({"freq": np.ones((128, 1))}, "freq in equal, ascending steps"),
         ({"freq": np.sqrt(np.arange(128.0))[:, None]}, "freq in equal, ascending steps"),
         ({"fp": np.ones((128, 90))}, "fp as complex numbers"),
@@ -184,9 +186,9 @@ def swapped(values):
     [
         (
             lambda values: values | {axis: np.full((1, 90), 50.0) for axis in "xyz"},
-            "all 90 pings have one position, so that the navigation seems to be missing",
+            "all 90 pings have the same position. The navigation seems to be missing",
         ),
-        (swapped, r"the track turns back \d times \(first after ping 4\d\): .* order of the file"),
+        (swapped, r"the track turns back \d times \(first after ping 4\d\), .* order of the file"),
     ],
 )
 def test_navigation_that_is_missing_or_out_of_order_is_reported(tmp_path, change, said):
@@ -204,7 +206,7 @@ def test_one_ping_is_read(tmp_path):
 def test_files_without_a_recording_and_with_several_are_refused(tmp_path):
     path = save(tmp_path / "other.mat", {"a": np.ones(3)})
     with pytest.raises(
-        FileFormatError, match=r"other\.mat must hold one structure with the fields"
+        FileFormatError, match=r"other\.mat must contain one structure with the fields"
     ):
         clsas.load(path)
     path = save(tmp_path / "two.mat", {"a": phase_history(), "b": phase_history()})
@@ -213,7 +215,7 @@ def test_files_without_a_recording_and_with_several_are_refused(tmp_path):
 
 
 def variable(kind, shape, parts=b""):
-    """A matrix of some kind in MATLAB's format 5."""
+    """Return a matrix of a given kind in MATLAB's format 5."""
     body = struct.pack("<IIII", 6, 8, kind, 0)
     body += struct.pack("<II", 5, 4 * len(shape)) + struct.pack(f"<{len(shape)}i", *shape)
     body += b"\0" * (-4 * len(shape) % 8) + struct.pack("<HHI", 1, 1, ord("a")) + parts
@@ -256,7 +258,7 @@ def test_a_variable_that_unpacks_beyond_memory_is_refused_unread(tmp_path, monke
 
 
 def test_variables_must_fit_into_memory_together(tmp_path, monkeypatch):
-    """Every one of them does: 5 MB as stored and 8 times as much as the doubles that they are."""
+    """Each array alone would fit: 5 MB in the file, and 8 times as much as doubles."""
     one = packed(variable(6, (5000, 1000), struct.pack("<II", 1, 5_000_000) + bytes(5_000_000)))
     path = file_of(tmp_path / "sum.mat", one + one + one)
     assert path.stat().st_size < 20_000
@@ -264,7 +266,7 @@ def test_variables_must_fit_into_memory_together(tmp_path, monkeypatch):
     words = r"sum\.mat is too large: reading numbers must ask for at most .* got 0\.0373 GiB"
     with pytest.raises(FileFormatError, match=words):
         clsas.load(path)
-    with pytest.raises(FileFormatError, match="must hold one structure"):
+    with pytest.raises(FileFormatError, match="must contain one structure"):
         clsas.load(file_of(tmp_path / "one.mat", one))
 
 
@@ -281,7 +283,7 @@ def test_nesting_without_end_is_refused(tmp_path):
     names = struct.pack("<HHIII", 5, 4, 8, 1, 8) + b"deeper".ljust(8, b"\0")
     for _ in range(100):
         inner = variable(2, (1, 1), names + inner)
-    with pytest.raises(FileFormatError, match="at most 32 structures within each other"):
+    with pytest.raises(FileFormatError, match="at most 32 levels of nested structures"):
         clsas.load(file_of(tmp_path / "deep.mat", inner))
 
 

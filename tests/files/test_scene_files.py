@@ -99,7 +99,7 @@ def test_dial_and_beam():
 
 
 def documented_keys():
-    """Key and default of every row of every table of docs/scene-files.md, by TOML table."""
+    """Return key and default of every row of every table in docs/scene-files.md, by TOML table."""
     tables = {}
     for section in DOCS.read_text().split("\n## ")[2:]:
         heading, _, body = section.partition("\n")
@@ -147,7 +147,7 @@ def test_presets_and_built_in_scenes():
     np.testing.assert_allclose(np.diff(centres), 5.28 / 640)
     assert grid.shape == (1024, 1024)
     assert grid.axes_m[1][[0, -1]] == pytest.approx([40, 45])
-    # Its phase centres are too far apart for its elements, and nothing else is amiss.
+    # Its phase centres are too far apart for its elements; nothing else is wrong.
     assert [finding.name for finding in check_sampling(sonar, track, grid)] == [
         "along_track_spacing"
     ]
@@ -162,7 +162,7 @@ def test_the_wreck_comes_with_clsas():
     assert (sonar.receivers, track.pings) == (6, 200)
     assert 200 * np.diff(track.positions_m[:, 0]) == pytest.approx(80)
     assert np.ptp(track.positions_m[:, 1]) == pytest.approx(0.4, abs=0.01)
-    # It heads where it goes: the beams look square to the course made good, as windows assume.
+    # The heading follows the course, so that beams are broadside to it, as windows assume.
     course = np.gradient(track.positions_m[:, 1], track.positions_m[:, 0])
     np.testing.assert_allclose(track.yaw_rad[1:-1], course[1:-1], atol=1e-4)
     assert isinstance(seabed, Seabed)
@@ -171,7 +171,7 @@ def test_the_wreck_comes_with_clsas():
     assert grid.axes_m[0][[0, -1]] == pytest.approx(seabed.x_m)
     assert grid.axes_m[1][[0, -1]] == pytest.approx(seabed.y_m)
     assert scene.image["tolerance_db"] == -40
-    # The window is wider than where the two-way pattern is at -6 dB, and within its main lobe.
+    # The window is wider than the two-way pattern at -6 dB, and narrower than its main lobe.
     window = BeamWindow.of_element(sonar.rx_length_m, sonar.wavelength_m)
     nulls_deg = 2 * np.degrees(np.arcsin(sonar.wavelength_m / sonar.rx_length_m))
     assert window.width_deg < scene.image["beam"].width_deg < nulls_deg
@@ -259,12 +259,12 @@ def test_track_file(tmp_path):
     ("text", "message"),
     [
         ("time_s,x_m,y_m,z\n", "unknown column 'z': did you mean 'z_m'"),
-        ("time_s,x_m,y_m\n", "column 'z_m' must be there once"),
-        ("time_s,x_m,y_m,z_m,z_m\n", "column 'z_m' must be there once"),
-        ("time_s,x_m,y_m,z_m,yaw_deg,yaw_deg\n", "column 'yaw_deg' must be there once"),
-        ("time_s,x_m,y_m,z_m,vx_m_s\n", "column 'vy_m_s' must be there once"),
-        ("", "column 'time_s' must be there once"),
-        ("time_s,x_m,y_m,z_m\n", "must hold at least one ping under the names of columns"),
+        ("time_s,x_m,y_m\n", "column 'z_m' must be present once"),
+        ("time_s,x_m,y_m,z_m,z_m\n", "column 'z_m' must be present once"),
+        ("time_s,x_m,y_m,z_m,yaw_deg,yaw_deg\n", "column 'yaw_deg' must be present once"),
+        ("time_s,x_m,y_m,z_m,vx_m_s\n", "column 'vy_m_s' must be present once"),
+        ("", "column 'time_s' must be present once"),
+        ("time_s,x_m,y_m,z_m\n", "must have at least one ping below the names of the columns"),
         ("time_s,x_m,y_m,z_m\n0,0,0,0\n1,2,3\n", "line 3 must be 4 numbers, got '1,2,3'"),
         ("time_s,x_m,y_m,z_m\n0,0,0,zero\n", "line 2 must be 4 numbers, got '0,0,0,zero'"),
         ("time_s,x_m,y_m,z_m\n0,0,0,nan\n", "positions_m must be finite"),
@@ -300,7 +300,7 @@ def test_a_track_file_that_is_no_text(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("sonar = [", "is not TOML: "),
+        ("sonar = [", "not a TOML file: "),
         ("[mosaic]\nstore = ''", "[mosaic] store must be a path, got an empty one"),
         ("[sonr]", "unknown table [sonr]: did you mean 'sonar'?"),
         ("[lake]", "unknown table [lake]; allowed are sonar, track, targets, seabed, grid, "),
@@ -335,18 +335,18 @@ def test_a_track_file_that_is_no_text(tmp_path):
         ("[sonar]\npreset = 'hugin'", "[sonar] preset must be one of 'thesis_wide_beam'"),
         (
             "[sonar]\npreset = 'edgetech'\nspacing_m = 1",
-            "preset must stand alone, got also spacing",
+            "preset must be the only key, got also spacing",
         ),
         ("[sonar]\nreceivers = 3", "missing table [sonar.pulse], or key 'preset'"),
         (
             f"[sonar]\nreceivers = 3\n{SONAR[SONAR.index('[sonar.p') :]}",
-            "by receivers and spacing_m, or rx_m",
+            "by either receivers and spacing_m, or rx_m",
         ),
         (SONAR.replace("[0.1, 0, 0]", "[0.1, 0]"), "[sonar] rx_m[1] must be a list of 3, got"),
         ("[track]\npings = 3", "[track] missing key 'start_m' (or 'file')"),
         (TRACK.replace("400", "2.5"), "[track] pings must be a whole number, got 2.5"),
         (TRACK.replace("400", "0"), "[track] pings must be at least 1, got 0"),
-        (f"{TRACK}file = 'a.csv'", "[track] file must stand alone, got also ping_interval_s"),
+        (f"{TRACK}file = 'a.csv'", "[track] file must be the only key, got also ping_interval_s"),
         (
             f"{TRACK}[track.yaw]\namplitude_m = 1\nperiod_s = 1",
             "unknown key 'amplitude_m' in [track.yaw]: did you mean 'amplitude_deg'?",
@@ -393,7 +393,7 @@ def test_a_track_file_that_is_no_text(tmp_path):
         ("[simulate]\nspreading = 1", "[simulate] spreading must be true or false, got 1"),
         (
             "[simulate.pointing]\nspot_m = [0, 1, 0]\nsquint_deg = 3",
-            "[simulate.pointing] spot_m must stand alone",
+            "[simulate.pointing] spot_m must be the only key",
         ),
         ("[simulate.pointing]\nsquint_deg = nan", "[simulate.pointing] squint_deg must be finite"),
         (
@@ -419,7 +419,7 @@ def test_a_track_file_that_is_no_text(tmp_path):
         ("[image]\nupsampling = nan", "[image] upsampling must be finite and >= 1 and <= 64"),
         (
             "[image]\ntolerance_db = -50\ntaps = 4\nstages = [[2, 2]]",
-            "[image] tolerance_db must stand alone, got also stages, taps",
+            "[image] tolerance_db must be the only request, got also stages, taps",
         ),
         (
             "[image]\ntolerance_db = -90",
@@ -511,7 +511,7 @@ def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(FileNotFoundError):
         config.read_scene(tmp_path / "none.toml")
     (tmp_path / "scene.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(ValueError, match=r"scene\.toml: is not TOML"):
+    with pytest.raises(ValueError, match=r"scene\.toml: not a TOML file"):
         config.read_scene(tmp_path / "scene.toml")
     (tmp_path / "scene.toml").write_text("[track]\nfile = 'none.csv'")
     with pytest.raises(
@@ -569,7 +569,7 @@ def test_a_damaged_track_is_one_short_message(tmp_path):
 
 
 def test_the_recording_to_process_may_be_elsewhere(tmp_path):
-    """Only `clsas process` reads it; every other command takes the rest of the scene."""
+    """Only `clsas process` reads it; other commands use the rest of the scene."""
     path = tmp_path / "scene.toml"
     path.write_text(f'{GRID}\n[process]\nlines = "nowhere.h5"\n')
     scene = config.read_scene(path)

@@ -117,7 +117,7 @@ def test_xarray_names_bad_input(monkeypatch):
     with pytest.raises(TypeError, match="obj must be of type Grid or"):
         to_xarray(np.ones(3))
     monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(ImportError, match="pip install xarray"):
+    with pytest.raises(ImportError, match="is needed for to_xarray: pip install 'xarray>="):
         to_xarray(PLANE)
 
 

@@ -1,4 +1,4 @@
-"""Every imager held to an oracle that shares nothing with them, at the extremes."""
+"""Every imager compared with an independent oracle, at the extremes."""
 
 from functools import cache
 
@@ -21,7 +21,6 @@ from clsas.trials.extremes import (
     closed,
     edge,
     headings,
-    line_in_the_spectrum,
     loud,
     narrow,
     radar,
@@ -31,6 +30,16 @@ from clsas.trials.extremes import (
     uneven,
     widest,
 )
+from clsas.trials.oracle import Band
+
+
+def line_in_the_spectrum(centre, width):
+    """Return a weak flat band and, near its edge, a tone that is 20 dB stronger."""
+    return [
+        Band(centre, 0.9 * width, 0.01 * width, 0.1),
+        Band(centre + 0.42 * width, 0.0, 0.01 * width, 1.0),
+    ]
+
 
 SLOW = Costs(pixel_ns=1e6, point_ns=1e6)  # plans for small images divide them
 FAR = (1e7, -1e7, 1e7)
@@ -38,7 +47,7 @@ HANN = BeamWindow(12, "hann", along=[1, 0, 0])
 
 
 def raw(channels=96, **options):
-    """Lines on their carrier, of a third of the usual echoes: these take most of the time."""
+    """Return lines on their carrier. The echoes take most of the time, so there are only 20."""
     return extremes.raw(channels, targets=20, **options)
 
 

@@ -50,9 +50,9 @@ REFUSED = [
     (("wavenumber",), "grid", GRID.with_height(np.zeros(GRID.shape)), ValueError,
      "a plane .*got heights"),
     (("wavenumber",), "grid", turned([0, 0.1, 0], [0.1, 0.01, 0]), ValueError,
-     "angle of grid's rows to the track must be .*<= 5 degrees, got 5.7"),
+     "angle between the grid's rows and the track must be .*<= 5 degrees, got 5.7"),
     (("wavenumber",), "grid", turned([0.1, 0, 0], [0, 0.1, 0]), ValueError,
-     "angle of grid's rows to the track .*got 90"),
+     "angle between the grid's rows and the track .*got 90"),
     (("wavenumber",), "grid", Grid.plane((0, 1, 5), (0, 1, 5)), ValueError,
      "distance of grid .*>= 0.0075.* m"),
     # Accuracy
@@ -106,8 +106,8 @@ REFUSED = [
     (("wavenumber",), "workers", 1.5, TypeError, "workers must be a whole number"),
     # Patches
     (("mosaic",), "patches", (20, 4), ValueError,
-     "patches must leave each some of 24 pixels: 20 patches of 2"),
-    (("mosaic",), "patches", (25, 4), ValueError, "patches must leave each some of 24 pixels"),
+     "patches must all have pixels: 20 patches of 2 are too many for 24"),
+    (("mosaic",), "patches", (25, 4), ValueError, "patches must all have pixels: 25"),
     (("mosaic",), "patches", (0, 4), ValueError, "every entry of patches must be .* got 0"),
     (("mosaic",), "patches", 4, (TypeError, ValueError),
      r"patches must be \(rows, columns\) of patches, got 4"),
@@ -115,7 +115,7 @@ REFUSED = [
      r"patches must be \(rows, columns\) of patches"),
     (("mosaic",), "memory_bytes", -1, ValueError, "memory_bytes must be"),
     (("mosaic",), "memory_bytes", 1000, ValueError, "memory_bytes must be at least .* MiB"),
-    (("mosaic",), "follow_s", 1.0, ValueError, "source must be a folder where follow_s is given"),
+    (("mosaic",), "follow_s", 1.0, ValueError, "source must be a folder if follow_s is given"),
 ]  # fmt: skip
 ROWS = [
     pytest.param(name, argument, value, error, says, id=f"{name}-{argument}-{number}")

@@ -313,7 +313,8 @@ def no_kernel(*_, **__):
 
 
 @pytest.mark.parametrize(
-    ("factor", "cause"), [(1e3, "In mm the grid"), (1e-3, "In km the grid"), (10, "Check the grid")]
+    ("factor", "cause"),
+    [(1e3, "if it were in mm"), (1e-3, "if it were in km"), (10, "Check the grid")],
 )
 def test_the_warning_names_the_likely_cause(factor, cause):
     given = scene(near)

@@ -108,7 +108,9 @@ def test_bright_points_where_coverage_ends(x_m, seabed, tolerance_db):
 
 def test_a_dark_image_beyond_single_precision_warns():
     lines, grid = bright_where_coverage_ends(4.8)
-    with pytest.warns(ClsasWarning, match=r"1\d dB darker than what the beam passes.*-6\d dB"):
+    with pytest.warns(
+        ClsasWarning, match=r"1\d dB darker than the echoes that the beam passes.*-6\d dB"
+    ):
         backproject(lines, grid, accuracy_db=-85, beam=BEAM)
 
 

@@ -639,7 +639,7 @@ def test_the_command(lines, tmp_path):
     )
     assert run.exit_code == 1
     assert "--high-pass-hz must be finite and > 70" in run.stderr
-    assert "hold nothing below 70" in run.stderr
+    assert "contain nothing below 70" in run.stderr
 
 
 def test_a_scene_gives_grid_beam_and_element(lines, tmp_path):

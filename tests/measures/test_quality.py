@@ -295,7 +295,9 @@ def test_relative_error_is_of_one_place():
         (Grid.plane((1e6, 1e6 + 1, 40), (1, 0, 30)), "1"),
         (grid.with_height(np.full(grid.shape, 2.0)), "2"),
     ):
-        with pytest.raises(ValueError, match=f"image and ref.* one grid, got .* to {apart} m apa"):
+        with pytest.raises(
+            ValueError, match=f"image and ref.* one grid, got .* by up to {apart} m"
+        ):
             relative_error_db(image, Image(pixels, other))
 
 
@@ -304,7 +306,7 @@ def test_relative_error_names_bad_input():
         relative_error_db(speckle(2, 3), speckle(3, 2))
     with pytest.raises(ValueError, match="reference must not be zero"):
         relative_error_db(speckle(2, 3), np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="image must hold no masked value, got 1 of 2"):
+    with pytest.raises(ValueError, match="image must have no masked value, got 1 of 2"):
         relative_error_db(np.ma.array([1.0, 2.0], mask=[True, False]), [1.0, 2.0])
     with pytest.raises(ValueError, match="image must be finite"):
         relative_error_db(np.full((2, 3), np.nan), speckle(2, 3))

@@ -201,7 +201,7 @@ def test_picture(tmp_path):
 
 def test_without_matplotlib_the_message_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(ImportError, match=r"pip install 'matplotlib>=3\.8'"):
+    with pytest.raises(ImportError, match=r"pip install 'matplotlib>=3\.10'"):
         MADE.save_png(tmp_path / "t.png")
     assert not any(tmp_path.iterdir())
 

@@ -1,7 +1,7 @@
 """A small store that tests damage."""
 
 import pytest
-from stores import GRID, LINES, WISH, files_of, written
+from stores import GRID, LINES, REQUEST, files_of, written
 
 import clsas
 
@@ -10,11 +10,11 @@ import clsas
 def kept(tmp_path_factory):
     """The files of a store."""
     path = tmp_path_factory.mktemp("kept") / "a.zarr"
-    list(clsas.mosaic(LINES, GRID, path, **WISH))
+    list(clsas.mosaic(LINES, GRID, path, **REQUEST))
     return files_of(path)
 
 
 @pytest.fixture
 def path(kept, tmp_path):
-    """A store of its own for a test."""
+    """A copy of the store that a test may damage."""
     return written(tmp_path / "a.zarr", kept)

@@ -1,4 +1,4 @@
-"""Metadata, coordinates and heights of stores: damage is found and mended."""
+"""Metadata, coordinates and heights of stores: damage is found and repaired."""
 
 import json
 import shutil
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from stores import GRID, LINES, WISH, change, change_metadata, files_of
+from stores import GRID, LINES, REQUEST, change, change_metadata, files_of
 
 import clsas
 from clsas.cli import main
@@ -24,10 +24,12 @@ def verified(path, code):
     return result.stdout, json.loads(found.stdout)
 
 
-def check_mended(path, kept, name):
-    """A run warns, forms no patch again and leaves what was written first."""
-    with pytest.warns(clsas.ClsasWarning, match=rf"a\.zarr was damaged and is mended: {name}: its"):
-        mosaic = clsas.mosaic(LINES, GRID, path, **WISH)
+def check_repaired(path, kept, name):
+    """A run warns, forms no patch again and restores what was written first."""
+    with pytest.warns(
+        clsas.ClsasWarning, match=rf"a\.zarr was damaged and has been repaired: {name}: its"
+    ):
+        mosaic = clsas.mosaic(LINES, GRID, path, **REQUEST)
     assert len(mosaic.finished) == 6
     assert list(mosaic) == []
     assert files_of(path) == kept
@@ -55,7 +57,7 @@ def test_any_bit_of_metadata_is_found_or_plays_no_part(path, kept, name):
         if store.array_damage():
             assert list(store.array_damage()) == [name.split("/")[0]]
             found += 1
-        else:  # a blank
+        else:  # white space
             assert json.loads(content) == json.loads(whole)
     assert found > 20
 
@@ -71,13 +73,13 @@ def test_any_bit_of_coordinates_and_heights_is_found(path, kept, name):
         store = clsas.Store.opened(path)
         assert list(store.array_damage()) == [name[: name.index("/")]]
         for read in (store.image, store.overview, lambda store=store: store.grid):
-            with pytest.raises(ValueError, match=r"is damaged.*clsas mosaic .* mends it"):
+            with pytest.raises(ValueError, match=r"is damaged.*run clsas mosaic .* to repair it"):
                 read()
     assert verified(path, 1)[1]["damaged_arrays"]
 
 
-def test_a_flipped_separator_is_found_and_mended(path, kept):
-    """Zarr then looks for pixels under other names, finds none, and takes them for zeros."""
+def test_a_flipped_separator_is_found_and_repaired(path, kept):
+    """Otherwise Zarr would look for chunks under other names, find none and return zeros."""
     document = path / "pixels" / "zarr.json"
     text = document.read_text()
     document.write_text(text.replace('"separator": "/"', '"separator": "."'))
@@ -90,7 +92,7 @@ def test_a_flipped_separator_is_found_and_mended(path, kept):
     assert "no patch can be compared with its checksum" in said
     assert "  pixels: its metadata are not those of a mosaic" in said
     assert found["finished"] is None
-    check_mended(path, kept, "pixels")
+    check_repaired(path, kept, "pixels")
 
 
 def remove(path):
@@ -104,13 +106,13 @@ def empty(path):
 
 
 def replace(path):
-    """By what is no folder."""
+    """Because the path leads to something that is not a folder."""
     shutil.rmtree(path)
     path.write_text("")
 
 
 def zeros(path):
-    """With right checksums: of another store."""
+    """With valid checksums, from another store."""
     other = np.zeros(GRID.shape if path.name == "height" else GRID.shape[path.name == "x"])
     zarr = pytest.importorskip("zarr")
     array = zarr.open_array(path, mode="r+")
@@ -119,34 +121,34 @@ def zeros(path):
 
 @pytest.mark.parametrize("name", ["x", "y", "height"])
 @pytest.mark.parametrize("damage", [remove, empty, replace, zeros])
-def test_coordinates_and_heights_are_mended(path, kept, name, damage):
+def test_coordinates_and_heights_are_repaired(path, kept, name, damage):
     damage(path / name)
     assert list(clsas.Store.opened(path).array_damage()) == [name]
-    check_mended(path, kept, name)
+    check_repaired(path, kept, name)
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
 @pytest.mark.parametrize("content", [None, b"", b"{}", b"[1]", b"\xff", b"{" * 100_000])
-def test_metadata_are_mended(path, kept, name, content):
+def test_metadata_are_repaired(path, kept, name, content):
     (path / name).unlink()
     if content is not None:
         (path / name).write_bytes(content)
-    check_mended(path, kept, name.split("/")[0])
+    check_repaired(path, kept, name.split("/")[0])
 
 
 def test_metadata_that_were_changed_elsewhere_are_found(path, kept):
-    """Though an array may have such."""
+    """Although an array may have attributes."""
     change_metadata(path, "height", attributes={"units": "km"})
     assert clsas.Store.opened(path).array_damage() == {
         "height": "its metadata do not match their digest"
     }
     with pytest.raises(ValueError, match="height: its metadata do not match their digest"):
         clsas.Store.opened(path).read()
-    check_mended(path, kept, "height")
+    check_repaired(path, kept, "height")
 
 
-def test_a_killed_run_leaves_a_store_that_is_mended_by_the_next(path, kept, monkeypatch):
-    """Between taking what is damaged away and putting the new in its place."""
+def test_a_killed_run_leaves_a_store_that_is_repaired_by_the_next(path, kept, monkeypatch):
+    """Between the removal of the damaged part and the move of the new one to its place."""
     from clsas.mosaics import arrays
 
     empty(path / "height")
@@ -160,13 +162,13 @@ def test_a_killed_run_leaves_a_store_that_is_mended_by_the_next(path, kept, monk
     with monkeypatch.context() as patch:
         patch.setattr(arrays.os.path, "lexists", killed)
         with pytest.raises(KeyboardInterrupt):
-            clsas.mosaic(LINES, GRID, path, **WISH)
+            clsas.mosaic(LINES, GRID, path, **REQUEST)
     assert not (path / "height").exists()
-    check_mended(path, kept, "height")
+    check_repaired(path, kept, "height")
 
 
 class TestStoresWithoutDigests:
-    """As this version wrote them at first."""
+    """As the first releases of this version wrote them."""
 
     @pytest.fixture
     def path(self, path):
@@ -183,21 +185,21 @@ class TestStoresWithoutDigests:
         assert (found["has_digests"], found["damaged_arrays"]) == (False, {})
 
     def test_it_gets_digests_when_it_is_continued(self, path, kept):
-        assert list(clsas.mosaic(LINES, GRID, path, **WISH)) == []
+        assert list(clsas.mosaic(LINES, GRID, path, **REQUEST)) == []
         assert clsas.Store.opened(path).has_digests
         assert files_of(path) == kept
 
     @pytest.mark.parametrize("name", ["x", "y", "height"])
-    def test_values_are_compared_and_mended_all_the_same(self, path, kept, name):
+    def test_values_are_compared_and_repaired_all_the_same(self, path, kept, name):
         zeros(path / name)
         assert list(verified(path, 1)[1]["damaged_arrays"]) == [name]
-        check_mended(path, kept, name)
+        check_repaired(path, kept, name)
 
     def test_heights_that_are_gone_are_missed(self, path, kept):
         shutil.rmtree(path / "height")
-        with pytest.raises(ValueError, match="its grid is not the one that was written"):
+        with pytest.raises(ValueError, match="its grid differs from what was written"):
             clsas.Store.opened(path).image()
-        check_mended(path, kept, "height")
+        check_repaired(path, kept, "height")
 
 
 class TestChunksOfNoPixels:
@@ -207,7 +209,7 @@ class TestChunksOfNoPixels:
         with pytest.raises(ValueError, match=r"a\.zarr is damaged: pixels: .* chunk_grid"):
             clsas.Store.opened(path).image()
         assert verified(path, 1)[1]["damaged_arrays"].keys() == {"pixels"}
-        check_mended(path, kept, "pixels")
+        check_repaired(path, kept, "pixels")
 
     @pytest.mark.parametrize("name", ["x", "height"])
     def test_in_coordinates(self, path, kept, name):
@@ -216,12 +218,12 @@ class TestChunksOfNoPixels:
         grid = {"name": "regular", "configuration": {"chunk_shape": shape}}
         change_metadata(path, name, chunk_grid=grid)
         assert verified(path, 1)[1]["damaged_arrays"].keys() == {name}
-        check_mended(path, kept, name)
+        check_repaired(path, kept, name)
 
     @pytest.mark.parametrize("shape", [[0, 14], [15, 0], [-1, 14], [15], [15.0, 14], "ab", None])
     def test_in_the_document(self, path, shape):
         change(path, patch_shape=shape)
-        for work in (clsas.Store.opened, lambda path: clsas.mosaic(LINES, GRID, path, **WISH)):
+        for work in (clsas.Store.opened, lambda path: clsas.mosaic(LINES, GRID, path, **REQUEST)):
             with pytest.raises(ValueError, match=r"a\.zarr is damaged: its attributes are not"):
                 work(path)
 

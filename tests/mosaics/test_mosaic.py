@@ -66,13 +66,13 @@ def test_every_patch_has_its_own_pixels(exact):
         seen.append((patch.row, patch.column))
         expected = GRID.positions_m(patch.rows, patch.columns)
         np.testing.assert_allclose(patch.grid.positions_m(), expected, atol=1e-9)
-        assert 0 < patch.record.channels < 160  # the beam's
+        assert 0 < patch.record.channels < 160  # those within the beam
         assert not patch.record.flags
     assert sorted(seen) == list(np.ndindex(2, 4))
 
 
 def test_patches_of_one_device_come_in_order(monkeypatch):
-    """Also when several are finished before anybody looks."""
+    """Even if several are finished before the caller takes the first."""
     monkeypatch.setattr(scheduling, "wait", lambda futures, timeout: set(wait(futures).done))
     wish = REQUEST | {"patches": (6, 8)}
     patches = [(patch.row, patch.column) for patch in clsas.mosaic(LINES, GRID, **wish)]
@@ -123,7 +123,7 @@ def test_the_overview_keeps_power_and_place(file, tmp_path, exact):
 
 
 def test_the_directions_are_those_of_the_whole_track():
-    """A swaying track's, which the channels that see a patch would tell otherwise."""
+    """The visible channels of a patch alone would give a swaying track other directions."""
     track = LINES.tx_m.copy()
     track[:, 1] += 0.2 * np.sin(track[:, 0])
     lines = lines_over(GRID, track, carrier_hz=100e3, step_m=0.03)
@@ -134,7 +134,7 @@ def test_the_directions_are_those_of_the_whole_track():
 
 
 class TestFactorized:
-    """A larger scene, of which every patch is worth factorizing."""
+    """A scene so large that every patch is factorized."""
 
     GRID = Grid.plane((-5.1, 5.1, 512), (40, 50.2, 512))
     BEAM = BeamWindow(20.0, "hann")
@@ -149,32 +149,32 @@ class TestFactorized:
     @pytest.fixture(scope="class")
     @classmethod
     def formed(cls, scene):
-        """The whole image, and its patches."""
+        """Return the exact image and the patches of the mosaic."""
         patches = []
         mosaic = clsas.mosaic(
             scene[0], cls.GRID, tolerance_db=cls.TOLERANCE_DB, beam=cls.BEAM, patches=(2, 2)
         )
-        with pytest.MonkeyPatch.context() as patch:  # whatever a search is worth
+        with pytest.MonkeyPatch.context() as patch:  # plan every patch, however small
             patch.setattr(planner, "_SEARCH_S", 0.0)
             return mosaic.image(patches.append), patches
 
     @pytest.mark.slow
     def test_every_patch_is_as_good_as_predicted(self, scene, formed):
         for patch in formed[1]:
-            assert patch.record.plan["image"]["sides"]  # not plain backprojection
+            assert patch.record.plan["image"]["sides"]  # it was factorized
             exact = clsas.Image(scene[1].pixels[patch.rows, patch.columns], patch.grid)
             measured = relative_error_db(patch.image, exact)
             assert measured <= patch.record.predicted_error_db <= self.TOLERANCE_DB
 
     @pytest.mark.slow
     def test_there_are_no_seams(self, scene, formed):
-        """Along borders the error is what it is elsewhere, and neighbours agree."""
+        """Along borders the error is as elsewhere, and neighbours agree."""
         image, exact = formed[0].pixels, scene[1].pixels
         level = np.sqrt(np.mean(np.abs(exact) ** 2))
         error = np.abs(image - exact) / level
         for border in (error[254:258], error[:, 254:258]):
             assert 20 * np.log10(np.sqrt(np.mean(border**2))) <= self.TOLERANCE_DB + 1
-        # The step across the border, beyond the exact image's own.
+        # The step across the border, minus that of the exact image.
         for a, b in ((np.s_[255], np.s_[256]), (np.s_[:, 255], np.s_[:, 256])):
             step = (image[a] - image[b]) - (exact[a] - exact[b])
             step_db = 20 * np.log10(np.sqrt(np.mean(np.abs(step) ** 2)) / level)
@@ -188,13 +188,13 @@ class TestFactorized:
 
 
 def test_a_normalising_beam(tmp_path):
-    """What it multiplies by is that of all channels, not of those that a patch sees."""
+    """The scale is that of all channels, not of those from which a patch receives."""
     beam = BeamWindow(8.0, "hann", normalise=True)
     exact = clsas.backproject(LINES, GRID, beam=beam, accuracy_db=-80)
     image = clsas.mosaic(LINES, GRID, **(REQUEST | {"beam": beam})).image()
     assert relative_error_db(image, exact) < -65
     clsas.save(tmp_path / "lines.h5", LINES)
-    with pytest.raises(ValueError, match="beam must not normalise with a folder"):
+    with pytest.raises(ValueError, match="beam must not normalise for a folder"):
         clsas.mosaic(tmp_path, GRID, **(REQUEST | {"beam": beam}))
 
 
@@ -208,14 +208,14 @@ def test_height_maps_and_points():
 
 
 def test_an_image_larger_than_memory_is_refused():
-    """Before anything is formed."""
+    """Before any patch is formed."""
     grid = Grid.plane((-4, 4, 10**7), (30, 40, 10**7))
     with pytest.raises(ValueError, match=r"the mosaic must ask for at most .* GiB"):
         clsas.mosaic(LINES, grid, beam=BEAM).image()
 
 
 def test_pings_that_do_not_fit_into_memory_are_refused(tmp_path, monkeypatch):
-    """Even if none of their samples are read."""
+    """Even if none of their samples is read."""
     pings = 100_000
     at_m = np.zeros((pings, 3))
     at_m[:, 0] = np.linspace(-4, 4, pings)
@@ -245,7 +245,7 @@ def test_patches_that_do_not_divide_the_grid(exact):
 
 
 def test_a_patch_that_no_channel_sees_is_empty_and_flagged(tmp_path):
-    """Half of the scene lies behind the beams, and some beyond the lines' end."""
+    """Half of the scene lies behind the beams, and a part beyond the end of the lines."""
     grid = Grid.plane((-4, 120, 64), (30, 40, 20))
     mosaic = clsas.mosaic(LINES, grid, tmp_path / "a.zarr", **(REQUEST | {"patches": (1, 4)}))
     patches = []
@@ -255,7 +255,9 @@ def test_a_patch_that_no_channel_sees_is_empty_and_flagged(tmp_path):
     assert [patch.record.is_empty for patch in patches] == [False, True, True, True]
     for patch in patches[1:]:
         assert not patch.image.pixels.any()
-        assert patch.record.flags == ("empty: in no channel's beam and range",)
+        assert patch.record.flags == (
+            "empty: outside the beam or recorded ranges of every channel",
+        )
         assert patch.record.predicted_error_db is None
 
 
@@ -281,7 +283,7 @@ def test_missing_samples_are_flagged(file, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("wish", [{}, {"accuracy_db": None, "tolerance_db": -65}])
 def test_missing_channels_weigh_nothing(file, wish, monkeypatch):
-    """Neither with a beam that divides by what channels weigh, nor in a plan."""
+    """Neither in a beam that divides by the sum of weights, nor in a plan."""
     monkeypatch.setattr("clsas.mosaics.forming._WORTH_A_PLAN", 0)
     beam = BeamWindow(8.0, "hann", normalise=True)
     kept = np.random.default_rng(1).random(160) > 0.2
@@ -293,7 +295,7 @@ def test_missing_channels_weigh_nothing(file, wish, monkeypatch):
         LINES.select(kept), GRID, beam=dataclasses.replace(beam, along=along), accuracy_db=-80
     )
     image = clsas.mosaic(file, GRID, **(REQUEST | {"beam": beam} | wish)).image()
-    # It is a mean times the number of all channels.
+    # A normalised image is the weighted mean times the number of all channels.
     of_all = 160 / np.count_nonzero(kept)
     assert relative_error_db(image.pixels, of_all * reference.pixels) < -65
 
@@ -301,7 +303,7 @@ def test_missing_channels_weigh_nothing(file, wish, monkeypatch):
 @pytest.mark.parametrize(
     ("samples", "says"),
     [
-        (np.ones((160, 9), np.float32), r"samples that are complex numbers.* got float32"),
+        (np.ones((160, 9), np.float32), r"samples as complex numbers.* got float32"),
         (np.ones((160, 9), np.int16), "got int16"),
         (np.complex64(1), r"got complex64 of shape \(\)"),
         ("group", "lacks samples"),
@@ -332,7 +334,7 @@ class TestOnceMore:
         first = next(running)
         running.close()
         assert (first.row, first.column) in mosaic.finished
-        # Also what was begun when the loop was left.
+        # Including the patches that were begun when the loop was left.
         assert mosaic.finished == Store.opened(tmp_path / "a.zarr").records()
         left = 8 - len(mosaic.finished)
         assert len(list(mosaic)) == left
@@ -373,7 +375,7 @@ class TestResuming:
         again = mosaic.image(patches.append)
         np.testing.assert_array_equal(again.pixels, before.pixels)
         told = [(patch.row, patch.column) for patch in patches]
-        assert told[-1] == (1, 2)  # after those that were there
+        assert told[-1] == (1, 2)  # after the stored patches
         assert sorted(told) == list(np.ndindex(2, 4))
         there = clsas.mosaic(LINES, GRID, path, **REQUEST)
         assert len(there.finished) == 8
@@ -381,7 +383,7 @@ class TestResuming:
 
     @pytest.mark.slow
     def test_after_kill(self, file, tmp_path, exact):
-        """Kill -9 in the middle, again and again."""
+        """Runs that are killed with SIGKILL at random moments."""
         program = f"""
             import clsas, pickle, sys
             grid, wish = pickle.load(open({str(tmp_path / "wish")!r}, "rb"))
@@ -405,20 +407,23 @@ class TestResuming:
             formed += process.stdout.readlines()
             assert process.wait() == (-signal.SIGKILL if kills < 3 else 0)
         assert len(set(formed)) == len(formed)  # none twice
-        # One may have been finished, and not yet told, when the process died.
+        # When the process died, one patch may have been finished but not yet printed.
         assert 45 <= len(formed) <= 48
         assert relative_error_db(Store.opened(tmp_path / "a.zarr").image(), exact) < -65
 
     @pytest.mark.parametrize(
         ("change", "message"),
         [
-            ({"accuracy_db": -60}, "accuracy_db is -70 there, -60 given"),
-            ({"accuracy_db": None, "tolerance_db": -40}, "tolerance_db is None there, -40 given"),
-            ({"beam": None}, "beam is .*width_deg.* there, None given"),
-            ({"patches": (2, 2)}, "patches of 30 x 20 pixels there, of 30 x 40 given"),
-            ({"grid": Grid.plane((-4, 4, 80), (30, 41, 60))}, "the grid lies elsewhere"),
-            ({"grid": Grid.plane((-4, 4, 40), (30, 40, 60))}, r"pixels is \[60, 80\] there"),
-            ({"lines": LINES.select(slice(1, None))}, "the range lines are others"),
+            ({"accuracy_db": -60}, "accuracy_db is -70 in the store, -60 given"),
+            (
+                {"accuracy_db": None, "tolerance_db": -40},
+                "tolerance_db is None in the store, -40 given",
+            ),
+            ({"beam": None}, "beam is .*width_deg.* in the store, None given"),
+            ({"patches": (2, 2)}, "patches have 30 x 20 pixels in the store, 30 x 40 given"),
+            ({"grid": Grid.plane((-4, 4, 80), (30, 41, 60))}, "the grid has another position"),
+            ({"grid": Grid.plane((-4, 4, 40), (30, 40, 60))}, r"pixels is \[60, 80\] in the store"),
+            ({"lines": LINES.select(slice(1, None))}, "the range lines differ"),
         ],
     )
     def test_other_inputs_are_refused(self, tmp_path, change, message):
@@ -430,13 +435,13 @@ class TestResuming:
         assert len(Store.opened(tmp_path / "a.zarr").records()) == before
 
     def test_a_store_without_a_finished_patch_may_be_deleted(self, tmp_path):
-        """By the user: another process may be about to write to it."""
+        """Only the user may delete it: another process may be about to write to it."""
         path = tmp_path / "a.zarr"
         wrong = clsas.mosaic(LINES, GRID, path, stages=[(64, 64)], patches=(2, 4))
         with pytest.raises(ValueError, match="patch 0,0: stages must leave a line and a pixel"):
             list(wrong)
         other = REQUEST | {"patches": (3, 4)}
-        with pytest.raises(ValueError, match="or delete it: no patch of it was finished"):
+        with pytest.raises(ValueError, match="or delete the store: it has no finished patch"):
             clsas.mosaic(LINES, GRID, path, **other)
         assert path.exists()
         shutil.rmtree(path)
@@ -470,7 +475,7 @@ class TestResuming:
         text = json.loads(header.read_text())
         text["attributes"]["version"] = 0
         header.write_text(json.dumps(text))
-        with pytest.raises(ValueError, match="is a mosaic of version 0, this clsas works with"):
+        with pytest.raises(ValueError, match="is a mosaic of version 0, but this clsas works with"):
             clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST)
 
     def test_lines_with_other_samples_are_refused(self, tmp_path):
@@ -478,7 +483,7 @@ class TestResuming:
         samples = LINES.samples.copy()
         samples[77] *= 5
         changed = dataclasses.replace(LINES, samples=samples)
-        with pytest.raises(ValueError, match="the range lines are others"):
+        with pytest.raises(ValueError, match="the range lines differ"):
             clsas.mosaic(changed, GRID, tmp_path / "a.zarr", **REQUEST)
 
     @pytest.mark.parametrize("damage", ["removed", "cut"])
@@ -497,7 +502,7 @@ class TestResuming:
 
     @pytest.mark.parametrize("text", ["", "{}", '{"attributes": {"format": "clsas mosaic"}}'])
     def test_a_damaged_document_is_told(self, tmp_path, text):
-        """It says what the store was made with, so that nothing can mend it."""
+        """Only this document contains the inputs of the store, so nothing can restore it."""
         next(iter(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST)))
         (tmp_path / "a.zarr" / "zarr.json").write_text(text)
         with pytest.raises(ValueError, match=r"a.zarr (is damaged|exists and is not|is a mosaic)"):
@@ -644,7 +649,7 @@ class TestFollowing:
 
     @pytest.fixture
     def record(self, lines, tmp_path):
-        """Return a function that adds files to a folder, of 200 channels each."""
+        """Return a function that adds files of 200 channels each to a folder."""
         folder = tmp_path / "survey"
         folder.mkdir()
 
@@ -667,7 +672,7 @@ class TestFollowing:
                 time.sleep(0.3)
                 add([part])
                 if part == 3:
-                    late.wait(60)  # the rest comes once patches are there
+                    late.wait(60)  # add the other files once a patch is finished
             (folder / END).touch()
 
         recorder = threading.Thread(target=more)
@@ -692,7 +697,7 @@ class TestFollowing:
 
     @pytest.mark.parametrize(("squint_deg", "column"), [(0.0, 160), (40.0, 160), (-40.0, 0)])
     def test_no_patch_is_formed_too_early(self, lines, squint_deg, column):
-        """Not either with a beam that looks ahead, or back."""
+        """Also for a beam that is squinted forward or backward."""
         beam = BeamWindow(8.0, "hann", squint_deg=squint_deg, along=(1.0, 0.0, 0.0))
         patch = self.GRID.window(slice(0, 12), slice(column, column + 10))
         counts = np.arange(20, 1201, 20)
@@ -701,11 +706,11 @@ class TestFollowing:
         passed = [each.has_passed(patch, each.settled) for each in known]
         assert not any(passed[: np.searchsorted(counts, last + 1)])
         assert last < 1000
-        assert passed[np.searchsorted(counts, last + 200)]  # and soon
+        assert passed[np.searchsorted(counts, last + 200)]  # soon afterwards
 
     @pytest.mark.slow
     def test_a_survey_is_followed_once_more(self, record, tmp_path):
-        """Files are in the store's inputs once, whoever looked when they came."""
+        """Every file is in the store's inputs once, whichever part of the run noticed it first."""
         folder, add = record
         add(range(2))
         mosaic = clsas.mosaic(folder, self.GRID, tmp_path / "a.zarr", **self.REQUEST, follow_s=1)
@@ -719,7 +724,7 @@ class TestFollowing:
 
     @pytest.mark.slow
     def test_a_survey_that_grew_twice_goes_on(self, record, tmp_path):
-        """The store's inputs hold every file in its order."""
+        """The store's inputs contain every file, in order."""
         folder, add = record
         add(range(2))
         path = tmp_path / "a.zarr"
@@ -748,7 +753,7 @@ class TestFollowing:
 
     @pytest.mark.slow
     def test_a_second_leg_while_following_again(self, lines, record, tmp_path):
-        """Patches finished in an earlier run, and those begun as the last file came, too."""
+        """Including patches of an earlier run, and patches begun when the last file was added."""
         folder, add = record
         add(range(6))
         path = tmp_path / "a.zarr"
@@ -758,7 +763,7 @@ class TestFollowing:
         running.close()
         mosaic = clsas.mosaic(folder, self.GRID, path, **self.REQUEST, follow_s=5)
         assert len(mosaic.finished) >= 5
-        # The way back, beside the first.
+        # The way back, parallel to the first leg.
         back = lines.select(np.arange(1199, -1, -1))
         aside_m = np.array([0.0, 2.0, 0.0])
         back = dataclasses.replace(back, tx_m=back.tx_m + aside_m, rx_m=back.rx_m + aside_m)
@@ -771,7 +776,7 @@ class TestFollowing:
         assert not list(clsas.mosaic(folder, self.GRID, path, **self.REQUEST))
 
     def test_a_worker_opens_every_file_once(self, lines, record, monkeypatch):
-        """But again should it be another one meanwhile."""
+        """But open it again if it has changed meanwhile."""
         survey = sys.modules["clsas.mosaics.survey"]
         read, opened = survey.read_geometry, []
         monkeypatch.setattr(
@@ -780,7 +785,7 @@ class TestFollowing:
         folder, add = record
 
         def seen():
-            """Return the channels that a worker knows, and the files that it opened for it."""
+            """Return the number of channels that a worker knows, and the files that it opened."""
             files = stamped_files(survey.open_survey(folder))
             opened.clear()
             return open_visibility(files, None).survey.channels, list(opened)
@@ -802,7 +807,7 @@ class TestFollowing:
 @pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="Linux tells the most memory")
 def test_lines_larger_than_memory_are_read_in_parts(tmp_path):
-    """200 km of track, 30 GB of samples, of which next to nothing is on the disk."""
+    """200 km of track and 30 GB of samples in a sparse file, which takes little of the disk."""
     pings, length = 640_000, 6000
     small = LINES
     track = along_x(pings, 0.05)
@@ -831,11 +836,11 @@ def test_lines_larger_than_memory_are_read_in_parts(tmp_path):
         import numpy as np, clsas
         from test_mosaic import BEAM, GRID, LINES
 
-        def most_kib():  # of this process, not of the one that it was made from
+        def most_kib():  # of this process alone, without the one that forked it
             lines = pathlib.Path("/proc/self/status").read_text().splitlines()
             return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
 
-        clsas.backproject(LINES, GRID, beam=BEAM, accuracy_db=-70)  # the driver's own
+        clsas.backproject(LINES, GRID, beam=BEAM, accuracy_db=-70)  # the memory of the driver
         before = most_kib()
         image = clsas.mosaic(sys.argv[1], GRID, accuracy_db=-70, beam=BEAM, patches=(2, 4)).image()
         print(most_kib() - before)
@@ -855,10 +860,10 @@ def test_lines_larger_than_memory_are_read_in_parts(tmp_path):
 
 
 def test_workers_of_a_machine_take_a_device_each(tmp_path, monkeypatch):
-    """And share them where there are more; what one leaves the next takes."""
+    """Further workers share them, and a new worker takes the place of one that ended."""
     monkeypatch.setattr("clsas.mosaics.devices.default_devices", lambda: ("first", "second"))
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
-    claim = claim_device.__wrapped__  # as every process calls it, once
+    claim = claim_device.__wrapped__  # without the cache, as if every call were another process
     workers = [claim() for _ in range(5)]
     assert [device for device, _ in workers] == ["first", "second", "first", "second", "first"]
     os.close(workers[1][1])

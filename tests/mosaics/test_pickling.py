@@ -1,4 +1,4 @@
-"""Mosaics, patches and devices in other processes: pickled, and opened anew there."""
+"""Mosaics, patches and devices that are pickled and used in another process."""
 
 import pickle
 import subprocess
@@ -23,7 +23,7 @@ pickle.dump((len(mosaic.finished), mosaic.image()), sys.stdout.buffer)
 
 
 def formed_elsewhere(mosaic):
-    """The patches that were finished before, and the image, of a mosaic in another process."""
+    """Return the finished patches and the image of a mosaic, from another process."""
     done = subprocess.run(
         [sys.executable, "-c", READ], input=pickle.dumps(mosaic), capture_output=True, check=True
     )

@@ -13,12 +13,12 @@ from click.testing import CliRunner
 import clsas
 from clsas.cli import main
 from clsas.core.grid import Grid
-from clsas.mosaics.documents import is_intact, read_attributes
+from clsas.mosaics.documents import is_intact, read_attributes, read_document
 from clsas.mosaics.store import Store
 
 GRID = Grid.plane((-4, 4, 40), (30, 40, 30))
 LINES = lines_over(GRID, along_x(60, 0.1), carrier_hz=100e3, step_m=0.03)
-WISH = {"accuracy_db": -50, "beam": clsas.BeamWindow(8.0, "hann"), "patches": (2, 3)}
+REQUEST = {"accuracy_db": -50, "beam": clsas.BeamWindow(8.0, "hann"), "patches": (2, 3)}
 CHUNK = Path("pixels/c/1/2")
 RECORD = Path("patches/1.2/zarr.json")
 
@@ -27,13 +27,13 @@ RECORD = Path("patches/1.2/zarr.json")
 def kept(tmp_path_factory):
     """The files of a store, by path in it."""
     path = tmp_path_factory.mktemp("kept") / "a.zarr"
-    list(clsas.mosaic(LINES, GRID, path, **WISH))
+    list(clsas.mosaic(LINES, GRID, path, **REQUEST))
     return {each.relative_to(path): each.read_bytes() for each in path.rglob("*") if each.is_file()}
 
 
 @pytest.fixture
 def path(kept, tmp_path):
-    """A store of its own for a test."""
+    """A copy of the store that a test may damage."""
     for name, content in kept.items():
         (tmp_path / "a.zarr" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "a.zarr" / name).write_bytes(content)
@@ -50,10 +50,10 @@ def zero(path):
     path.write_bytes(bytes(path.stat().st_size))
 
 
-def check_mended(path, kept):
+def check_repaired(path, kept):
     """A run warns, forms the one damaged patch and ends with the same pixels."""
-    with pytest.warns(clsas.ClsasWarning, match=r"a\.zarr is damaged .* again: patch 1,2: its"):
-        mosaic = clsas.mosaic(LINES, GRID, path, **WISH)
+    with pytest.warns(clsas.ClsasWarning, match=r"a\.zarr is damaged; .* again: patch 1,2: its"):
+        mosaic = clsas.mosaic(LINES, GRID, path, **REQUEST)
     assert [(patch.row, patch.column) for patch in mosaic] == [(1, 2)]
     assert not Store.opened(path).damage()
     for name, content in kept.items():
@@ -63,17 +63,17 @@ def check_mended(path, kept):
 
 def test_all_is_well_of_a_whole_store(path, kept):
     assert not Store.opened(path).damage()
-    assert len(clsas.mosaic(LINES, GRID, path, **WISH).finished) == 6
+    assert len(clsas.mosaic(LINES, GRID, path, **REQUEST).finished) == 6
 
 
 @pytest.mark.parametrize(
     "damage",
     [
         lambda path: flip(path, 0),
-        lambda path: flip(path, 8 * path.stat().st_size - 40),  # the last of the pixels
-        lambda path: flip(path, 8 * path.stat().st_size - 1),  # of the checksum
+        lambda path: flip(path, 8 * path.stat().st_size - 40),  # in the last pixel
+        lambda path: flip(path, 8 * path.stat().st_size - 1),  # in the checksum
         zero,
-        lambda path: path.write_bytes((path.parent / "1").read_bytes()),  # another patch's
+        lambda path: path.write_bytes((path.parent / "1").read_bytes()),  # of another patch
         lambda path: path.unlink(),
     ],
     ids=["first bit", "last bit", "checksum", "zeroed", "exchanged", "gone"],
@@ -85,13 +85,13 @@ def test_damaged_pixels_are_found_and_formed_again(path, kept, damage):
     for read in (store.image, store.read, store.overview, lambda: store.image(slice(20, None))):
         with pytest.raises(ValueError, match="patch 1,2: its pixels"):
             read()
-    assert store.image(slice(0, 15)).pixels.any()  # of other patches
-    check_mended(path, kept)
+    assert store.image(slice(0, 15)).pixels.any()  # the other patches can be read
+    check_repaired(path, kept)
 
 
 def test_a_finished_mosaic_does_not_hand_out_damage(path):
-    """Also where the damage came after the store was verified."""
-    mosaic = clsas.mosaic(LINES, GRID, path, **WISH)
+    """Even if the damage occurred after the store was verified."""
+    mosaic = clsas.mosaic(LINES, GRID, path, **REQUEST)
     flip(path / CHUNK, 1000)
     with pytest.raises(ValueError, match="patch 1,2: its pixels do not match their checksum"):
         mosaic.image()
@@ -109,11 +109,11 @@ def test_any_bit_of_a_record_is_found_or_plays_no_part(path, kept):
         if store.damage():
             found += 1
             assert (1, 2) not in store.records()
-        else:  # a blank, or Zarr's own part of the document
+        else:  # white space, or the part of the document that belongs to Zarr
             assert read_attributes((path / RECORD).parent) == expected
     assert found > 200
     (path / RECORD).write_bytes(kept[RECORD].replace(b'"channels": ', b'"channels": 1'))
-    check_mended(path, kept)
+    check_repaired(path, kept)
 
 
 @pytest.mark.parametrize("name", ["zarr.json", "pixels/zarr.json"])
@@ -136,7 +136,7 @@ def test_any_bit_of_the_layout_is_found_or_plays_no_part(path, kept, name):
 
 def test_a_damaged_height_map_is_found(tmp_path):
     grid = GRID.with_height(np.linspace(0, 1, GRID.size).reshape(GRID.shape))
-    list(clsas.mosaic(LINES, grid, tmp_path / "a.zarr", **WISH))
+    list(clsas.mosaic(LINES, grid, tmp_path / "a.zarr", **REQUEST))
     store = Store.opened(tmp_path / "a.zarr")
     np.testing.assert_array_equal(store.image().grid.height_m, grid.height_m)
     (chunk,) = [each for each in (tmp_path / "a.zarr/height/c").rglob("*") if each.is_file()]
@@ -151,13 +151,13 @@ def test_a_store_without_checksums_is_refused_by_its_version(path):
     document = json.loads((path / "zarr.json").read_text())
     document["attributes"]["version"] = 1
     (path / "zarr.json").write_text(json.dumps(document))
-    for work in (Store.opened, lambda path: clsas.mosaic(LINES, GRID, path, **WISH)):
-        with pytest.raises(ValueError, match="of version 1, this clsas works with version 2"):
+    for work in (Store.opened, lambda path: clsas.mosaic(LINES, GRID, path, **REQUEST)):
+        with pytest.raises(ValueError, match="of version 1, but this clsas works with version 2"):
             work(path)
 
 
 def test_pixels_reach_the_disk_before_the_record_has_its_name(tmp_path, monkeypatch):
-    list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **WISH))
+    list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST))
     events = []
     sync, rename = os.fsync, os.replace
 
@@ -178,7 +178,7 @@ def test_pixels_reach_the_disk_before_the_record_has_its_name(tmp_path, monkeypa
     names = [event for event in events if event[0] == "name"]
     assert [target for _, _, target in names] == [chunk, document]
     order = [
-        ("sync", os.path.dirname(document)),  # the former record is gone
+        ("sync", os.path.dirname(document)),  # the former record is removed
         ("sync", names[0][1]), names[0], ("sync", os.path.dirname(chunk)),
         ("sync", names[1][1]), names[1], ("sync", os.path.dirname(document)),
     ]  # fmt: skip
@@ -186,7 +186,7 @@ def test_pixels_reach_the_disk_before_the_record_has_its_name(tmp_path, monkeypa
 
 
 def test_a_patch_that_is_written_anew_has_no_record_meanwhile(path, monkeypatch):
-    """A run that is killed then must not leave the old record with new pixels."""
+    """A run that is killed in between must not leave the old record with new pixels."""
     store = Store.opened(path)
     record = store.records()[1, 2]
 
@@ -209,10 +209,28 @@ def test_a_refused_write_leaves_the_patch(path, kept):
     test_all_is_well_of_a_whole_store(path, kept)
 
 
-def test_a_store_does_not_grow_into_what_is_no_mosaic(path, kept):
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"parts": None}, "inputs must have a list 'parts', got None"),
+        ({"parts": "abc"}, "inputs must have a list 'parts', got 'abc'"),
+        (
+            {"pixels": None},
+            r"inputs must have 'pixels' \[30, 40\], the shape of the grid, got None",
+        ),
+        ({"pixels": [40, 30]}, r"inputs must have 'pixels' \[30, 40\], .* got \[40, 30\]"),
+        ({"pixels": [30.0, 40]}, r"inputs must have 'pixels' \[30, 40\], .* got \[30.0, 40\]"),
+    ],
+)
+def test_inputs_that_are_not_those_of_a_mosaic_are_refused(path, kept, tmp_path, changed, message):
     store = Store.opened(path)
-    with pytest.raises(ValueError, match="inputs must have the parts and pixels of a mosaic"):
-        store.grow({"a": 1})
+    inputs = read_document(path)["inputs"] | changed
+    given = {name: value for name, value in inputs.items() if value is not None}
+    new = Store.at(tmp_path / "new.zarr")
+    for accept in (lambda: new.begin(given, GRID, (15, 14)), lambda: store.grow(given)):
+        with pytest.raises(ValueError, match=message):
+            accept()
+    assert not new.path.exists()
     test_all_is_well_of_a_whole_store(path, kept)
 
 
@@ -226,7 +244,7 @@ def test_leftovers_of_killed_runs_are_removed(path, folder):
         clsas.save(path.parent / "lines.h5", LINES)
         assert not list(path.parent.glob(".clsas-*"))
     else:
-        list(clsas.mosaic(LINES, GRID, path, **WISH))
+        list(clsas.mosaic(LINES, GRID, path, **REQUEST))
         assert not list(path.rglob(".clsas-*"))
 
 
@@ -238,7 +256,7 @@ def test_other_software_verifies_pixels_too(path):
 
 
 def test_the_checksum_is_as_described(path):
-    """As docs/mosaic.md describes it for other software."""
+    """In the way that docs/mosaic.md describes for other software."""
     import zlib
 
     attributes = json.loads((path / RECORD).read_text())["attributes"]
@@ -288,7 +306,7 @@ def test_the_snippets_of_the_documentation_run_where_patches_are_unseen(tmp_path
     snippets = [s for s in re.findall(r"```python\n(.*?)```", text, re.S) if "Client" not in s]
     assert len(snippets) == 3
     pytest.importorskip("xarray")
-    # Few pixels, most of which lie beyond the track and the recorded ranges.
+    # Few pixels, most of them beyond the track and the recorded ranges.
     small = snippets[0].replace("(0, 500, 10001)", "(0, 500, 56)")
     small = small.replace("(30, 130, 2001)", "(30, 130, 48)").replace("tol", "patches=(2, 5), tol")
     names = {"lines": LINES}
@@ -302,7 +320,7 @@ def test_the_snippets_of_the_documentation_run_where_patches_are_unseen(tmp_path
 
 @pytest.mark.parametrize("make", [os.mkfifo, lambda chunk: chunk.symlink_to("/dev/zero")])
 def test_a_pipe_or_device_in_place_of_a_chunk_is_refused(path, make):
-    """Reading it would never end."""
+    """Reading a pipe would never end."""
     chunk = next(each for each in sorted((path / "pixels" / "c").rglob("*")) if each.is_file())
     chunk.unlink()
     make(chunk)

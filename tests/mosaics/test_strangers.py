@@ -1,4 +1,4 @@
-"""Stores of strangers: nothing in them runs code, takes all memory or leads elsewhere."""
+"""Stores from strangers: they cannot run code, exhaust memory or redirect writes."""
 
 import contextlib
 import json
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stores import GRID, LINES, WISH, change, change_metadata, files_of
+from stores import GRID, LINES, REQUEST, change, change_metadata, files_of
 
 import clsas
 from clsas.core import validate
@@ -19,7 +19,7 @@ zarr = pytest.importorskip("zarr")
 
 
 class Payload:
-    """Makes a file when it is unpickled."""
+    """An object that creates a file when it is unpickled."""
 
     def __init__(self, path):
         self.path = path
@@ -29,7 +29,7 @@ class Payload:
 
 
 def ways_to_read(path):
-    """All that reads a store."""
+    """Return all functions that read a store."""
     yield lambda: clsas.Store.opened(path).grid
     yield lambda: clsas.Store.opened(path).image()
     yield lambda: clsas.Store.opened(path).read()
@@ -73,7 +73,7 @@ def test_pickles_of_zarr_format_2_do_not_run(path, tmp_path, name, has_digests):
     (path / name).mkdir()
     (path / name / ".zarray").write_text(json.dumps(metadata))
     (path / name / ".".join("0" for _ in shape)).write_bytes(pickle.dumps(Payload(mark)))
-    # What the store would do to a program that reads it as Zarr is told to by default:
+    # What the store does to a program that reads it with the defaults of Zarr:
     with contextlib.suppress(Exception):
         _ = zarr.open_array(path / name, mode="r")[...]
     assert mark.exists()
@@ -82,8 +82,8 @@ def test_pickles_of_zarr_format_2_do_not_run(path, tmp_path, name, has_digests):
     assert not mark.exists()
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        list(clsas.mosaic(LINES, GRID, path, **WISH))
-    assert f"is mended: {name}: its metadata are gone" in str(found[0].message)
+        list(clsas.mosaic(LINES, GRID, path, **REQUEST))
+    assert f"has been repaired: {name}: its metadata are missing" in str(found[0].message)
     assert not mark.exists()
 
 
@@ -139,7 +139,7 @@ def test_zarr_is_not_asked_about_other_metadata(path, monkeypatch, name, entries
 
 
 def test_zarr_is_given_what_was_checked(path, monkeypatch):
-    """Whatever the file says by then."""
+    """Even if the file has changed by then."""
     from clsas.mosaics import metadata
 
     read = metadata.read_bytes
@@ -178,7 +178,7 @@ def test_a_store_that_claims_more_than_memory_is_refused(path, monkeypatch):
 
 
 def test_a_chunk_larger_than_it_can_be_is_not_read(path, monkeypatch):
-    """A sparse file takes no room on the disk."""
+    """A sparse file takes no space on the disk."""
     with (path / "pixels" / "c" / "0" / "0").open("r+b") as file:
         file.truncate(1 << 40)
     store = clsas.Store.opened(path)
@@ -189,7 +189,7 @@ def test_a_chunk_larger_than_it_can_be_is_not_read(path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["pixels/c/1", "pixels", "patches/1.2", "patches"])
 def test_a_run_writes_nowhere_else(path, tmp_path, name):
-    """Where a folder of the store leads elsewhere by a symbolic link."""
+    """If a symbolic link leads a folder of the store to another place."""
     elsewhere = tmp_path / "elsewhere"
     (path / name).rename(elsewhere)
     for each in elsewhere.rglob("1.2/zarr.json" if name == "patches" else "zarr.json"):
@@ -199,6 +199,6 @@ def test_a_run_writes_nowhere_else(path, tmp_path, name):
         (path / "patches" / "1.2" / "zarr.json").unlink()
     (path / name).symlink_to(elsewhere)
     before = files_of(elsewhere)
-    with pytest.raises(ValueError, match="must be a folder of its own to be written"):
-        list(clsas.mosaic(LINES, GRID, path, **WISH))
+    with pytest.raises(ValueError, match="must be a real folder of the store"):
+        list(clsas.mosaic(LINES, GRID, path, **REQUEST))
     assert files_of(elsewhere) == before

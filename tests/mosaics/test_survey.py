@@ -1,4 +1,4 @@
-"""Surveys are read by slices, and imaged as if they had been read whole."""
+"""Surveys are read in slices, and imaged as if they had been read whole."""
 
 from dataclasses import replace
 
@@ -118,7 +118,7 @@ def test_a_survey_grows_by_files_that_follow(folder):
     assert grown.digests(3) == grown.digests()[3:]
     assert grown.digests()[:3] == before.digests()
     save(folder / "25.h5", LINES.select(slice(0, 10)))
-    with pytest.raises(ValueError, match=r"whose names follow the last one, 3\.h5, got 25\.h5"):
+    with pytest.raises(ValueError, match=r"whose names sort after the last one, 3\.h5, got 25\.h5"):
         open_files(files_of(folder), grown)
     (folder / "25.h5").unlink()
     (folder / "3.h5").unlink()
@@ -146,15 +146,15 @@ def test_errors(folder, tmp_path):
     with pytest.raises(FileNotFoundError):
         open_survey(tmp_path / "none.h5")
     save(folder / "3.h5", replace(LINES, carrier_hz=99e3))
-    with pytest.raises(ValueError, match=r"3.h5: carrier_hz must be .* 100000, got 99000"):
+    with pytest.raises(ValueError, match=r"3.h5: carrier_hz must equal .* 100000, got 99000"):
         open_survey(folder)
     save(folder / "3.h5", replace(LINES, rx_velocity_m_s=[1.0, 0, 0]))
-    with pytest.raises(ValueError, match="rx_velocity_m_s must be in every file"):
+    with pytest.raises(ValueError, match="rx_velocity_m_s must be in all files"):
         open_survey(folder)
     save(folder / "3.h5", GRID)
-    with pytest.raises(FileFormatError, match="must hold range lines, got 'grid'"):
+    with pytest.raises(FileFormatError, match="must contain range lines, got 'grid'"):
         open_survey(folder)
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(ValueError, match=r"must hold range lines: the folder .*empty has no file"):
+    with pytest.raises(ValueError, match=r"must contain range lines, but .*empty has no file"):
         open_survey(empty)

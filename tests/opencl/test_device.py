@@ -84,7 +84,7 @@ def test_it_agrees_with_opencl():
     for info, device in zip(list_devices(), raw, strict=True):
         assert info.name == device.name.strip()
         assert info.platform == device.platform.name
-        assert info.memory_bytes > 0.1 * device.global_mem_size  # PoCL's follows what is free
+        assert info.memory_bytes > 0.1 * device.global_mem_size  # PoCL reports free memory
 
 
 def test_chosen_by_index():
@@ -92,7 +92,7 @@ def test_chosen_by_index():
         for wish in (info.index, str(info.index)):
             chosen, why = choose(wish)
             assert chosen.index == info.index
-            assert why == f"asked for as {info.index}"
+            assert why == f"requested as {info.index}"
 
 
 def test_chosen_by_a_part_of_its_name():
@@ -104,7 +104,7 @@ def test_chosen_by_a_part_of_its_name():
 
 
 def several_devices():
-    """An Intel CPU that two platforms drive, and a GPU beside them."""
+    """Return an Intel CPU supported by two platforms, and a GPU."""
     info = list_devices()[0]
     told = (
         ("Portable Computing Language", "pthread-Intel(R) Xeon(R)", "cpu", 16),
@@ -124,14 +124,16 @@ def several_devices():
 )
 def test_chosen_by_kind_and_platform(wish, index, monkeypatch):
     monkeypatch.setattr(module, "list_devices", several_devices)
-    assert choose(wish) == (several_devices()[index], f"asked for as {wish!r}")
+    assert choose(wish) == (several_devices()[index], f"requested as {wish!r}")
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, wish)
     assert choose()[0].index == index
 
 
 def test_a_kind_that_is_not_there_is_told(monkeypatch):
     monkeypatch.setattr(module, "list_devices", lambda: several_devices()[:2])
-    words = "No device matches 'gpu', asked for. Available: 0: Portable Computing Language: "
+    words = (
+        "No device matches 'gpu', which was requested. Available: 0: Portable Computing Language: "
+    )
     with pytest.raises(DeviceError, match=re.escape(words)):
         choose("gpu")
 
@@ -163,7 +165,7 @@ def test_the_time_of_building_kernels_is_counted_once(platform):
 
 
 def test_threads_do_not_set_each_others_arguments(platform):
-    """Of a kernel that is slow to be handed them, as one is between two threads' turns."""
+    """Setting the arguments of this kernel is slow, so that threads could interfere."""
     entered, most = 0, 0
 
     class Slow:
@@ -287,11 +289,11 @@ def test_only_the_kernels_used_last_are_kept(platform, monkeypatch):
     assert len(device._kernels) == 3
     again = device.kernel("peak", WIDTH=1, CHAINS=8)
     assert again is not first
-    assert first.compiled.function_name == again.name  # what a run holds goes on living
+    assert first.compiled.function_name == again.name  # kernels that a run refers to stay alive
 
 
 def test_kernels_are_released_with_the_last_that_holds_them(platform):
-    """Those of Program.all_kernels have a reference too many, and never are."""
+    """Kernels of Program.all_kernels have an extra reference, and never are released."""
     kernel = platform.kernel("backproject_tiles", **OPTIONS)
     assert kernel.compiled.reference_count == 1
 
@@ -323,7 +325,7 @@ def test_a_profile_counts_and_times_what_runs_within(platform):
 
 
 def test_factorized_images_are_driven_with_lanes_of_their_own(platform):
-    """Kernels and profile are those of the device, whatever the lanes of its exact images."""
+    """Kernels and profile are shared, whatever the number of lanes in exact images."""
     other = dataclasses.replace(
         platform, info=dataclasses.replace(platform.info, width=1, stage_width=4, permute=False)
     )

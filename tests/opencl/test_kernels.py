@@ -168,9 +168,9 @@ def test_every_kernel_is_in_the_table():
 @pytest.mark.filterwarnings("ignore::pyopencl.CompilerWarning")
 @pytest.mark.parametrize("name", OPTIONS)
 def test_parameters_are_those_that_the_compiler_finds(name, platform):
-    """Drivers tell of them if asked to, but not of a program from their cache.
+    """Drivers report parameters on request, but not for a program from their cache.
 
-    PoCL's headers rename those that are called like a function of OpenCL, as `length` is.
+    PoCL's headers rename parameters with the name of an OpenCL function, such as `length`.
     """
     info, text = cl.kernel_arg_info, whole_source(f"{name}.cl")
     for options in OPTIONS[name]:

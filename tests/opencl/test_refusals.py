@@ -1,4 +1,4 @@
-"""What keeps OpenCL from use is named: forked processes, and caches that PoCL cannot write."""
+"""Errors if OpenCL cannot be used: forked processes, and caches that PoCL cannot write."""
 
 import os
 import subprocess
@@ -53,7 +53,7 @@ except clsas.DeviceError as error:
 
 
 def in_a_process(code, *arguments, **environment):
-    """What a program prints; it is stopped if it hangs."""
+    """Return what a program prints; a program that hangs is stopped."""
     done = subprocess.run(
         [sys.executable, "-c", code, *arguments],
         env=os.environ | environment, capture_output=True, text=True, timeout=300,
@@ -95,7 +95,7 @@ def test_no_device_is_used_in_a_forked_process(monkeypatch):
 
 @pytest.fixture
 def no_folder(tmp_path):
-    """A path that nobody can make a folder of, also root."""
+    """Return a path at which nobody can create a folder, not even root."""
     (tmp_path / "file").write_text("")
     return tmp_path / "file" / "folder"
 
@@ -141,5 +141,5 @@ def test_a_command_without_a_cache_names_it(no_folder):
 
 
 def test_the_command_line_prints_the_advice_line_by_line():
-    """Lines that are not indented would be escaped, as those of strangers are."""
+    """Line feeds before lines that are not indented would be escaped."""
     assert "\\n" not in printable(str(refusals.no_device()))

@@ -1,4 +1,4 @@
-"""Kernels read nothing that was not written: memory that holds anything changes no image."""
+"""Kernels do not read uninitialised memory: its contents do not change any image."""
 
 from functools import cache
 
@@ -28,7 +28,7 @@ def made(name):
 
 @pytest.fixture
 def poison(monkeypatch):
-    """Fill every new buffer with NaN, once it is switched on; the list holds their sizes."""
+    """Return a function that fills new buffers with NaN from then on, and lists their sizes."""
     filled = []
     make = Device.buffer
 

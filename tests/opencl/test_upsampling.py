@@ -23,7 +23,7 @@ def even(frequency):
 
 
 def upsampled(samples, spectrum, step, device, gain=even, most_db=-60):
-    """Lines as a device makes them, complex, with their zeros; where samples go; the filters."""
+    """Return complex lines from a device with their zeros, the resampling and the filters."""
     found = upsampler(spectrum, step, gain, most_db)
     resampling = found.resampling(samples.shape[1], 3, spectrum)
     device = open_device(device)
@@ -86,7 +86,7 @@ def test_a_gain_shapes_the_spectrum(platform):
 
 @pytest.mark.parametrize("length", [1, 2, 17, 1021])
 def test_lines_of_any_length(platform, length):
-    """Each is the same as within longer lines of zeros."""
+    """The result is the same as within longer lines padded with zeros."""
     samples = noise(3, length)
     got, resampling, _ = upsampled(samples, flat(0.8), 21, platform)
     longer, _, _ = upsampled(np.pad(samples, ((0, 0), (0, 64))), flat(0.8), 21, platform)
@@ -119,7 +119,7 @@ def test_the_longest_filter_serves_where_it_nearly_suffices():
 
 
 def test_turning_is_exact_far_along_a_line(platform):
-    """Whole cycles are left out before float32 rounds them."""
+    """Whole cycles are removed before the phase is rounded to float32."""
     centre, length = 0.3141592, 40000
     spectrum = dataclasses.replace(flat(0.8), centre=centre)
     wave = np.exp(2j * np.pi * centre * np.arange(length))[None]

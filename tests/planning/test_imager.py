@@ -211,7 +211,7 @@ def test_a_plan_serves_a_track_beside_its_own(platform):
     along = np.linspace(0, 2 * np.pi, lines.channels)
     away_m = 0.01 * np.sin(along)[:, None] * [0.0, 1.0, 0.0]
     moved = dataclasses.replace(lines, tx_m=lines.tx_m + away_m, rx_m=lines.rx_m + away_m)
-    with pytest.raises(ValueError, match="another line geometry"):
+    with pytest.raises(ValueError, match="lines must have the geometry"):
         chosen.check(moved, grid)
     image = former(moved, grid, chosen, platform).form(moved)
     ideal = backproject(moved, grid, accuracy_db=-75, device=platform)

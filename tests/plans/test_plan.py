@@ -412,10 +412,26 @@ def test_a_plan_knows_its_lines_and_grid(chosen):
     lines, grid = made(swaying)
     chosen.check(lines, grid)
     other_lines, _ = over(around(0, 40))
-    with pytest.raises(ValueError, match="^lines must have the geometry"):
+    with pytest.raises(ValueError, match=r"^lines must have the geometry"):
         chosen.check(other_lines, grid)
-    with pytest.raises(ValueError, match="^grid must have the geometry"):
+    with pytest.raises(ValueError, match=r"^grid must have the geometry"):
         chosen.check(lines, around(0, 41))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("align", 3),
+        ("half_lengths", (-1, 2, 3)),
+        ("stretch", np.nan),
+        ("most_channels", (2**40,) * 3),
+    ],
+)
+def test_an_image_by_an_invalid_plan_is_refused(chosen, field, value):
+    """`replace` checks only what fields have to do with each other."""
+    lines, grid = made(swaying)
+    with pytest.raises(ValueError, match=f"the plan is invalid: .*{field}"):
+        factorize(lines, grid, changed(chosen, **{field: value}))
 
 
 def test_a_frequency_that_lines_cannot_hold_is_refused(chosen):

@@ -253,7 +253,7 @@ def test_notebooks_show_text_without_matplotlib_and_of_points(monkeypatch):
 def test_missing_matplotlib_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     for draw in (SPECKLE.plot, lambda: plot.volume(VOLUME)):
-        with pytest.raises(ImportError, match=r"pip install 'matplotlib>=3\.8'"):
+        with pytest.raises(ImportError, match=r"pip install 'matplotlib>=3\.10'"):
             draw()
 
 

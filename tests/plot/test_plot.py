@@ -244,5 +244,5 @@ def test_only_figures_are_saved(tmp_path):
 
 def test_missing_matplotlib_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(ImportError, match=r"pip install 'matplotlib>=3\.8'"):
+    with pytest.raises(ImportError, match=r"pip install 'matplotlib>=3\.10'"):
         plot.image_db(IMAGE)

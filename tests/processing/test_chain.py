@@ -1,4 +1,4 @@
-"""The chain from a recording to a focused image: what runs, what is kept, what is written."""
+"""The chain from a recording to a focused image: which steps run, and which files are kept."""
 
 import json
 import pickle
@@ -10,8 +10,10 @@ from click.testing import CliRunner
 
 import clsas
 from clsas.cli import main
+from clsas.core.atomic import locked
 from clsas.core.validate import ClsasWarning
 from clsas.files.process_tables import STEPS
+from clsas.processing import folders
 from clsas.processing import steps as steps_module
 
 pytest.importorskip("matplotlib")
@@ -40,7 +42,7 @@ unknowns = ["sway"]
 
 
 def recording(sway_m=0.0, time_s=0.0):
-    """Points seen by a sonar on a swaying track, as its navigation has them."""
+    """Return lines of points from a swaying track, with the positions of a straight one."""
     sonar = clsas.Sonar(
         clsas.Pulse(100e3, 30e3, 1e-3), [[0.0, 0.0, 0.0]], tx_length_m=0.06, rx_length_m=0.06
     )
@@ -66,7 +68,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def scene(folder, tmp_path):
-    """A scene beside the recording, with all steps on lines."""
+    """A scene file beside the recording, with every step that works on lines."""
     (tmp_path / "lines.h5").symlink_to(folder / "lines.h5")
     path = tmp_path / "scene.toml"
     path.write_text(SCENE + CALIBRATE + FOCUS)
@@ -77,7 +79,7 @@ STEPS_HERE = ("calibrate", "focus", "image")
 
 
 def choose(scene, *steps):
-    """Let a scene have these steps."""
+    """Write the steps of a scene into its file."""
     text = scene.read_text().replace(
         'lines = "lines.h5"', f'lines = "lines.h5"\nsteps = {[*steps]}'
     )
@@ -86,7 +88,7 @@ def choose(scene, *steps):
 
 @pytest.fixture
 def plain(scene):
-    """A scene whose only step is an image of the recording as it came."""
+    """A scene whose only step images the uncorrected recording."""
     choose(scene, "image")
     return scene
 
@@ -153,10 +155,10 @@ def test_a_record_that_cannot_be_read_is_no_licence_to_replace(plain):
     path, before = folder / "process.json", contents(folder)
     record = json.loads(path.read_text())
     for text, message in (
-        ("{", "process.json that is no record of clsas: choose another output, or remove it"),
-        ("[]", "no record of clsas"),
+        ("{", "process.json that clsas did not write: choose another output, or remove the file"),
+        ("[]", "that clsas did not write"),
         (json.dumps(record | {"version": 1}), "of another version of clsas"),
-        (json.dumps(record | {"steps": [{"name": 1}]}), "holds image.h5, which image would"),
+        (json.dumps(record | {"steps": [{"name": 1}]}), "contains image.h5, which image would"),
     ):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
@@ -173,7 +175,7 @@ def test_files_of_others_are_never_replaced(plain, tmp_path, name):
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / name).write_text("mine")
-    message = f"output '.*mine' holds {name}, which image would replace .* choose another output"
+    message = f"output '.*mine' contains {name}, which image would replace .* choose another output"
     with pytest.raises(ValueError, match=message):
         clsas.process(plain, output=folder)
     assert contents(folder) == {name: b"mine"}
@@ -187,7 +189,7 @@ def test_two_scenes_do_not_share_a_folder(plain, tmp_path):
     other.write_text(plain.read_text().replace("tolerance_db = -40", "tolerance_db = -30"))
     folder = clsas.process(plain, output=tmp_path / "both").folder
     before = contents(folder)
-    with pytest.raises(ValueError, match=r"another scene, '../scene.toml' .* not '../other.toml'"):
+    with pytest.raises(ValueError, match=r"another scene: '../scene.toml' .* not '../other.toml'"):
         clsas.process(other, output=folder)
     assert contents(folder) == before
 
@@ -203,7 +205,7 @@ def test_scene_and_folder_may_move_together(plain, tmp_path, monkeypatch):
 
 
 def test_a_killed_step_leaves_nothing_in_the_way(plain, monkeypatch):
-    """Files of a step appear together, once it is done."""
+    """The files of a step appear together when it is done."""
     folder, image = plain.with_suffix(""), steps_module.RUN["image"]
 
     def killed(job):
@@ -239,13 +241,13 @@ def test_what_was_finished_before_an_error_is_kept(scene):
 
 
 def test_a_single_step_begins_with_the_lines_that_the_scene_corrects(scene):
-    """Whether or not the corrections ran before, and whatever else is in the folder."""
+    """Whether or not the corrections ran before, and whatever else the folder contains."""
     choose(scene, "inspect", "calibrate", "image")
     found = clsas.process(scene, steps=("image",))
     assert found.repeated == ("calibrate", "image")
     assert found["image"].corrections == ("calibrate",)
     assert found["image"].lines == found["calibrate"].digest
-    with pytest.warns(ClsasWarning):  # of inspections
+    with pytest.warns(ClsasWarning):  # the findings of the inspection
         assert clsas.process(scene).repeated == ("inspect",)
     assert clsas.process(scene, steps=("image",)).repeated == ()
     assert clsas.process(scene, steps=("inspect",)).repeated == ()
@@ -258,14 +260,18 @@ def test_results_that_no_longer_belong_to_the_lines_are_named(scene):
     choose(scene, "calibrate", "image")
     folder = clsas.process(scene).folder
     scene.write_text(scene.read_text().replace("search_m = 0.4", "search_m = 0.3"))
-    message = "results of image in .* are out of date, its lines .* since: image.h5, image.png"
+    message = (
+        "results of image in .* are out of date, since its lines .* changed: image.h5, image.png"
+    )
     with pytest.warns(ClsasWarning, match=message):
         assert clsas.process(scene, steps=("calibrate",)).repeated == ("calibrate",)
     scene.write_text(scene.read_text().replace("'calibrate', ", ""))
-    with pytest.warns(ClsasWarning, match="out of date, the scene leaves it out: calibrate.h5"):
+    with pytest.warns(
+        ClsasWarning, match="out of date, since the scene leaves it out: calibrate.h5"
+    ):
         found = clsas.process(scene)
     assert found["image"].corrections == ()
-    # What compared the image before and after the corrections is gone with them.
+    # The comparison of the image before and after the corrections is removed with them.
     assert set(contents(folder)) == {"process.json", "calibrate.h5", "image.h5", "image.png"}
 
 
@@ -287,7 +293,7 @@ def test_usual_steps_and_warnings_of_inspection(scene):
     assert (found.folder / "inspect.png").exists()
     findings = found["inspect"].numbers["findings"]
     assert len(found["inspect"].warnings) == len(findings) > 0
-    assert clsas.process(scene).repeated == ()  # and warns no more
+    assert clsas.process(scene).repeated == ()  # without a warning
 
 
 def test_lines_and_echoes_in_memory(scene, tmp_path):
@@ -331,7 +337,7 @@ def test_mosaic_continues(scene):
 
 @pytest.fixture
 def joining(scene):
-    """A scene whose mosaic has been formed, from its recording as it came."""
+    """A scene whose mosaic has been formed from the uncorrected recording."""
     pytest.importorskip("zarr")
     choose(scene, "mosaic")
     scene.write_text(scene.read_text() + "[mosaic]\npatches = [1, 2]\n")
@@ -341,12 +347,12 @@ def joining(scene):
 
 def change_recording(scene):
     lines = clsas.load(scene.parent / "lines.h5")
-    (scene.parent / "lines.h5").unlink()  # a link to that of all tests
+    (scene.parent / "lines.h5").unlink()  # a hard link to the file that all tests share
     clsas.save(scene.parent / "lines.h5", replace(lines, samples=2 * lines.samples[::-1]))
 
 
 def test_a_mosaic_of_another_recording_is_formed_anew(joining):
-    """As every other step is run again."""
+    """Like any other step whose inputs changed."""
     before = clsas.Store.opened(joining.with_suffix("") / "mosaic.zarr").read()
     change_recording(joining)
     found = clsas.process(joining)
@@ -367,7 +373,7 @@ def test_a_mosaic_of_other_options_is_formed_anew(joining):
 
 
 def test_a_mosaic_is_the_steps_own_from_any_working_directory(joining, monkeypatch):
-    """Its path was recorded from another one."""
+    """The path of the store was recorded from another working directory."""
     text = joining.read_text()
     monkeypatch.chdir(joining.parent)
     joining.write_text(text.replace("tolerance_db = -40", "tolerance_db = -30"))
@@ -375,7 +381,7 @@ def test_a_mosaic_is_the_steps_own_from_any_working_directory(joining, monkeypat
 
 
 def test_a_mosaic_that_the_step_did_not_make_is_not_replaced(joining, tmp_path):
-    """Neither one that was there before, nor one that came in its place."""
+    """Neither a store that existed before, nor one that took the place of the step's."""
     store = tmp_path / "elsewhere.zarr"
     lines = clsas.load(joining.parent / "lines.h5")
     other = replace(lines, samples=3 * lines.samples[::-1])
@@ -399,7 +405,7 @@ def test_a_mosaic_that_the_step_did_not_make_is_not_replaced(joining, tmp_path):
 
 
 def test_a_refused_mosaic_leaves_the_old_one(joining):
-    """What is wrong with the request is found before anything is removed."""
+    """A wrong request is refused before anything is removed."""
     before = clsas.Store.opened(joining.with_suffix("") / "mosaic.zarr").read()
     change_recording(joining)
     text = joining.read_text()
@@ -414,9 +420,12 @@ def test_a_refused_mosaic_leaves_the_old_one(joining):
     ("text", "message"),
     [
         ('[process]\nsteps = ["images"]', "must be one of"),
-        ("[process]\nsteps = []", "steps must name one or several"),
-        ('[process]\nsteps = ["calibrate"]', "calibrate needs"),
-        (SCENE.replace("lines.h5", "nowhere.h5"), r"\[process\] lines must be a file, there is no"),
+        ("[process]\nsteps = []", "steps must name at least one"),
+        ('[process]\nsteps = ["calibrate"]', "may include calibrate only with points_m"),
+        (
+            SCENE.replace("lines.h5", "nowhere.h5"),
+            r"\[process\] lines must be a file, but .* does not exist",
+        ),
         ('[process]\noutput = ""', "output must be a path"),
         ("[process]\nstep = 1", "unknown key 'step' in \\[process\\]"),
         ("[process.calibrate]\npoints_m = [[1.0, 2.0]]", "points_m"),
@@ -458,17 +467,17 @@ def test_bad_arguments(scene, tmp_path):
     described = clsas.Grid.plane((0, 1, 2), (0, 1, 2))
     clsas.save(tmp_path / "grid.h5", described)
     output = tmp_path / "output"
-    with pytest.raises(ValueError, match="must hold RangeLines or Echoes, got Grid"):
+    with pytest.raises(ValueError, match="must contain RangeLines or Echoes, got Grid"):
         clsas.process(scene, lines=tmp_path / "grid.h5", output=output)
     assert not output.exists()
-    with pytest.raises(ValueError, match=r"cannot be made: there is no folder '.*no/such'"):
+    with pytest.raises(ValueError, match=r"cannot be created: there is no folder '.*no/such'"):
         clsas.process(scene, output=tmp_path / "no/such/folder")
     with pytest.raises(ValueError, match=r"output must be a folder, got the file '.*grid.h5'"):
         clsas.process(scene, output=tmp_path / "grid.h5")
 
 
 def test_two_runs_in_one_folder_are_refused(plain, tmp_path, monkeypatch):
-    """The second would continue from the lines of the first, and record them as its own."""
+    """Otherwise the second would continue from the first one's lines, recorded as its own."""
     other = clsas.load(plain.parent / "lines.h5").weighted(np.full(260, 2.0))
     image = steps_module.RUN["image"]
     messages = []
@@ -489,6 +498,26 @@ def test_two_runs_in_one_folder_are_refused(plain, tmp_path, monkeypatch):
     assert clsas.process(plain, lines=other).repeated == ("image",)
 
 
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_folder_that_another_first_run_removes_is_made_again(tmp_path, monkeypatch, is_there):
+    """The other run created the folder, failed, and removed it before this one locked it."""
+    folder, locks = tmp_path / "output", []
+    if is_there:
+        folder.mkdir()
+
+    def locked_late(path):
+        if not locks:
+            path.rmdir()
+        locks.append(path)
+        return locked(path)
+
+    monkeypatch.setattr(folders, "locked", locked_late)
+    with folders.made(folder):
+        assert (folder / ".clsas.lock").exists()
+    assert locks == [folder, folder]
+    assert not folder.exists()
+
+
 def test_a_recording_that_changes_while_it_is_processed_is_refused(plain, tmp_path, monkeypatch):
     changing, lines = tmp_path / "changing.h5", clsas.load(plain.parent / "lines.h5")
     clsas.save(changing, lines)
@@ -501,7 +530,7 @@ def test_a_recording_that_changes_while_it_is_processed_is_refused(plain, tmp_pa
         return open_device(device)
 
     monkeypatch.setattr(chain, "open_device", open_late)
-    with pytest.raises(ValueError, match=r"changing\.h5 changed since its digest was recorded"):
+    with pytest.raises(ValueError, match=r"changing\.h5 has changed since its digest was recorded"):
         clsas.process(plain, lines=changing)
     assert not plain.with_suffix("").exists()
 
@@ -512,9 +541,11 @@ def test_results_that_changed_since_are_not_returned(scene):
     lines, image = found.lines, found.image
     clsas.save(found.folder / "calibrate.h5", lines.weighted(np.full(260, 2.0)))
     clsas.save(found.folder / "image.h5", replace(image, pixels=2 * image.pixels))
-    with pytest.raises(ValueError, match=r"calibrate\.h5 changed since its digest was recorded"):
+    with pytest.raises(
+        ValueError, match=r"calibrate\.h5 has changed since its digest was recorded"
+    ):
         _ = found.lines
-    with pytest.raises(ValueError, match=r"image\.h5 changed since its digest was recorded"):
+    with pytest.raises(ValueError, match=r"image\.h5 has changed since its digest was recorded"):
         _ = found.image
 
 

@@ -1,4 +1,4 @@
-"""The attack on the public API: that nothing is left out of it, and a part of it."""
+"""The attack on the public API: it covers all names, and a part of it passes."""
 
 import subprocess
 import sys
@@ -12,7 +12,7 @@ pytest.importorskip("sarkit", reason="sarkit (extra radar) is not installed")
 
 ATTACK = Path(__file__).parents[2] / "scripts" / "attack"
 EVERY = {"data": 4, "sonars": 6, "imaging": 40, "files": 30}
-"""Groups that take little time, and of how many values one is tried."""
+"""Groups that take little time; one value in so many is tried."""
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_every_public_function_and_argument_is_attacked(judge, folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("group", EVERY)
 def test_wrong_values_are_refused_by_name_and_equal_ones_accepted(group):
-    """In a process of its own, whose memory is limited."""
+    """In a separate process with limited memory."""
     command = [ATTACK / "api", "--groups", group, "--every", EVERY[group], "--list"]
     run = subprocess.run(
         [sys.executable, *map(str, command)], capture_output=True, text=True, check=False
@@ -62,7 +62,7 @@ def test_wrong_values_are_refused_by_name_and_equal_ones_accepted(group):
 
 
 def test_the_judgement_finds_what_is_wrong(judge):
-    """A function that does everything wrong, one value at a time."""
+    """A function with a different mistake for each value."""
 
     def wrong(length_m):
         if length_m is None:

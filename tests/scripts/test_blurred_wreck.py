@@ -1,4 +1,4 @@
-"""The whole chain: the wreck, by an array on a track that nobody knows."""
+"""The whole chain: the wreck, recorded by an array on an unknown track."""
 
 import pytest
 from studies import blurred_wreck
@@ -17,7 +17,7 @@ def test_the_chain_restores_what_the_true_track_shows(tmp_path):
     scene = parse_scene(blurred_wreck.SCENE.encode(), name="wreck.toml", folder=tmp_path)
     few = pytest.warns(ClsasWarning, match="navigate: .* fewer than 8 reflectors")
     with pytest.warns(ClsasWarning, match="inspect: "), few:
-        found = clsas.process(scene, lines=recording.told, output=tmp_path / "processed")
+        found = clsas.process(scene, lines=recording.given, output=tmp_path / "processed")
     beam = scene.image["beam"]
     true = clsas.factorize(recording.true, scene.grid, -40, beam=beam)
     before = clsas.load(tmp_path / "processed" / "before.h5")

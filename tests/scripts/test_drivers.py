@@ -1,4 +1,4 @@
-"""scripts/drivers, as far as it goes without a chroot, and the table it prints."""
+"""The parts of scripts/drivers that need no chroot, and the table that it prints."""
 
 import json
 import shutil
@@ -13,7 +13,7 @@ SCRIPTS = Path(__file__).parents[2] / "scripts"
 
 @pytest.fixture
 def checkout(tmp_path):
-    """A folder with the script in it, and nothing to make a chroot with."""
+    """A folder with the script, on a machine that cannot make a chroot."""
     (tmp_path / "scripts").mkdir()
     for name in ("drivers", "environment"):
         shutil.copy(SCRIPTS / name, tmp_path / "scripts")
@@ -39,9 +39,9 @@ def test_where_there_is_no_chroot_to_be_had_it_says_why(checkout):
     ("arguments", "message"),
     [
         (["--fast"], "unknown option --fast"),
-        (["--turns", "0", "bench"], "--turns is a number from 1 on"),
+        (["--turns", "0", "bench"], "--turns must be a whole number of at least 1"),
         (["speed"], "unknown part speed"),
-        (["--driver", "cuda"], "--driver is one of: pypi pocl rusticl rusticl-gpu"),
+        (["--driver", "cuda"], "--driver must be pypi, pocl, rusticl or rusticl-gpu"),
     ],
 )
 def test_a_wrong_argument_is_named(checkout, arguments, message):

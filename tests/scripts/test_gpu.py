@@ -1,4 +1,4 @@
-"""The report of scripts/gpu, on whatever device there is."""
+"""The report of scripts/gpu, on any device."""
 
 import os
 import subprocess
@@ -28,9 +28,9 @@ def test_a_report_holds_what_a_part_printed(tmp_path, selection):
     text = report.read_text()
     assert f"# clsas on {info.name}" in text
     assert f"Driver {info.driver} of {info.platform}" in text
-    assert "`python -m clsas devices`: ended with 0 after" in text
+    assert "`python -m clsas devices`: exit code 0 after" in text
     assert info.label in text.split("## Devices")[1]
-    assert text.endswith("All parts ended well.\n")
+    assert text.endswith("All parts succeeded.\n")
 
 
 def test_a_report_needs_no_git(tmp_path):

@@ -35,7 +35,7 @@ serve(answer)
 
 @pytest.fixture
 def program(tmp_path):
-    """Return a program that answers requests, without a code."""
+    """Return a program that answers requests without any code."""
     path = tmp_path / "echo.py"
     path.write_text(ECHO.format(folder=str(SCRIPTS / "peers")))
     return path
@@ -48,7 +48,7 @@ def over_channels(lines, points_m):
 
 @pytest.mark.parametrize(("track", "pixels"), [("straight", 32), ("circle", 24)])
 def test_samples_over_frequency_give_the_ideal_image(track, pixels):
-    """By the sum that codes for radar form, in float64."""
+    """With the sum that codes for radar form, in float64."""
     scene = scenes.TRACKS[track](pixels)
     lines = scene.lines()
     given = scenes.as_history(lines)
@@ -63,7 +63,7 @@ def test_samples_over_frequency_give_the_ideal_image(track, pixels):
 
 @pytest.mark.parametrize(("track", "pixels"), [("straight", 32), ("circle", 24)])
 def test_lines_from_one_range_give_the_ideal_image(track, pixels):
-    """By the sum that torchbp forms, with every line's trigonometric polynomial, in float64."""
+    """With the sum that torchbp forms, of the trigonometric polynomials of lines, in float64."""
     scene = scenes.TRACKS[track](pixels)
     lines = scene.lines()
     given = scenes.as_profiles(lines)
@@ -90,7 +90,7 @@ def test_a_file_holds_the_scene_in_every_convention(tmp_path):
     y_m = given["corner_m"][1] + step_y * np.arange(rows)
     np.testing.assert_allclose(x_m, scene.grid.axes_m[0], atol=1e-12)
     np.testing.assert_allclose(y_m, scene.grid.axes_m[1], atol=1e-12)
-    # The band keeps its wavelengths: frequencies grow as the speed of waves does.
+    # The band keeps its wavelengths, so frequencies are proportional to the speed of waves.
     wavelengths_m = scenes.LIGHT_M_S / given["band_hz"]
     np.testing.assert_allclose(wavelengths_m, 1500 / np.array([105e3, 135e3]))
 
@@ -112,7 +112,7 @@ def test_the_helix_has_a_turn_for_every_pixel_along_a_side():
 
 @pytest.mark.parametrize("pixels", [128, 512])
 def test_channels_of_the_circle_do_not_alias(pixels):
-    """Phases of the farthest pixels differ by half a cycle at most from channel to channel."""
+    """Phases of the farthest pixels change by at most half a cycle from channel to channel."""
     scene = scenes.circle(pixels)
     corners_m = focus.corners_m(scene.grid).reshape(-1, 3)
     range_m = np.linalg.norm(corners_m[:, None] - scene.track(), axis=-1)
@@ -157,7 +157,7 @@ def test_a_program_has_as_many_cores_as_it_is_given(program, tmp_path):
 
 def test_more_cores_than_there_are_are_refused(program, tmp_path):
     with (
-        pytest.raises(workers.PeerError, match="4096 cores were asked for, and"),
+        pytest.raises(workers.PeerError, match="4096 cores were requested, but only"),
         workers.worker(sys.executable, program, tmp_path / "none", 4096),
     ):
         pass
@@ -168,7 +168,7 @@ def test_a_program_that_fails_is_named(tmp_path):
     program.write_text("raise SystemExit(3)")
     with (
         workers.worker(sys.executable, program, tmp_path / "none") as ask,
-        pytest.raises(workers.PeerError, match=r"broken\.py ended with 3"),
+        pytest.raises(workers.PeerError, match=r"broken\.py ended with exit code 3"),
     ):
         ask(image_file="a")
 
@@ -182,7 +182,7 @@ def test_a_package_that_is_not_there_is_named(tmp_path, monkeypatch):
 
 
 def test_a_folder_without_torchbp_is_refused(tmp_path):
-    with pytest.raises(workers.PeerError, match="is no checkout of torchbp"):
+    with pytest.raises(workers.PeerError, match="is not a checkout of torchbp"):
         workers.built(tmp_path, codes.TORCH)
 
 
@@ -205,7 +205,7 @@ def test_rows_tell_what_was_measured_and_what_was_refused():
 
 @pytest.mark.slow
 def test_clsas_is_measured_by_its_own_program(platform):
-    """Exact and factorized images keep to what was asked, by the program that takes their time."""
+    """Images of the program that is timed satisfy their requests, exact and factorized."""
     here = codes.Code(sys.executable, SCRIPTS / "peers" / "with_clsas.py")
     chosen = [each for each in codes.methods([platform.info.label]) if each.code == "clsas"]
     found = compare.measure(scenes.straight(64), {"clsas": here}, chosen, repeats=1)
@@ -218,7 +218,7 @@ def test_clsas_is_measured_by_its_own_program(platform):
 
 @pytest.mark.parametrize("course_degrees", [0.0, 30.0])
 def test_displacements_of_the_other_frame_move_lines_as_they_are(course_degrees):
-    """A sway found along x of that frame is a sway of the lines, whatever their course."""
+    """A sway along x of that frame is a sway of the lines, whatever their course."""
     turn = np.radians(course_degrees)
     ahead, aside = [np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0]
     along_m = 0.1 * np.arange(-20, 21)[:, None]

@@ -14,7 +14,7 @@ STAGES = [[(2, 2)], [(3, 8)], [(8, 2)], [(2, 2)] * 3, [(4, 8), (2, 2)]]
 @pytest.mark.parametrize("stages", STAGES)
 @pytest.mark.parametrize("bistatic", [False, True])
 def test_errors_of_a_plan(stages, bistatic):
-    """Followed through the stages they stay below [45], by the place of the outermost channel."""
+    """The largest errors are those of [45], reduced by the position of the outermost channel."""
     grid = patch(-SIDE_M / 2, NEAREST_M, 1024, 1024, SIDE_M / 1024)
     tx = along_x(640, SPACING_M)
     lines = thesis_lines(grid, tx, beside(tx, 0.05, 0.0, 0.0) if bistatic else None)
@@ -26,9 +26,9 @@ def test_errors_of_a_plan(stages, bistatic):
     bounds_m = stage_errors_m(stages, SPACING_M, SIDE_M, NEAREST_M)
     shares = [(beams - 1) / beams for beams, _ in stages]
     expected_m = np.dot(bounds_m, shares)
-    # Oblique by up to 7 degrees: by up to 12 % more.
+    # Lines of sight are oblique by up to 7 degrees, which adds up to 12 %.
     assert 0.85 * expected_m <= np.abs(errors_m).max() <= 1.12 * expected_m
-    # Stages err independently: in power they add up to less than their maxima do.
+    # Errors of stages are independent, so their powers add up.
     rms_m = np.sqrt(np.mean(errors_m**2))
     spread = [
         (beams**2 - 1) / 3 / beams**2 * e**2 for (beams, _), e in zip(stages, bounds_m, strict=True)

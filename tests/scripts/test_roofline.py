@@ -1,4 +1,4 @@
-"""Main loops that are read from machine code, and processors that hide instructions."""
+"""Main loops found in machine code, and processors whose instructions are hidden."""
 
 import platform
 import shutil
@@ -16,7 +16,7 @@ needs_compiler = pytest.mark.skipif(
 )
 CPU = Path("/proc/cpuinfo")
 
-# Two loops within an outer one: the second has the most multiply-adds and reads the stack.
+# Two loops within an outer one. The second has the most multiply-adds and reads the stack.
 LOOPS = r"""
 void kernel(long n, const float *x) {
     __asm__ volatile(
@@ -56,7 +56,7 @@ def test_the_main_loop_is_found_and_counted(tmp_path):
 @needs_compiler
 @pytest.mark.skipif(not shutil.which("llvm-mca"), reason="needs llvm-mca")
 def test_a_loop_is_scheduled(tmp_path):
-    """Both multiply-adds write what they read: four or more cycles pass between two of them."""
+    """Both multiply-adds depend on their last result, so an iteration takes at least 4 cycles."""
     loop = roofline.main_loop(compiled(tmp_path, LOOPS, "-shared", "-fPIC"))
     cycles, port = roofline.scheduled(loop, "haswell")
     assert 4 <= int(cycles) <= 8

@@ -1,4 +1,4 @@
-"""Every script of scripts/thesis runs, on a small scene."""
+"""Every script in scripts/thesis runs on a small scene."""
 
 import csv
 import subprocess
@@ -53,7 +53,7 @@ def test_script_runs(script, tmp_path):
 
 
 def _points_beside_a_track():
-    """Return lines of the wreck's system from half its track: the wreck's take minutes."""
+    """Return lines of the wreck's system from half its track, since the wreck takes minutes."""
     x_m = np.arange(200) * 0.2 - 20
     track_m = np.stack([x_m, 0.05 * np.sin(x_m), 20 + 0 * x_m], axis=1)
     random = np.random.default_rng(0)

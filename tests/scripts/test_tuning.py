@@ -19,7 +19,7 @@ def test_every_constant_takes_turns_and_keeps_its_value(monkeypatch):
         assert len(row) == len(tuning.COLUMNS)
         assert float(row[2]) > 0
         assert float(row[4]) > 0
-    # The usual value is its own measure.
+    # The usual value is compared with itself.
     assert [row[3] for row in rows[::2]] == ["1.00"] * len(before)
     assert [row[5] for row in rows[::2]] == ["1.00"] * len(before)
 

@@ -1,4 +1,4 @@
-"""Ends of lines that do not fade, in images of both imagers."""
+"""Lines whose ends do not fade, in exact and factorized images."""
 
 import dataclasses
 import math
@@ -64,7 +64,7 @@ def test_ends_that_matter_little_or_are_not_reached_keep_the_tolerance(
 @pytest.mark.parametrize("accuracy_db", [-50, -60, -70])
 def test_exact_images_too_tell_of_ends_that_do_not_fade(cut_off, accuracy_db):
     lines, ((grid, exact), _) = cut_off
-    with pytest.warns(ClsasWarning, match=f"do not fade.* in place of accuracy_db {accuracy_db}"):
+    with pytest.warns(ClsasWarning, match=f"do not fade.* instead of accuracy_db {accuracy_db}"):
         image = clsas.backproject(lines, grid, accuracy_db=accuracy_db)
     predicted_db = prepare(lines, grid, accuracy_db=accuracy_db).predicted_error_db
     assert accuracy_db < predicted_db < -35
@@ -119,7 +119,7 @@ def test_thin_guard_bands_keep_what_is_asked(four_points, oversampling):
 def test_a_band_that_fills_all_that_is_sampled_is_told_with_the_numbers(four_points):
     echoes, grid, exact = four_points
     lines = clsas.compress(echoes, oversampling=1.0)
-    message = r"oversampling is 1\.0\d*, more than 1.05 is needed; the error may be -\d\d dB"
+    message = r"oversampling is 1\.0\d*, but must be above 1.05; the error may be -\d\d dB"
     with pytest.warns(ClsasWarning, match=message):
         image = clsas.backproject(lines, grid, accuracy_db=-80)
     predicted_db = prepare(lines, grid, accuracy_db=-80).predicted_error_db

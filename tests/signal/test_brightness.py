@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from cases import bright_where_coverage_ends
 
-from clsas.core.lines import wavelength_m
+from clsas.core.wavelengths import wavelength_m
 from clsas.signal.brightness import brightness
 from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow

@@ -40,7 +40,7 @@ def ranges(lines):
 
 
 def response(pulse, window, delay):
-    """Compressed point response by a fine sum over the band, no FFT: integral W |P|^2."""
+    """Return the compressed point response, integral W |P|^2, by a fine sum and no FFT."""
     f = (np.arange(20000) + 0.5) / 20000 * BAND - BAND / 2
     power = np.abs(pulse.spectrum(f)) ** 2
     if window == "hamming":
@@ -70,7 +70,7 @@ def test_compressed_line_is_the_closed_form(name, oversampling, window):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PULSES)
 def test_peak_is_at_the_range_with_amplitude_and_phase(name):
-    """Between the samples, by band-limited interpolation of the line itself."""
+    """The peak between samples is found by band-limited interpolation of the line."""
     amplitude = 2.0 * np.exp(0.3j)
     for y in (40.0, 40.0013, 40.0031):
         echoes = echoes_of(PULSES[name], [[0, y, 0]], amplitude, range_m=(30, 50))
@@ -191,7 +191,7 @@ def test_real_passband_gives_the_same_lines_as_baseband():
 
 
 def test_echoes_without_a_pulse_are_only_filtered():
-    """In-band tones pass as they are, out-of-band ones vanish."""
+    """Tones in the band pass unchanged, and others vanish."""
     rate, n = 400e3, 4000
     t = 0.01 + np.arange(n) / rate
     tones = np.exp(2j * np.pi * np.array([[20e3], [-45e3], [60e3]]) * t)
@@ -209,7 +209,7 @@ def test_echoes_without_a_pulse_are_only_filtered():
 
 
 def test_sampling_below_and_at_the_bandwidth():
-    """Critically sampled echoes keep their lines: the filter needs no room beside the band."""
+    """Critically sampled echoes can be compressed, without a guard band for the filter."""
     rate, n = BAND, 600
     t = np.arange(n) / rate
     echoes = Echoes(

@@ -53,7 +53,7 @@ def test_wrong_arguments_are_named(wrong, said):
 
 
 def test_a_band_whose_filter_is_too_long_for_memory_is_refused(monkeypatch):
-    """A band of 10 Hz at 1 MHz: FFTs of 18 million points, which take a GiB."""
+    """A band of 10 Hz at 1 MHz requires FFTs of 18 million points, which take a GiB."""
     monkeypatch.setattr(validate, "_memory_bytes", lambda: 1 << 29)
     with pytest.raises(
         ValueError, match=r"bandwidth_hz must ask for at most 0\.5 GiB, .* got 1\.0"

@@ -40,7 +40,7 @@ def test_weights_mirror_and_keep_a_constant(taps):
 
 @pytest.mark.parametrize("frequency", [0.0, 0.1, 0.25])
 def test_the_response_is_what_a_tone_of_upsampled_samples_keeps(frequency):
-    """On average over all places between samples, in cycles per upsampled sample."""
+    """It is the average over positions between samples, at cycles per upsampled sample."""
     interpolator = design(8, 1.5, flat(0.8))
     sample = np.arange(-40, 41)
     tone = np.exp(2j * np.pi * frequency * sample)
@@ -76,13 +76,13 @@ def test_more_taps_and_more_upsampling_err_less():
 
 @pytest.mark.parametrize(("taps", "gain_db"), [(2, 12.04), (4, 24.08)])
 def test_each_doubling_gains_the_order_of_the_filter(taps, gain_db):
-    """Linear interpolation errs by the second power of the spacing, four taps by the fourth."""
+    """The error is of second order in the spacing if linear, of fourth with four taps."""
     errors = [design(taps, upsampling, flat(0.8)).error_db for upsampling in (8, 16)]
     assert errors[0] - errors[1] == pytest.approx(gain_db, abs=0.1)
 
 
 def test_least_squares_beats_lagrange():
-    """The classical four-tap cubic is one of the filters that were to be had."""
+    """The four-tap cubic is among the filters over which least squares optimises."""
     upsampling, spectrum = 2.0, flat(0.8)
     f = spectrum.frequency[:, None, None] / upsampling
     offsets = np.array([-1.5, -0.5, 0.5, 1.5])
@@ -192,7 +192,7 @@ def test_designing_for_many_rates_is_designing_for_each(taps):
 
 @pytest.mark.parametrize("most_db", [-40.0, -75.0])
 def test_upsampling_filters_are_least_squares_fits(most_db):
-    """Of exp(j 2 pi f x) by taps, at every phase, weighted by the power."""
+    """They fit exp(j 2 pi f x) at every phase, weighted by the power."""
     spectrum = flat(0.7)
     found = upsampler(spectrum, 16, np.ones_like, most_db)
     weight = np.sqrt(spectrum.power + 1e-13)

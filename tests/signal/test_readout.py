@@ -1,4 +1,4 @@
-"""Range lines read between their samples."""
+"""Interpolation of range lines between their samples."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""How many pixels of an image of noise are independent, and how its power scatters."""
+"""The number of independent pixels of noise images, and the scatter of their power."""
 
 import dataclasses
 
@@ -42,7 +42,7 @@ def grid(width_m, depth_m, *, count=48):
 
 
 def relative_variance(lines, grid, amplitude, rng, *, draws=600):
-    """The variance of an image's mean power over its squared mean, by images of noise."""
+    """Return the variance over the squared mean of the mean power of noise images."""
     frequency = np.linspace(-BAND / 2, BAND / 2, 24)
     points_m = grid.spread(40)
     range_m = np.linalg.norm(points_m[:, None] - lines.tx_m, axis=-1)

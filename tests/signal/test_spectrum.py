@@ -4,8 +4,9 @@ from cases import noise
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import band_wavelength_m
 from clsas.exact.reference import ideal
-from clsas.signal.spectrum import band_wavelength_m, measure_spectrum
+from clsas.signal.spectrum import measure_spectrum
 
 
 def lines_of(samples):
@@ -27,7 +28,7 @@ def test_the_spectrum_is_measured_about_its_centre(centre, occupied):
 
 @pytest.mark.parametrize("mixed_hz", [0.0, 1.0, 20e3, 30e3])
 def test_the_wavelength_is_that_of_the_band_whatever_was_mixed_out(mixed_hz):
-    """30 kHz, sampled at 75 kHz."""
+    """The band lies at 30 kHz and is sampled at 75 kHz."""
     range_m = 10.0 + 0.01 * np.arange(500)
     turns = np.exp(-4j * np.pi * mixed_hz / 1500.0 * range_m)
     samples = noise(20, 500, occupied=0.2, centre=0.4) * turns
@@ -59,7 +60,7 @@ def test_the_spectrum_does_not_depend_on_the_unit(scale):
     "filled", [slice(None, 500, 10), slice(1, None, 4), slice(3, None, 8), slice(777, 778)]
 )
 def test_the_spectrum_is_that_of_the_channels_which_hold_anything(filled):
-    """Elements of an array may be dead, in regular steps."""
+    """Dead elements of an array may lie in regular steps."""
     samples = np.zeros((1000, 100), complex)
     samples[filled] = noise(len(samples[filled]), 200, occupied=0.4, centre=0.25)[:, 50:150]
     assert measure_spectrum(lines_of(samples)).centre == pytest.approx(0.25, abs=0.02)
@@ -69,7 +70,7 @@ def test_the_spectrum_is_that_of_the_channels_which_hold_anything(filled):
 @pytest.mark.parametrize("tilt_db", [0, 20, -20])
 @pytest.mark.parametrize("noise_db", [-200, -30])
 def test_the_centre_is_the_middle_of_the_occupied_band(occupied, tilt_db, noise_db):
-    """However the band is tilted, and in noise: so the guard band is as wide on both sides."""
+    """Tilt and noise do not matter, so that the guard band is equally wide on both sides."""
     rng = np.random.default_rng(3)
     frequency = np.fft.fftfreq(2000)
     gain = 10 ** (tilt_db / 20 * frequency / occupied) * (np.abs(frequency) < occupied / 2)
@@ -83,7 +84,7 @@ def test_the_centre_is_the_middle_of_the_occupied_band(occupied, tilt_db, noise_
 
 @pytest.mark.slow
 def test_a_common_offset_weighs_as_in_the_image():
-    """It adds up in phase over the image, echoes from everywhere do not."""
+    """The offset adds up in phase over the image, while echoes from everywhere do not."""
     x_m = 0.02 * np.arange(200)
     track = np.column_stack([x_m, 0 * x_m, 0 * x_m])
     band = noise(200, 1000, occupied=0.1, centre=0.35)

@@ -20,7 +20,7 @@ def with_box(height=2.0, offset=(0.0, 0.0, 0.0)):
 
 
 def marched(seabed, points, eye, steps=800):
-    """Whether the straight way clears the heights, by small steps along it."""
+    """Return whether straight lines of sight clear the heights, by small steps along them."""
     clear = np.ones(len(points), bool)
     # The last step and a half of the lattice on the ground belongs to the point itself.
     ground = np.linalg.norm(points[:, :2] - eye[:2], axis=1)
@@ -49,7 +49,7 @@ def test_shadows_are_those_of_marched_rays(eye):
     points[:, 2] = seabed.height_m(points[:, 0], points[:, 1])
     found, expected = seabed.lit(points, eye), marched(seabed, points, np.array(eye, float))
     assert 0.1 < 1 - expected.mean() < 0.7
-    # They differ only at edges, and there as often to one side as to the other.
+    # Differences lie only at edges of shadows, and equally often on either side.
     assert np.mean(found != expected) < 0.035
     assert abs(found.mean() - expected.mean()) < 0.007
     apart = points[found != expected]
@@ -65,7 +65,7 @@ def test_shadows_are_those_of_marched_rays(eye):
     ("height", "offset"), [(2, (0, 0, 0)), (3, (0, 0, -7)), (1, (4e5, 6e6, 3))]
 )
 def test_length_and_width_of_the_shadow_of_a_box(height, offset):
-    """Behind a box's far edge, at 26 m: h R/(H - h) long, and widening from the sonar on."""
+    """Behind the far edge of a box at 26 m, it is h R/(H - h) long and widens with range."""
     seabed = with_box(height, offset)
     points = lattice(seabed)
     lit = seabed.lit(points.reshape(-1, 3), EYE + offset).reshape(points.shape[:2])
@@ -160,13 +160,13 @@ def test_spheres_hold_what_is_seen():
         positions, _ = seabed.visible(observer)
         away = np.linalg.norm(positions[:, None] - centres, axis=-1) - radii
         assert away.min(axis=1).max() < 1e-9
-    # Of what is left out nothing is in the beam; of what is kept most is not far from it.
+    # No omitted scatterer is in the beam, and most of the others are not far from it.
     everything, _ = seabed.visible(Observer(EYE))
     assert len(positions) < 0.8 * len(everything)
     in_beam = np.abs(everything[:, 0]) < 0.05 * np.linalg.norm(everything - EYE, axis=1)
     kept = {tuple(p) for p in positions}
     assert all(tuple(p) in kept for p in everything[in_beam])
-    # Nothing in the beam: nothing is seen, but there is still somewhere to listen to.
+    # With nothing in the beam no point is visible, but there is still a receive window.
     blind = Observer(EYE, 0.0, lambda directions, slack: np.zeros(len(directions)))
     assert len(seabed.visible(blind)[0]) == len(seabed.visible(blind)[1]) == 0
     assert len(seabed.spheres(blind)[0]) > 0
@@ -219,7 +219,9 @@ def test_bad_seabeds(arguments, error, message):
 
 
 def test_a_seabed_without_scatterers():
-    with pytest.raises(ValueError, match="density_m2 must put some scatterer on the seabed"):
+    with pytest.raises(
+        ValueError, match="density_m2 must put at least one scatterer on the seabed"
+    ):
         Seabed(**GOOD, density_m2=1e-6).points  # noqa: B018
 
 

@@ -66,7 +66,7 @@ def test_antennas_at_phase_centres_are_those_of_a_monostatic_sonar():
 
 
 def test_a_seabed_looks_the_same_from_phase_centres():
-    """From the middle between antennas nothing else is lit or in shadow; ranges differ a little."""
+    """The same points are lit from the middle between antennas; ranges differ a little."""
     options = {"range_m": (25, 45)}
     apart, together = (
         simulate(SMOOTH, TRACK, box_on_sand(), phase_centres=on, **options) for on in (False, True)
@@ -79,7 +79,7 @@ def test_without_element_patterns_elements_have_no_sizes():
     sized = replace(SMOOTH, tx_length_m=0.015, rx_length_m=0.015, rx_height_m=0.01)
     without = simulate(sized, TRACK, SCENE, element_pattern=False)
     assert np.array_equal(without.samples, simulate(SMOOTH, TRACK, SCENE).samples)
-    with pytest.raises(ValueError, match="nothing to act on: element_pattern is off"):
+    with pytest.raises(ValueError, match="must be left out: element_pattern is off"):
         simulate(sized, TRACK, SCENE, element_pattern=False, pointing=Pointing.squint(0.1))
     for name in ("element_pattern", "phase_centres"):
         with pytest.raises(TypeError, match=f"{name} must be of type bool"):
@@ -107,7 +107,7 @@ def test_rectangular_chirp_through_the_receivers_filter(rate):
     expected = np.exp(2j * np.pi * f * (t[:, None] - tau)) @ spectrum * step
     expected *= 1j * np.exp(-2j * np.pi * CARRIER * tau)
     assert db(echoes.samples[0] - expected) < -100
-    # The filter is no small thing here: the plain rectangular pulse is far from it.
+    # The filter matters here: the echo differs strongly from a rectangular pulse.
     assert db(echoes.samples[0] - closed_form(echoes, PointTargets([[0.1, 30, 0]], [1j]))) > -30
 
 
@@ -208,7 +208,7 @@ def test_element_patterns_against_a_direct_sum(sizes, pointing):
 
 
 def test_patterns_are_frequency_dependent():
-    """At the null of the carrier the edges of the band still come through."""
+    """In the direction of the carrier's null, the edges of the band still pass."""
     sonar = replace(SMOOTH, rx_m=[[0, 0, 0]], rx_length_m=0.15)
     angle = np.arcsin(C / CARRIER / 0.15 * 5)
     scene = PointTargets([[40 * np.sin(angle), 40 * np.cos(angle), 0]])
@@ -238,7 +238,7 @@ def test_pointing_moves_the_beam():
 
 
 def test_window_given_cuts_and_never_wraps():
-    """Echoes that begin before, end after, lie beside: the window holds what lies in it."""
+    """Echoes begin before, end after or lie outside the window, which keeps its part."""
     near, far = 39.0, 40.0
     scene = PointTargets([[0, r, 0] for r in (1.0, 38.5, 39.2, 39.9, 40.3, 41.5, 500.0)])
     track = Track([[0, 0, 0]], [0.0])
@@ -265,7 +265,7 @@ def test_automatic_window_holds_every_echo():
 
 
 def test_rectangular_chirp_never_wraps():
-    """Its spectrum fills the whole band, so this is where ringing could come round."""
+    """The spectrum of the chirp fills the whole band, so that ringing could wrap around."""
     sonar = Sonar(Pulse(CARRIER, 100e3, 1e-3), [[0, 0, 0]])
     track = Track([[0, 0, 0]], [0.0])
     scene = PointTargets([[0, 40, 0]])
@@ -365,7 +365,7 @@ def box_on_sand(**others):
     ],
 )
 def test_a_seabed_sounds_like_its_points_that_are_seen(sonar, options):
-    """Ping by ping they are the point targets, and right to a third of the floor."""
+    """In every ping the echoes are those of the visible points, to a third of the floor."""
     seabed = box_on_sand(floor_db=-60)
     echoes = simulate(sonar, SWATH, seabed, **options)
     for ping in range(SWATH.pings):
@@ -422,7 +422,7 @@ def test_echoes_of_several_parts_add():
     noisy = simulate(NARROW, SWATH, (seabed, targets), **limits, snr_db=20.0).samples
     ratio = np.abs(both).max() ** 2 / np.mean(np.abs(noisy - both) ** 2)
     assert 10 * np.log10(ratio) == pytest.approx(20, abs=0.3)
-    # In single precision or not, a part is summed by its own error only.
+    # The accuracy of a part's sum depends only on that part's own error.
     alone = simulate(NARROW, SWATH, targets, **limits).samples
     np.testing.assert_array_equal(alone, simulate(NARROW, SWATH, (targets,), **limits).samples)
 
@@ -451,7 +451,7 @@ def test_result_does_not_depend_on_threads_or_groups(monkeypatch):
 
 def test_a_seabed_behind_the_sonar_is_silent():
     track = Track([[0, 80, 10.0]], [0.0])
-    with pytest.warns(ClsasWarning, match="no echo falls within the receive window"):
+    with pytest.warns(ClsasWarning, match="no echo arrives within the receive window"):
         assert not simulate(NARROW, track, box_on_sand()).samples.any()
 
 
@@ -598,7 +598,7 @@ def test_points_outside_a_line_give_it_nothing():
         ({"range_m": (0, 1e12)}, ValueError, r"range_m must ask for at most .* GiB, .* got .* GiB"),
         ({"range_m": (0, 1e308)}, ValueError, "range_m must ask for at most .* got inf GiB"),
         ({"workers": 0}, ValueError, "workers must be at least 1, got 0"),
-        ({"pointing": Pointing.squint(0.1)}, ValueError, "pointing has nothing to act on"),
+        ({"pointing": Pointing.squint(0.1)}, ValueError, "pointing must be left out"),
     ],
 )
 def test_bad_arguments(arguments, error, message):
@@ -622,12 +622,12 @@ def test_platform_faster_than_sound():
 
 
 def test_nothing_in_the_window():
-    with pytest.warns(ClsasWarning, match="no echo falls within the receive window"):
+    with pytest.warns(ClsasWarning, match="no echo arrives within the receive window"):
         echoes = simulate(SMOOTH, TRACK, SCENE, range_m=(100, 110))
     assert not echoes.samples.any()
     with (
         pytest.warns(ClsasWarning),
-        pytest.raises(ValueError, match="snr_db needs an echo to refer to"),
+        pytest.raises(ValueError, match="snr_db must be left out without an echo"),
     ):
         simulate(SMOOTH, TRACK, SCENE, range_m=(100, 110), snr_db=10)
 

@@ -21,7 +21,7 @@ NEAR = around(0, 40)
 LINES = lines_over(NEAR, along_x(200, 0.02), None, carrier_hz=120e3, step_m=0.02)
 FAR = around(0, 90)
 ASIDE = around(30, 25)
-"""At ranges of the lines, 50 degrees ahead."""
+"""Grid within the range of the lines, 50 degrees ahead."""
 
 
 def heard(form):
@@ -60,14 +60,14 @@ def test_whoever_is_asked_warns_once_of_a_grid_that_no_line_reaches(grid, beam):
 
 @pytest.mark.parametrize("pixels", [(0, 0), (3, 77), (149, 159)])
 def test_nothing_is_said_where_one_pixel_of_many_is_reached(pixels):
-    """Between the points that are looked at first."""
+    """The pixel lies between the points of the quick test."""
     points_m = np.tile(FAR.positions_m()[:1, :1], (150, 160, 1))
     points_m[pixels] = 0, 40, 0
     assert heard(lambda: plan(LINES, Grid.points(points_m), tolerance_db=-40)) == []
 
 
 def test_nothing_is_said_of_a_narrow_strip_of_a_large_plane():
-    """A beam of a degree from a track of centimetres, over pixels metres apart."""
+    """The beam is one degree wide, the track centimetres long, and pixels metres apart."""
     short = LINES.select(slice(0, 2))
     grid = Grid.plane(x=(-1000.3, 1000, 700), y=(30, 60, 300))
     assert heard(lambda: plan(short, grid, tolerance_db=-40, beam=BeamWindow(1.0))) == []
@@ -83,7 +83,7 @@ def test_nothing_is_said_of_lines_of_zeros():
 
 @pytest.mark.parametrize("speed", [15.0, 450.0, 1350.0])
 def test_lines_of_fast_receivers_reach_the_pixels_in_their_range(speed):
-    """Seen from behind, ranges change faster than distances."""
+    """Behind a moving receiver, range changes faster than distance."""
     grid = Grid.plane((-80, 0, 81), (0, 20, 21))
     tx, velocity = np.zeros((1, 3)), np.array([[speed, 0, 0]])
     points_m = grid.positions_m().reshape(-1, 3)[1::7]

@@ -53,7 +53,7 @@ def test_a_direction_that_is_given_is_made_a_unit():
 
 
 def test_directions_of_legs():
-    """Each leg has its own, up to its ends."""
+    """Each leg has its own direction up to its ends."""
     leg = np.zeros((60, 3))
     leg[:, 0] = np.linspace(0, 30, 60)
     across = leg[:, [1, 0, 2]] + [40, 5, 0]

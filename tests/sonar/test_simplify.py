@@ -1,4 +1,4 @@
-"""Effects that an image does without: only where no pixel can tell, and then they cost nothing."""
+"""Effects are left out only if no pixel changes noticeably, and then they cost nothing."""
 
 import json
 from dataclasses import replace
@@ -33,7 +33,7 @@ PIXELS = np.random.default_rng(0).permutation(FLAT.size)[:250]
 
 @pytest.fixture(autouse=True)
 def small_images_count(monkeypatch):
-    """Images as large as are worth it take long to check."""
+    """Simplify small images too, because larger ones take long to check."""
     monkeypatch.setattr("clsas.sonar.simplify.LEAST_PIXELS", LEAST_PIXELS)
 
 
@@ -50,7 +50,7 @@ def moving():
 
 
 def moving_and_apart():
-    """Receivers so far from their transmitters that only their motion can be left out."""
+    """Return receivers so far from transmitters that only motion can be left out."""
     rx_m = beside(APERTURE, 0.6, 0.0, 0.2)
     return lines_on(FLAT, APERTURE, rx_m, velocity=[[0.004, 0, 0]] * CHANNELS), FLAT, None
 
@@ -91,11 +91,11 @@ ALL = pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
 
 @cache
 def made(case):
-    """Lines, grid and beam, what leaves out an effect at the loosest, and where that begins, dB."""
+    """Return lines, grid, beam, the simplest model, and the accuracy at which it begins, dB."""
     lines, grid, beam = case()
     model = simplify(lines, grid, beam, -0.1)
     assert model.left_out == CASES[case] or case is moving_and_apart
-    if case is moving_and_apart:  # transmitters are merged too where anything is allowed
+    if case is moving_and_apart:  # transmitters are merged too if any error is allowed
         model = next(
             m
             for db in np.arange(-1, -70, -1.0)
@@ -172,7 +172,7 @@ def test_factorized_images_keep_their_tolerance_on_either_side(case, beside_db, 
 
 
 def test_plans_with_stages_leave_out_the_same(platform):
-    """Of a plan that does factorize, with other samples and after a round trip through JSON."""
+    """So do images with other samples, and with a plan that was read back from JSON."""
     lines, grid, _, model, begins_db = made(apart)
     chosen = plan(lines, grid, tolerance_db=-40, depth=1, device=platform)
     assert begins_db < -40
@@ -187,7 +187,7 @@ def test_plans_with_stages_leave_out_the_same(platform):
     assert np.array_equal(factorize(lines, grid, read, device=platform).pixels, first.pixels)
     twice = factorize(replace(lines, samples=2 * lines.samples), grid, chosen, device=platform)
     assert relative_error_db(twice.pixels, 2 * first.pixels) < -55
-    with pytest.raises(ValueError, match="another line geometry"):
+    with pytest.raises(ValueError, match="lines must have the geometry"):
         factorize(model.lines, grid, chosen, device=platform)
 
 
@@ -216,7 +216,7 @@ def test_the_error_of_what_is_left_out_is_predicted():
 
 
 def test_an_image_without_the_effect_has_nothing_to_model():
-    """No velocities, one antenna: what the kernels' options and uploads follow from."""
+    """Kernel options and uploads then know neither velocities nor a second antenna."""
     lines, grid, *_, begins_db = made(everything)
     preparation = prepare(lines, grid, accuracy_db=min(begins_db + 7, -1))
     assert preparation.lines.rx_velocity_m_s is None
@@ -255,14 +255,14 @@ def test_small_images_are_not_worth_a_fit():
 
 
 def test_pixels_next_to_an_antenna_keep_both():
-    """Ranges bend there between the points at which they are compared."""
+    """Near an antenna, range is nonlinear between the points at which it is compared."""
     grid = Grid.plane((-0.9, 0.9, 192), (0.05, 1.0, 192))
     lines = lines_on(grid, APERTURE, beside(APERTURE, 1e-4, 0, 0))
     assert simplify(lines, grid, None, -10).left_out == ()
 
 
 def test_one_rock_on_a_plane_is_relief():
-    """It may be all that echoes, however few its pixels are."""
+    """The rock may be the only reflector, however few its pixels are."""
     height_m = np.zeros((192, 192))
     height_m[101, 77] = 0.05
     lines = lines_on(DEEP, APERTURE)
@@ -285,14 +285,14 @@ def test_points_that_coincide_are_no_plane():
 
 
 def test_a_beam_looks_where_the_given_antennas_do():
-    """Antennas that are moved hide which channels are one ping, and so where the track leads."""
+    """Fitted antennas no longer show pings, from which the track's direction follows."""
     lines, _grid, beam, model, _ = made(with_beam)
     assert np.allclose(model.beam.along, beam.directions(lines))
     assert not np.allclose(beam.directions(model.lines), beam.directions(lines), atol=1e-9)
 
 
 def test_steps_of_a_beam_are_not_moved():
-    """A rectangular one takes channels in or out at its edges."""
+    """Shifting the edges of a rectangular beam would add or drop channels."""
     lines, grid, beam, _, _begins_db = made(with_beam)
     rx_m = beside(lines.rx_m, 0.0, 0.0, 0.0)
     moving_lines = replace(lines, rx_m=rx_m, rx_velocity_m_s=np.tile([0.5, 0, 0], (CHANNELS, 1)))
@@ -324,7 +324,7 @@ def test_images_in_pieces_still_add_up(platform):
 
 
 def random_survey(seed):
-    """Antennas, motion and a grid of any kind and size, in metres up to thousands, and a beam."""
+    """Return random antennas, motion, a beam, and a grid of any kind, up to kilometres wide."""
     random = np.random.default_rng(seed)
 
     def magnitude(least, most):
@@ -374,7 +374,7 @@ def random_survey(seed):
 
 @pytest.mark.slow
 def test_no_geometry_leaves_out_more_than_is_allowed(monkeypatch):
-    """Every pixel and channel that see each other, of surveys that nobody would make."""
+    """Check all pixels and their visible channels in unusual random surveys."""
     monkeypatch.setattr("clsas.sonar.simplify.LEAST_PIXELS", 1000)
     left_out = set()
     for seed in range(150):

@@ -32,7 +32,7 @@ def some_boxes(count, largest_m, seed=2):
 
 
 def touched(beam, boxes, position_m, along, points=400, seed=3):
-    """Return which positions see any of many points in boxes, their corners among them."""
+    """Return the positions whose beam touches any of many points in boxes, corners included."""
     rng = np.random.default_rng(seed)
     inside = rng.uniform(-1, 1, (points, 3))
     inside[: points // 2] = np.sign(inside[: points // 2])  # corners
@@ -74,7 +74,7 @@ def test_few_other_positions_are_found(name):
 
 @pytest.mark.parametrize("name", BEAMS)
 def test_runs_find_what_single_positions_find(name):
-    """Coarse to fine, the answer is that of testing every position."""
+    """Searching from coarse to fine finds the same positions as testing every one."""
     boxes = some_boxes(100, 1.0)
     position_m, along = bent_track(1000)
     track = BeamTrack(BEAMS[name].limits, position_m, along)
@@ -93,7 +93,7 @@ def test_runs_find_what_single_positions_find(name):
 
 
 def test_boxes_touched_between_positions_only_are_within_a_run():
-    """A beam narrower than the step from position to position."""
+    """The beam is narrower than the step between positions."""
     x_m = np.arange(0, 32.0)
     position_m = np.stack([x_m, 0 * x_m, 0 * x_m], axis=1)
     along = np.tile([1.0, 0, 0], (len(x_m), 1))
@@ -114,7 +114,7 @@ def test_there_may_be_no_boxes():
 
 
 def test_a_position_inside_a_box_sees_the_corner_behind():
-    """The beam looks away from the box's centre, at what little of the box is there."""
+    """The beam points away from the centre of the box, at a small corner of it."""
     position_m = np.array([[0.97, 0.97, 0.0]])
     along = np.array([[1.0, 1.0, 0.0]]) / np.sqrt(2)
     boxes = Boxes(np.zeros((1, 3)), np.eye(3), np.array([[1.0, 1.0, 0.0]]))

@@ -17,7 +17,7 @@ SMALL = cases.Case(200, 8.25e-3, 1e6, 100e3, (-0.3, 0.3), (40.0, 40.6), 128)
 
 
 def test_cases_are_sampled():
-    """Channels and pixels are close enough for the beam, the grid and the band."""
+    """Channels and pixels are dense enough for the beam and the band."""
     for name, case in cases.FACTORIZED_CASES.items():
         if name in cases.DENSE_CASES:
             continue
@@ -98,7 +98,7 @@ def test_scaling_fits_exponents_and_writes_them(monkeypatch, tmp_path, capsys):
     pytest.importorskip("matplotlib")
 
     def measured(case, **_):
-        """Times that grow as N^2 and N^3."""
+        """Times that are proportional to N^2 and N^3."""
         n = case.pixels / 256
         figures = dict.fromkeys(["plan_seconds", "error_db", "predicted_error_db"], -50.0)
         times = {"seconds": {"median": 0.1 * n**2}, "exact_seconds": {"median": n**3}}

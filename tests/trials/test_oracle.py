@@ -25,7 +25,7 @@ def test_it_imports_nothing_but_numpy():
 
 @pytest.mark.parametrize("tilt_db", [0.0, -10.0, 30.0])
 def test_a_pulse_has_the_spectrum_that_it_names(tilt_db):
-    """A long sampled pulse, transformed: a tilted box with Gaussian edges."""
+    """The transform of a long sampled pulse is a tilted box with Gaussian edges."""
     step, count = 0.01, 4096
     band = Band(centre=20.0, width=30.0, edge=0.3, level=2.0 - 1j, tilt_db=tilt_db)
     offset = (np.arange(count) - count // 2) * step
@@ -56,7 +56,7 @@ def test_ranges_of_moving_receivers_solve_the_quadratic():
 
 
 def test_lines_sampled_at_the_ranges_of_pixels_are_the_image():
-    """The carrier that sampling mixes out is the phase that imaging restores."""
+    """Sampling mixes out the same carrier phase that imaging restores."""
     x = np.linspace(-0.5, 0.5, 9)
     tx = np.stack([x, 0 * x, 0 * x], axis=1)
     echoes = [Echo(oracle.ranges_m([[0.1, 8, 0]], tx, tx), 1.5j, [Band(60.0, 10.0, 0.1)])]

@@ -1,4 +1,4 @@
-"""The test that users run on their own devices."""
+"""The self-test that users run on their devices."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from clsas.trials import selftest
 
 @pytest.fixture
 def small(monkeypatch):
-    """One exact and one factorized image on the device as it is."""
+    """Run one exact and one factorized image, without variants of the device."""
     monkeypatch.setattr(selftest, "other_builds", lambda info: [])
     monkeypatch.setattr(
         selftest, "_CHECKS", (("flat", "exact", -60.0), ("flat", "factorized", -40.0))
@@ -22,7 +22,7 @@ def small(monkeypatch):
 
 @pytest.mark.slow
 def test_every_image_is_within_its_bound(platform, monkeypatch):
-    """With vectors and with one lane; other ways to drive a CPU are tested elsewhere."""
+    """With the default vectors and with one lane; other tests cover the other builds."""
     monkeypatch.setattr(selftest, "_BUILDS", ((1, False),))
     told = []
     results = selftest.run(platform, progress=lambda *done: told.append(done))
@@ -34,7 +34,7 @@ def test_every_image_is_within_its_bound(platform, monkeypatch):
 
 @pytest.mark.slow
 def test_other_builds_for_a_device_are_tested_too(platform, monkeypatch):
-    """One lane on every image whose imager runs kernels, other widths on two."""
+    """One lane forms every image whose imager runs kernels, other widths form two."""
     checks = (("bistatic", "exact", -60.0), ("flat", "wavenumber", None))
     monkeypatch.setattr(selftest, "_CHECKS", checks)
     monkeypatch.setattr(selftest, "other_builds", lambda info: [(1, False), (4, False)])
@@ -49,7 +49,7 @@ def test_other_builds_for_a_device_are_tested_too(platform, monkeypatch):
 
 @pytest.mark.slow
 def test_plans_of_the_scenes_are_factorized(platform):
-    """Else the factorized imager would not be tested."""
+    """Otherwise the factorized imager would not be tested."""
     for scene, imager, asked_db in selftest._CHECKS:
         if imager == "factorized":
             known = selftest._SCENES[scene]()

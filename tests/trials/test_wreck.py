@@ -1,4 +1,4 @@
-"""The wreck's scene: what its range lines are kept as, and its shadow's contrast."""
+"""The wreck's scene: the cache of its range lines, and the contrast of its shadow."""
 
 import numpy as np
 import pytest
@@ -33,12 +33,12 @@ def test_contrast_is_that_of_the_masks(shadow):
     column = np.rint((ground[dark, 0] - x_m[0]) / (x_m[1] - x_m[0])).astype(int)
     row = np.rint((ground[dark, 1] - y_m[0]) / (y_m[1] - y_m[0])).astype(int)
     pixels[row, column] = 0.1j
-    # Of the pixels at the shadow's edge some are its own.
+    # Some pixels at the edge of the shadow belong to it.
     assert shadow.contrast_db(Image(pixels, grid)) == pytest.approx(20, abs=0.2)
 
 
 def few_lines():
-    """Noise in every channel, in place of a minute's simulation."""
+    """Replace the simulation, which takes minutes, by noise."""
     tx_m = np.zeros((120, 3))
     tx_m[:, 0] = np.linspace(-20, 20, 120)
     tx_m[:, 2] = 20
@@ -56,7 +56,7 @@ def test_lines_are_simulated_once(monkeypatch, tmp_path):
     assert asked == [1]
     np.testing.assert_array_equal(first.samples, second.samples)
     (kept,) = (tmp_path / "cache").iterdir()
-    kept.write_bytes(kept.read_bytes()[:1000])  # what is damaged is made again
+    kept.write_bytes(kept.read_bytes()[:1000])  # a damaged file is replaced
     wreck.lines()
     assert asked == [1, 1]
 

@@ -1,1 +1,1 @@
-"""Valid calls of the public API, hostile values for their arguments, and the judgement."""
+"""Valid calls of the public API, hostile values for arguments, and the check of outcomes."""

@@ -73,7 +73,7 @@ def files(folder: Path) -> dict[str, Call]:
             accepts=dict.fromkeys(("output", "steps", "progress"), optional)
             | {"lines": ("None", "RangeLines")},
         ),
-        # Neither looks whether anything is there.
+        # Neither checks whether the path exists.
         "Store": Call(clsas.Store, {"path": folder / "store.zarr"}, accepts={"path": ("long",)}),
         "Store.at": Call(
             clsas.Store.at,

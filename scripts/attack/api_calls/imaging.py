@@ -1,4 +1,4 @@
-"""Valid calls of imagers, plans, measures of images and navigation."""
+"""Valid calls of imagers, plans, image measures and navigation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import scipy.io
 
 import clsas
-from api_calls.scene import EMPTY, LARGE, Call, fields, nothing, scene
+from api_calls.scene import EMPTY, LARGE, Call, nothing, scene
 from clsas.planning.costs import Costs
 
 
@@ -84,12 +84,29 @@ def imaging(folder: Path) -> dict[str, Call]:
             names=scene_names,
             accepts=dict.fromkeys(("beam", "memory_bytes", "costs"), optional) | {"stages": EMPTY},
         ),
-        "Plan": Call(
-            clsas.Plan,
-            fields(plan),
-            kinds=dict.fromkeys(("lines_digest", "grid_digest"), "text"),
-            accepts={"tolerance_db": ("None", "number"), "beam": optional},
-            skips={"left_out": ("list", "int array")},
+        "Imager": Call(
+            clsas.Imager,
+            whole | {"plan": plan, "device": 0},
+            kinds=device,
+            names=scene_names,
+        ),
+        "Imager:tolerance": Call(
+            clsas.Imager,
+            whole | {"tolerance_db": -30.0, "beam": beam},
+            names=scene_names,
+            accepts={"beam": optional},
+        ),
+        "Imager:accuracy": Call(
+            clsas.Imager,
+            whole | {"accuracy_db": -50.0, "beam": beam},
+            names=scene_names,
+            accepts={"beam": optional},
+        ),
+        "Imager.close": Call(clsas.Imager(lines, grid, plan).close, {}),
+        "Imager()": Call(
+            clsas.Imager(lines, grid, accuracy_db=-50.0),
+            {"lines": lines, "accumulate": s.image, "progress": nothing},
+            accepts=dict.fromkeys(("accumulate", "progress"), optional),
         ),
         "plan:tolerance": Call(
             clsas.plan,
@@ -122,11 +139,9 @@ def imaging(folder: Path) -> dict[str, Call]:
             names=scene_names | {"plan_or_tolerance": ("tolerance_db",)},
             accepts={"beam": optional},
         ),
-        "Plan.changed": Call(plan.changed, {"half_precision": False}),
         "Plan.check": Call(plan.check, whole),
         "Plan.describe": Call(plan.describe, {}),
         "Plan.from_json": Call(clsas.Plan.from_json, {"text": plan.to_json()}),
-        "Plan.moved": Call(plan.moved, {"lines": lines}),
         "Plan.to_json": Call(plan.to_json, {"filters": True}),
         "assess": Call(
             clsas.assess,
@@ -259,7 +274,7 @@ def imaging(folder: Path) -> dict[str, Call]:
 
 
 def _anew(store: Path) -> Callable[..., clsas.Mosaic]:
-    """Return `clsas.mosaic`, which first removes the store that the last call left."""
+    """Return `clsas.mosaic`, preceded by the removal of the store that the last call left."""
 
     def mosaic(**given: Any) -> clsas.Mosaic:
         shutil.rmtree(store, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""The attack itself: every value for every argument of every valid call, and what comes of it."""
+"""The attack itself: every value for every argument of every valid call, and its outcome."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ GROUPS: dict[str, Callable[[Path], dict[str, Call]]] = {
     "results": files.results,
     "pictures": pictures.pictures,
 }
-"""What makes the valid calls of each group; their files lie in a folder."""
+"""Function that returns the valid calls of each group, given a folder for their files."""
 
 ATTACKED = (
     clsas.BeamWindow, clsas.Echoes, clsas.Grid, clsas.Image, clsas.PointTargets, clsas.Pointing,
     clsas.Pulse, clsas.RangeLines, clsas.Replica, clsas.Seabed, clsas.Sonar, clsas.Track,
 )  # fmt: skip
-"""Classes whose properties are read too, where a call returns one of their objects."""
+"""Classes whose properties are also read if a call returns one of their objects."""
 
 
 def table(group: str, folder: Path) -> dict[str, Call]:
-    """Return the valid calls of a group by their names in `public`."""
+    """Return the valid calls of a group, by their names in `public`."""
     with _quiet():
         write_files(folder)
         return GROUPS[group](folder)
@@ -57,10 +57,10 @@ def attack(
     skip: Sequence[str] = (),
     every: int = 1,
 ) -> Iterator[dict[str, Any]]:
-    """Attack the calls of a group; yield every call before and after it is made.
+    """Attack the calls of a group, and yield every call before and after it is made.
 
-    Only names that begin with `only` are attacked, only an argument if one is given, and not the
-    calls of `skip`. Of the values one in `every` is taken.
+    Only names that begin with `only` are attacked, only `argument` if it is given, and none of the
+    calls in `skip`. One value in `every` is tried.
     """
     found = {name: call for name, call in table(group, folder).items() if name.startswith(only)}
     others = objects(folder) if found else {}
@@ -83,7 +83,7 @@ def attack(
 def values_for(
     call: Call, which: str, given: Any, others: dict[str, Any], folder: Path
 ) -> Iterator[Value]:
-    """Return the values to attack an argument with, and what each must come to."""
+    """Yield the values with which an argument is attacked, and their expected outcomes."""
     kind = _kind(call, which)
     parameter = inspect.signature(call.function).parameters.get(which)
     optional = given is None or (parameter is not None and parameter.default is None)
@@ -95,22 +95,22 @@ def values_for(
 
 
 def arguments_of(call: Call) -> list[str]:
-    """Return the names of a call's parameters, those of `**options` aside."""
+    """Return the names of a call's parameters, except `**options`."""
     parameters = inspect.signature(call.function).parameters.values()
     return [each.name for each in parameters if each.kind is not each.VAR_KEYWORD]
 
 
 def _kind(call: Call, which: str) -> str:
-    """Return the kind of an argument; windows have one name everywhere."""
+    """Return the kind of an argument; windows and devices are recognised by their name."""
     by_name = {"window": "window", "device": "device"}.get(which)
     return call.kinds.get(which) or by_name or kind_of(call.arguments[which])
 
 
 def outcome(call: Call, which: str, value: Value, valid: Result) -> Failure | None:
-    """Make a call with one argument replaced; return what is wrong with what comes of it."""
+    """Return the failure of a call with one argument replaced, or None if it passes."""
     given = call.arguments[which]
     names = (which, *call.names.get(which, ()), *_parts_of(given))
-    if value.expected == EITHER:  # which of several arguments is wrong may be open
+    if value.expected == EITHER:  # the message may blame another of the arguments
         names += tuple(call.arguments)
     arguments = call.arguments | {which: value.value}
     with _quiet():
@@ -122,14 +122,14 @@ def outcome(call: Call, which: str, value: Value, valid: Result) -> Failure | No
 
 
 def _parts_of(given: Any) -> tuple[str, ...]:
-    """Names of an object's own fields, which a message may name in place of the argument."""
+    """Return the names of an object's fields, which a message may name instead of the argument."""
     if type(given).__module__.startswith("clsas"):
         return tuple(getattr(type(given), "__dataclass_fields__", ()))
     return ()
 
 
 def _properties(result: Any) -> Failure | None:
-    """Return what is wrong with the properties of an object that a call returned."""
+    """Return the failure of a property of an object that a call returned, or None."""
     if not isinstance(result, ATTACKED):
         return None
     for name, read in properties(result):
@@ -137,14 +137,14 @@ def _properties(result: Any) -> Failure | None:
             if Result(read()).nan:
                 return Failure("returns NaN", f"in the property {name}")
         except (ValueError, TypeError):
-            continue  # documented, such as axes of points
+            continue  # documented, for example for the axes of points
         except Exception as error:
             return Failure("wrong exception", f"property {name}: {type(error).__name__}: {error}")
     return None
 
 
 class _quiet(warnings.catch_warnings):
-    """Without warnings, which an attack is not about."""
+    """Context without warnings, which do not matter here."""
 
     def __enter__(self) -> Any:
         entered = super().__enter__()

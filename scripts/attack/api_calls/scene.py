@@ -1,4 +1,4 @@
-"""The calls to make, and the tiny scene and files that they are made on."""
+"""Descriptions of calls, and the tiny scene and files that the calls use."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from clsas.planning.costs import Costs
 
 RESULTS = (
     "Assessment", "Autofocus", "Calibration", "Effect", "Finding", "Inspection", "Micronavigation",
-    "Mosaic", "Patch", "PhaseSign", "Processed", "Tradeoff",
+    "Mosaic", "Patch", "PhaseSign", "Plan", "Processed", "Tradeoff",
 )  # fmt: skip
-"""Classes of which only clsas makes objects: their constructors check nothing."""
+"""Classes whose constructors check nothing, since only clsas calls them."""
 
 LARGE = ("2.15e+09", "9.22e+18")
-"""Numbers of repetitions that nothing forbids, but that nobody can wait for."""
+"""Numbers of repetitions that are valid, but take too long."""
 EMPTY = ("empty list", "empty array")
-"""Values that functions of every element accept: what they return is empty too."""
+"""Values that elementwise functions accept, and for which they return an empty result."""
 
 
 @dataclass(frozen=True)
 class Call:
-    """A valid call, and what is special about its arguments.
+    """A valid call, and special properties of its arguments.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ def _methods(kind: type) -> Iterator[str]:
 
 
 def objects(folder: Path) -> dict[str, Any]:
-    """Return an object of many public classes: none is allowed in place of another."""
+    """Return objects of many public classes, none of which may replace another."""
     s = scene(folder)
     return {
         "a Grid": s.grid,
@@ -96,7 +96,7 @@ def objects(folder: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Scene:
-    """A sonar of one receiver that passes two points, and what is made of its echoes."""
+    """A sonar with one receiver that passes two points, and the products of its echoes."""
 
     sonar: clsas.Sonar
     track: clsas.Track
@@ -112,7 +112,7 @@ class Scene:
 
 @cache
 def scene(folder: Path) -> Scene:
-    """Return the scene, made once."""
+    """Return the scene, which is made once."""
     sonar = clsas.Sonar(
         clsas.Pulse(100e3, 20e3, 1e-3), [[0.0, 0.0, 0.0]], tx_length_m=0.1, rx_length_m=0.1
     )
@@ -130,12 +130,12 @@ def scene(folder: Path) -> Scene:
 
 
 def fields(obj: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass, as its constructor takes them."""
+    """Return the fields of a dataclass as arguments of its constructor."""
     return {each.name: getattr(obj, each.name) for each in dataclasses.fields(obj) if each.init}
 
 
 def nothing(*_: Any) -> None:
-    """Take progress."""
+    """Accept a progress report."""
 
 
 def axes() -> Any:
@@ -169,7 +169,7 @@ lines = "lines.h5"
 
 
 def write_files(folder: Path) -> None:
-    """Write the small files that readers are attacked with."""
+    """Write the small files with which readers are attacked."""
     s = scene(folder)
     random = np.random.default_rng(0)
     (folder / "folder").mkdir(exist_ok=True)

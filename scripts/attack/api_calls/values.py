@@ -1,8 +1,8 @@
-"""Values to attack an argument with, and the judgement of what a call makes of them.
+"""Values with which arguments are attacked, and the check of the outcomes.
 
-Every value has a verdict to expect. "refused": wrong for an argument of this kind, so that the call
-must raise. "equal": means the same as the valid value, so that the result must too. "either": the
-call may refuse it or accept it, but then nothing that it returns may be NaN.
+Every value has an expected outcome. "refused": the value is wrong for this kind of argument, so the
+call must raise. "equal": the value is equivalent to the valid one, so the result must be equal.
+"either": the call may refuse the value or accept it, but the result must not contain NaN.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ import numpy as np
 import clsas
 
 REFUSED, EQUAL, EITHER = "refused", "equal", "either"
-LOOSE = 3e-3  # relative difference that float16 makes of a value
-DEEPEST = 6  # levels of fields in a result that are looked at
+LOOSE = 3e-3  # relative difference, more than rounding to float16 causes
+DEEPEST = 6  # levels of fields in a result that are compared
 
 
 class Value(NamedTuple):
-    """A value, how it is called in reports, and what must come of it."""
+    """A value, its label in reports, and its expected outcome."""
 
     label: str
     value: Any
     expected: str
-    tolerance: float = 0.0  # of the result, relative to the valid one, where they must be equal
+    tolerance: float = 0.0  # relative, for results that must be equal
 
 
 class Foreign:
-    """An object that no function of clsas knows."""
+    """An object of a class that no function of clsas accepts."""
 
     def __repr__(self) -> str:
-        """Return a name that does not change from run to run."""
+        """Return a name that is the same in every run."""
         return "<Foreign>"
 
 
 def _function(*_: Any) -> None:
-    """Take anything."""
+    """Accept any arguments."""
 
 
 GARBAGE: dict[str, Any] = {
@@ -77,7 +77,7 @@ NUMBERS: dict[str, Any] = {
 
 
 def values_of(kind: str, valid: Any, others: Mapping[str, Any], folder: Path) -> Iterator[Value]:
-    """Return the values to attack an argument of a kind with; `others` are objects of clsas."""
+    """Yield the values for an argument of a given kind; `others` are objects of clsas."""
     garbage = [Value(label, value, REFUSED) for label, value in GARBAGE.items()]
     garbage += [
         Value(name, value, REFUSED)
@@ -159,7 +159,7 @@ def _choice(valid: str, garbage: list[Value], folder: Path) -> Iterator[Value]:
 
 
 def _window(valid: str, garbage: list[Value], folder: Path) -> Iterator[Value]:
-    """Return values for windows of SciPy, which are names, numbers or tuples of both."""
+    """Yield values for windows of SciPy, which are names, numbers or tuples of both."""
     for value in _choice(valid, garbage, folder):
         yield value._replace(expected=EITHER) if value.label == "number" else value
 
@@ -248,7 +248,7 @@ def _read_only(given: np.ndarray) -> np.ndarray:
 
 
 def _parts(valid: Any, garbage: list[Value], folder: Path) -> Iterator[Value]:
-    """Return values for tuples of numbers, counts or names, such as (start, stop, count)."""
+    """Yield values for tuples of numbers, counts or names, such as (start, stop, count)."""
     yield from garbage
     for label in ("None", "nan", "True", "empty list", "empty array", "masked"):
         yield Value(label, NUMBERS[label], REFUSED)
@@ -271,7 +271,7 @@ def _parts(valid: Any, garbage: list[Value], folder: Path) -> Iterator[Value]:
         kind = "choice" if isinstance(part, str) else kind_of(part)
         for each in _KINDS[kind](part, garbage[:6], folder):
             changed = (*valid[:place], each.value, *valid[place + 1 :])
-            # NumPy makes numbers of bools, and objects of fractions, in an array.
+            # In an array, NumPy converts bools to numbers and fractions to objects.
             lenient = each.label in ("True", "np.True_", "Fraction")
             expected = EITHER if lenient else each.expected
             yield Value(f"[{place}] {each.label}", changed, expected, each.tolerance)
@@ -339,7 +339,7 @@ _KINDS: dict[str, Callable[[Any, list[Value], Path], Iterator[Value]]] = {
 
 
 def kind_of(valid: Any) -> str:
-    """Return what kind of argument a valid value shows."""
+    """Return the kind of argument that a valid value implies."""
     if isinstance(valid, bool):
         return "bool"
     if isinstance(valid, int):
@@ -363,7 +363,7 @@ def kind_of(valid: Any) -> str:
 
 
 class Failure(NamedTuple):
-    """What a call did wrong."""
+    """A kind of failure, and its details."""
 
     kind: str
     detail: str
@@ -372,12 +372,12 @@ class Failure(NamedTuple):
 def judge_error(
     error: BaseException, names: tuple[str, ...], value: Value, paths: bool
 ) -> Failure | None:
-    """Return what is wrong with an exception, None if nothing is."""
+    """Return the failure of a call that raised, or None if the exception is as expected."""
     text = str(error)
     allowed = (ValueError, TypeError, clsas.DeviceError)
     if paths and isinstance(error, OSError) and not isinstance(error, clsas.FileFormatError):
         given = str(value.value)
-        named = given[:200] in f"{error.filename}{text}"  # or a folder of it that is missing
+        named = given[:200] in f"{error.filename}{text}"  # or a missing folder in it
         named |= bool(error.filename) and given.startswith(str(error.filename))
         return None if named or _names(text, names) else Failure("names no path", _said(error))
     if not isinstance(error, allowed) or isinstance(error, (np.linalg.LinAlgError, UnicodeError)):
@@ -407,7 +407,7 @@ def _said(error: BaseException) -> str:
 def judge_result(
     result: Any, valid: Result, value: Value, may_be_nan: bool = False
 ) -> Failure | None:
-    """Return what is wrong with what a call returned, None if nothing is."""
+    """Return the failure of a call that returned, or None if the result is as expected."""
     if value.expected == REFUSED:
         return Failure("accepts a wrong value", _short(result))
     found = Result(result)
@@ -427,14 +427,14 @@ def _short(result: Any) -> str:
 
 
 class Result:
-    """Everything that a call returned: its numbers by where they stand."""
+    """All numbers in the result of a call, by their place in it."""
 
     def __init__(self, value: Any) -> None:
         self.numbers = dict(_walk(value))
 
     @cached_property
     def nan(self) -> set[str]:
-        """Where NaN stands."""
+        """Places with NaN."""
         return {
             place
             for place, number in self.numbers.items()
@@ -442,7 +442,7 @@ class Result:
         }
 
     def difference(self, other: Result, tolerance: float) -> Failure | None:
-        """Return where two results differ, None if nowhere."""
+        """Return the first difference of two results, or None if they are equal."""
         for place, want in other.numbers.items():
             have = self.numbers.get(place)
             if have is None or have.shape != want.shape:
@@ -466,11 +466,11 @@ def _close(have: np.ndarray, want: np.ndarray, tolerance: float) -> bool:
 SECONDS = re.compile(
     "second|kept|measured|created|time$|costs|work|written|elapsed|_run|digest|version"
 )
-"""Fields that differ from run to run, or are no result."""
+"""Fields that differ from run to run, or do not belong to the result."""
 
 
 def _walk(value: Any, place: str = "", deep: int = 0) -> Iterator[tuple[str, np.ndarray]]:
-    """Return all numbers in an object, with where they stand."""
+    """Yield all numbers in an object, with their place in it."""
     if deep > DEEPEST or SECONDS.search(place):
         return
     if isinstance(value, (bool, int, float, complex, np.generic)):
@@ -503,7 +503,7 @@ def _walk(value: Any, place: str = "", deep: int = 0) -> Iterator[tuple[str, np.
 
 
 def properties(value: Any) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Return how to read the public properties of an object, and its repr."""
+    """Yield the names of an object's public properties with functions that read them."""
     if not type(value).__module__.startswith("clsas"):
         return
     yield "repr", lambda: repr(value)
