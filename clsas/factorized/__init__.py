@@ -1,1 +1,1 @@
-"""The image, fast: the tree of subimages, its filters, and the run of a plan."""
+"""Factorized images: the tree of subimages, its geometry, and the run of a plan on a device."""

@@ -1,4 +1,4 @@
-"""The buffers of a factorized image on a device: names, shapes and types.
+"""Names, shapes and types of the buffers of a factorized image on a device.
 
 The run allocates from these lists, and the prediction of memory adds them up.
 """
@@ -22,19 +22,19 @@ from clsas.opencl.buffers import (
 from clsas.sonar.beam import BeamWindow
 
 CHUNK = 32
-"""Channels that a stage adds up before it hands on the sums, and takes up those still open."""
+"""Channels that the stage kernel adds up before it writes its sums, and resumes unfinished ones."""
 LEAST_BATCH = 2
-"""Roots that are formed together at least, if they fit the memory: fewer commands."""
+"""Least number of roots formed together if memory allows, so that commands are few."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """Lines of one stage: `half` samples to either side of a subimage's centre.
+    """Layout of the lines of a stage, with `half` samples on either side of a subimage's centre.
 
     Attributes
     ----------
     half, length : int
-        Samples that are needed to either side, and in all, in whole vectors.
+        Samples needed on either side, and in total, rounded up to whole vectors.
     """
 
     half: int
@@ -42,22 +42,22 @@ class Level:
 
     @classmethod
     def of(cls, half: int, width: int) -> Level:
-        """Return the lines of a stage for a device with some lanes."""
+        """Return the layout for a device with `width` lanes."""
         return cls(half, round_up(2 * half + 1, width))
 
     @property
     def pitch(self) -> int:
-        """Samples of a line with the zeros around it."""
+        """Samples of a line, including the zeros around it."""
         return self.length + 2 * GUARD
 
     @property
     def centre(self) -> int:
-        """Sample of the subimage's centre."""
+        """Sample at the centre of the subimage."""
         return self.half + GUARD
 
 
 def row_pitch(channels: int) -> int:
-    """Return the channels of a row in a table, where a vector may begin at the last."""
+    """Return the length of a table's row, in which a vector may begin at the last channel."""
     return channel_pitch(channels) + VECTOR_ROOM
 
 
@@ -71,20 +71,20 @@ def stage_tables(
     bands: int = 1,
     rows: bool = False,
 ) -> Buffers:
-    """Return the tables of a stage, which tell how channels are aligned and combined.
+    """Return the tables of a stage, by which channels are aligned and combined.
 
     Parameters
     ----------
     level : int
         Number of the stage.
     roots, subimages : int
-        Roots, and the stage's subimages in each.
+        Number of roots, and of the stage's subimages in each.
     channels : int
-        Channels of the stage before in each root; of the first stage raw ones.
+        Channels of the stage before in each root; for the first stage, raw channels.
     ramps : bool
         True if phases of raw channels are turned along their lines.
     bands : int
-        Bands of channels: see `clsas.aperture.virtual_channels.Bands`.
+        Number of bands of channels; see `clsas.aperture.virtual_channels.Bands`.
     rows : bool
         True if virtual channels lie in the rows of a sheet.
     """
@@ -108,7 +108,7 @@ def stage_tables(
 def stage_lines(
     level: int, subimages: int, channels: int, pitch: int, *, half_precision: bool
 ) -> Buffers:
-    """Return the lines that a stage forms: so many virtual channels of some subimages."""
+    """Return the buffer of the lines that a stage forms, `channels` for each subimage."""
     return {f"lines{level}": lines_buffer(subimages * channels, pitch, half_precision)}
 
 
@@ -120,11 +120,11 @@ def leaf_tables(
     Parameters
     ----------
     virtual_channels : int
-        Of all roots together.
+        Virtual channels of all roots together.
     parts : int
-        Tiles or groups.
+        Number of tiles or groups.
     points : int or None
-        Off a plane, the points of all groups.
+        Number of points in all groups; None on a plane.
     beam : BeamWindow or None
     """
     columns = virtual_channels + VECTOR_ROOM
@@ -141,7 +141,7 @@ def leaf_tables(
 
 
 def tile_buffers(tiles: int, channels: int, beam: BeamWindow | None, *, aligned: bool) -> Buffers:
-    """Return what a batch of tiles takes besides their pixels.
+    """Return the buffers of a batch of tiles, apart from those of the pixels.
 
     Parameters
     ----------

@@ -88,7 +88,7 @@ def in_enough_precision(
     device.finish()  # kernels may still write to the buffer that is given up
     single = _uploaded(lines, geometry.factorization, device, half_precision=False)
     validate.warn(
-        "lines are held in single precision, not in half as planned, and take up to twice the "
+        "lines are kept in single precision, not in half as planned, and need up to twice the "
         "memory: echoes from the grid are too weak compared with the largest sample, "
         f"{largest:.3g}, or the gain that they need is out of range"
     )

@@ -1,4 +1,4 @@
-"""Geometry of a factorized image: the mean track, and how channels and roots lie about it."""
+"""Geometry of a factorized image: the mean track, its channels, and the roots."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from clsas.factorized.tree import Division
 from clsas.plans.factorization import Factorization
 from clsas.sonar.beam import BeamWindow
 
-_ON_TRACK = 1e-4  # wavelengths; closer, channels lie on the mean track
+_ON_TRACK = 1e-4  # distance within which channels lie on the mean track, wavelengths
 _SHAPES = {"strips": "several passes", "sheet": "a sheet"}
-_SAMPLED_LINES = 64  # whose power is measured, spread evenly
+_SAMPLED_LINES = 64  # evenly spread lines whose power is measured
 
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
     """Geometry of lines and roots in float64, with channels in the order of the track.
 
-    It holds no samples, and serves any number of images.
+    It contains no samples, and serves any number of images.
 
     Attributes
     ----------
@@ -39,31 +39,31 @@ class Geometry:
     surface : Surface
     factorization : Factorization
     beam : BeamWindow or None
-    division, seen : Division
-        Subimages of every stage; roots, rectangles of leaves whose visibility is found together,
-        and leaves.
+    division : Division
+        Subimages of all stages.
+    rectangles : Division
+        Roots, rectangles of leaves whose visibility is computed together, and leaves.
     track : MeanTrack
     channels : int64 [channels]
-        Lines in the order of the track.
+        Numbers of the lines, in the order of the track.
     phase_centres_m : float64 [channels, 3]
     directions : BeamDirections or None
         Unit directions of the beam anywhere on the track; None without a beam.
     along : float64 [samples, 3] or None
-        Those at `track.samples`.
+        Directions of the beam at `track.samples`.
     drift : float64 [3]
     own_drift : float64 [channels, 3] or None
         See `clsas.aperture.phase_rates`.
     samples_per_m, cycles_per_m : float
         Samples and phase of the upsampled lines per metre of range from the mean track.
     nearest_m : float or None
-        With a beam: least distance between a channel and the centre of a root.
-    on_sheet : bool
-        True if all channels lie on the mean track itself.
+        With a beam, the smallest distance between a channel and the centre of a root.
+    on_track : bool
+        True if all channels lie on the mean track, so that there is nothing to align.
     ramps : bool
-        True if the first stage turns the phase of channels along their lines.
+        True if the first stage turns the phases of channels along their lines.
     slack : float
-        Change of aperture coordinate, relative to the whole, by which a channel off the track may
-        appear elsewhere.
+        Largest difference of aperture coordinates at which a channel appears from two points.
     """
 
     lines: RangeLines
@@ -71,7 +71,7 @@ class Geometry:
     factorization: Factorization
     beam: BeamWindow | None
     division: Division
-    seen: Division
+    rectangles: Division
     track: MeanTrack
     channels: NDArray[np.int64]
     phase_centres_m: NDArray[np.float64]
@@ -82,7 +82,7 @@ class Geometry:
     samples_per_m: float
     cycles_per_m: float
     nearest_m: float | None
-    on_sheet: bool
+    on_track: bool
     ramps: bool
     slack: float
 
@@ -90,7 +90,7 @@ class Geometry:
     def roots(self) -> NDArray[np.int64]:
         """First pixels of roots in the order in which they are formed, [roots, 2].
 
-        With a beam, roots that the same channels see follow each other.
+        With a beam, roots that are visible from the same channels follow each other.
         """
         roots = self.division.roots
         if self.along is None:
@@ -111,54 +111,48 @@ def geometry_of(
 
     Parameters
     ----------
-    lines, surface, factorization, beam
-        What is imaged, and how.
+    lines : RangeLines
+    surface : Surface
+    factorization : Factorization
+    beam : BeamWindow or None
     track : MeanTrack, optional
-        The lines' mean track of the shape that the factorization names, if it is known already.
+        The mean track of the lines, with the shape that the factorization names, if it is known.
 
     Raises
     ------
     ValueError
         If the lines have no such mean track.
     """
-    aperture, resampling = factorization.aperture, factorization.resampling
+    resampling, division = factorization.resampling, Division(surface, factorization.sides)
     wavelength_m = band_wavelength_m(lines, resampling.centre_cycles_per_sample)
-    track = track or mean_track_of(lines, aperture.shape, wavelength_m)
-    if track is None:
-        raise ValueError(
-            "lines must have channels at more than one place for a plan that divides"
-            if aperture.shape == "track"
-            else f"lines must have channels that lie on {_SHAPES[aperture.shape]}, as "
-            "the plan has them"
-        )
-    channels = np.argsort(track.coordinate, kind="stable")
+    track = track or _mean_track(lines, factorization, wavelength_m)
     directions = along = nearest_m = None
-    division = Division(surface, factorization.sides)
     if beam is not None:
         directions = directions_of(beam, beam.directions(lines), track)
         along = directions.at(track.samples)
         root_m = division.centres_m(0, division.roots)
         nearest_m = float(cdist(root_m, lines.phase_centres_m).min())
+    channels = np.argsort(track.coordinate, kind="stable")
     track = track.some(channels)
     phase_centres_m = lines.phase_centres_m[channels]
+    off_m = float(np.abs(track.offsets_m(phase_centres_m)).max())
+    close_m = _ON_TRACK * wavelength_m
+    on_track = off_m <= close_m
     own = own_drift(lines)
-    # On the track itself there is nothing to align.
-    off_m = np.abs(track.offsets_m(phase_centres_m)).max()
-    on_sheet = bool(off_m <= _ON_TRACK * wavelength_m)
     if own is not None:
         off_m += np.linalg.norm(own, axis=1).max() * np.abs(lines.last_range_m).max()
-    apart = lines.rx_velocity_m_s is not None or not np.array_equal(lines.tx_m, lines.rx_m)
-    away = apart or off_m > _ON_TRACK * wavelength_m
-    # From elsewhere a channel off the track appears at another place.
-    way_m = np.linalg.norm(track.sampled_m[1], axis=1)
-    together = _together(surface, factorization, along, nearest_m)
+    bistatic = lines.rx_velocity_m_s is not None or not np.array_equal(lines.tx_m, lines.rx_m)
+    ramps = factorization.aperture.aligns_phases and (bistatic or off_m > close_m)
+    # The apparent coordinate of a channel off the track depends on the point.
+    slowest_m = np.linalg.norm(track.sampled_m[1], axis=1).min()
+    together = _rectangle(surface, factorization, along, nearest_m)
     return Geometry(
         lines=lines.without_samples(),
         surface=surface,
         factorization=factorization,
         beam=beam,
         division=division,
-        seen=Division(surface, (factorization.sides[0], together, factorization.sides[-1])),
+        rectangles=Division(surface, (factorization.sides[0], together, factorization.sides[-1])),
         track=track,
         channels=channels,
         phase_centres_m=phase_centres_m,
@@ -169,14 +163,27 @@ def geometry_of(
         samples_per_m=resampling.samples_per_m(lines) * (1 + factorization.stretch),
         cycles_per_m=resampling.cycles_per_m(lines) * (1 + factorization.stretch),
         nearest_m=nearest_m,
-        on_sheet=on_sheet,
-        ramps=bool(away and aperture.aligns_phases),
-        slack=2 * off_m / max(way_m.min(), 1e-9),
+        on_track=on_track,
+        ramps=bool(ramps),
+        slack=2 * off_m / max(slowest_m, 1e-9),
     )
 
 
+def _mean_track(lines: RangeLines, factorization: Factorization, wavelength_m: float) -> MeanTrack:
+    """Return the mean track of the shape that a factorization names, or raise ValueError."""
+    shape = factorization.aperture.shape
+    track = mean_track_of(lines, shape, wavelength_m)
+    if track is None:
+        raise ValueError(
+            "lines must have channels at more than one place for a plan that divides the image"
+            if shape == "track"
+            else f"lines must have channels that lie on {_SHAPES[shape]}, as the plan assumes"
+        )
+    return track
+
+
 def imaged_rms(geometry: Geometry, lines: RangeLines) -> float:
-    """Return the rms of samples at ranges where pixels lie, over some of the lines."""
+    """Return the rms of samples at the ranges of pixels, over some of the lines."""
     some = some_channels(lines.channels, _SAMPLED_LINES)
     root_m = geometry.division.centres_m(0, geometry.division.roots)
     away_m = cdist(root_m, lines.phase_centres_m[some])
@@ -186,22 +193,22 @@ def imaged_rms(geometry: Geometry, lines: RangeLines) -> float:
     for i, near, far in zip(some, near_m, far_m, strict=True):
         limits = (np.array([near, far]) - lines.first_range_m[i]) / lines.range_step_m
         first, last = np.clip(limits, 0, lines.length).astype(np.int64)
-        seen = lines.samples[i, first : last + 1].astype(np.complex128)
-        total += float(np.vdot(seen, seen).real)
+        echoes = lines.samples[i, first : last + 1].astype(np.complex128)
+        total += float(np.vdot(echoes, echoes).real)
         count += last + 1 - first
     return math.sqrt(total / max(count, 1))
 
 
-def _together(
+def _rectangle(
     surface: Surface,
     factorization: Factorization,
     along: NDArray[np.float64] | None,
     nearest_m: float | None,
 ) -> tuple[int, int]:
-    """Return the size of rectangles of leaves whose visibility is found together.
+    """Return the size of rectangles of leaves whose visibility is computed together.
 
-    They lie within a leaf's parent, and are hardly visible from further along the track than one
-    leaf.
+    They lie within the parent of a leaf. The stretch of the track from which a rectangle is visible
+    exceeds that of a leaf by no more than `BEAM_MARGIN`.
     """
     sides, limits = factorization.sides, factorization.limits
     leaf, parent = sides[-1], sides[max(len(sides) - 2, 0)]
@@ -221,5 +228,5 @@ def _together(
 
 
 def _doubled(side: tuple[int, int]) -> list[tuple[int, int]]:
-    """Return a size with twice the rows, and with twice the columns."""
+    """Return two sizes, one with twice the rows and one with twice the columns."""
     return [(2 * side[0], side[1]), (side[0], 2 * side[1])]

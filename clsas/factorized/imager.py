@@ -1,4 +1,4 @@
-"""A factorization at work: images of any samples of one geometry."""
+"""Factorized images of any samples of one geometry."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from clsas.sonar.simplify import Model, leave_out
 
 
 class FactorizedImager:
-    """Forms images by a plan that factorizes, of any samples of the plan's lines.
+    """An imager that forms factorized images by a plan, of lines with one geometry.
 
     Parameters
     ----------
     lines : RangeLines
-        Lines of the geometry. Their samples do not matter.
+        Lines with that geometry. Their samples have no effect.
     grid : Grid
     plan : Plan
-        A plan that factorizes, made for this geometry or for one that hardly differs.
+        A plan with a factorization, made for this geometry or for one that differs very little.
     device : Device
     track, surface : optional
         Results of planning: see `clsas.factorized.geometry.geometry_of`.
     warned : bool
-        True if the user has been warned already that no line adds anything to the image.
+        True if the user has already been warned that no line contributes to the image.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class FactorizedImager:
         )
 
     def form(self, lines: RangeLines, progress: Callable[[int, int], None] | None = None) -> Image:
-        """Return the image of lines of the same geometry.
+        """Return the image of lines with the same geometry.
 
         Parameters
         ----------
@@ -92,7 +92,7 @@ class FactorizedImager:
         return Image(pixels, grid)
 
     def _warn_unreached(self, lines: RangeLines) -> None:
-        """Warn once that no line adds anything to the image."""
+        """Warn once that no line contributes to the image."""
         if not self._warned:
             self._warned = True
             warn_unreached(lines, self._model.grid, self._model.beam, self._along)

@@ -1,4 +1,4 @@
-"""Groups of points off a plane, leaf by leaf."""
+"""Groups of points in the leaves of grids that are not planes."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ class LeafGroups:
     Attributes
     ----------
     groups : Groups
-        In the order of their leaves.
+        The groups, in the order of their leaves.
     leaf : int64 [groups]
-        The leaf of each, numbered root by root.
+        Leaf of each group, numbered root by root.
     ends : int64 [roots + 1]
-        Groups before each root, and of all.
+        Number of groups before each root, and in total.
     pixels_before : int64 [roots + 1]
-        Pixels of the grid before each root, and of all.
+        Number of pixels before each root, and in total.
     """
 
     groups: Groups
@@ -35,12 +35,12 @@ class LeafGroups:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the groups."""
+        """Memory of the groups, bytes."""
         return self.groups.index.nbytes + self.groups.offset_m.nbytes
 
 
 def leaf_groups(geometry: Geometry, width: int) -> LeafGroups:
-    """Return the groups of points in the leaves of all roots, for a device of some width."""
+    """Return the groups of points in the leaves of all roots, for a device with `width` lanes."""
     division, surface = geometry.division, geometry.surface
     roots, last = geometry.roots, len(division.sides) - 1
     corners = division.corners(last, roots)
@@ -60,9 +60,10 @@ def leaf_groups(geometry: Geometry, width: int) -> LeafGroups:
 def _cells(
     geometry: Geometry, corners: NDArray[np.int64], width: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the leaf of every cell, and the cell's number in it, [rows, columns] each.
+    """Return the leaf of each cell and the number of the cell in it, [rows, columns] each.
 
-    Leaves are numbered in the order of their corners, [roots, leaves, 2], cells block by block.
+    Leaves are numbered in the order of their corners, [roots, leaves, 2]. Cells are numbered block
+    by block.
     """
     side = geometry.division.sides[-1]
     number = np.empty(corners.max(axis=(0, 1)) // side + 1, np.int64)

@@ -1,4 +1,4 @@
-"""Pixels on a plane from the virtual channels of leaves, tile by tile."""
+"""Leaves on a plane: tiles of pixels, formed from virtual channels."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class PlaneLeaves:
         self.stage, self.image = stage, image
         self.geometry, self.device, self.slot = stage.geometry, stage.device, stage.slot
         self.factorization, self.surface = self.geometry.factorization, self.geometry.surface
-        # A CPU sets the pixels where they belong.
+        # A CPU writes pixels directly into the image.
         on_cpu = self.device.info.kind == "cpu" and not stage.normalise
         self.shared = self.device.share(image) if on_cpu else None
         self.expand = expansion_kernel(self.device, self.geometry.beam)
@@ -88,13 +88,13 @@ class PlaneLeaves:
         return self._finish(event, parts, pixels)
 
     def _expanded(self, tables: Slot, sector: Sector, batch: slice) -> dict[str, Any]:
-        """Start expanding ranges about tiles' centres; return what backprojection takes of it."""
+        """Start expanding ranges about tile centres; return arguments for backprojection."""
         tiles = (batch.stop - batch.start) * self.per_root
         stride = sector.stride(-1)
         pitch, most = channel_pitch(stride), max(stride, self.factorization.most_channels[-1])
         beam, aligned = self.geometry.beam, self.stage.aligned
         references: dict[str, Any] = {"centre_sample": self.stage.level.centre}
-        if not aligned:  # the host fills references that the batch before may still read
+        if not aligned:  # the host fills references, which the batch before may still read
             self.slot.wait()
         buffers = self.slot.make(tile_buffers(tiles, most, beam, aligned=aligned))
         if not aligned:
@@ -127,9 +127,10 @@ class PlaneLeaves:
         return expanded | references
 
     def _destination(self, tables: Slot, roots: NDArray[np.int64]) -> dict[str, Any]:
-        """Return the arguments that say where the pixels of some roots go.
+        """Return the kernel's arguments for the destination of the pixels of some roots.
 
-        That is the image itself where a device shares its memory, and no root overhangs it.
+        It is the image itself if the device shares memory with the host and no root extends past
+        the image.
         """
         height, width = self.factorization.sides[0]
         shape = self.surface.plane.shape
@@ -145,7 +146,7 @@ class PlaneLeaves:
     def _finish(
         self, event: cl.Event, parts: list[tuple[slice, slice]], pixels: dict[str, Any]
     ) -> Finish:
-        """Start reading pixels that are not in place; return what waits for them."""
+        """Start reading pixels into the image; return a function that waits for them."""
         ready, weights = [event], []
         if pixels["pixels"] is not self.shared:
             ready = [
@@ -217,7 +218,11 @@ class PlaneLeaves:
         )
 
     def _references(self, sector: Sector, batch: slice, pitch: int) -> dict[str, NDArray]:
-        """Return samples of tiles' centres in the lines of their leaves, [roots, tiles, pitch]."""
+        """Return where the lines of leaves have the centres of tiles, by names of kernel tables.
+
+        Arrays are [roots, tiles, pitch]: the sample, the position between samples, and the phase in
+        cycles.
+        """
         shape, centre = (batch.stop - batch.start, self.per_root, pitch), self.stage.level.centre
         sample = np.full(shape, centre, np.int32)
         fraction, phase = np.zeros((2, *shape), np.float32)

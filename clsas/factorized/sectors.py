@@ -27,8 +27,8 @@ from clsas.opencl.buffers import MARGIN
 from clsas.plans.factorization import Factorization
 from clsas.sonar.beam import BeamWindow
 
-_FAR = 1 << 28  # samples: off any line, and within int32
-_MOST_KEPT_BYTES = 128 << 20  # of sectors, and of groups
+_FAR = 1 << 28  # samples; beyond the end of any line, and within int32
+_MOST_KEPT_BYTES = 128 << 20  # kept of sectors, and of groups, for the next image
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,17 +42,17 @@ class Sector:
     root_m : float64 [roots, 3]
         Centres of the roots.
     channels : slice
-        Raw channels, in the order of the track, that see any of them.
+        Raw channels from which any of the roots is visible, in the order of the track.
     relative_m : list of float64 [roots, subimages, 3]
         Centres of subimages relative to those of their roots, stage by stage.
     virtual : list of VirtualChannels
         Virtual channels, stage by stage.
     needs : list of ChannelRanges
-        Virtual channels of each subimage, and the channels that it combines, stage by stage.
+        Virtual channels of each subimage and the channels that it combines, stage by stage.
     coordinate : float64 [roots, channels]
-        Aperture coordinates of the raw channels.
+        Apparent aperture coordinates of the raw channels.
     across : float64 [roots, channels] or None
-        Their coordinates across a sheet.
+        Their apparent coordinates across a sheet; None without a sheet.
     """
 
     roots: NDArray[np.int64]
@@ -72,70 +72,74 @@ class Sector:
         return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
     def stride(self, level: int) -> int:
-        """Return the largest number of virtual channels of a stage's subimages."""
+        """Return the largest number of virtual channels of any subimage of a stage."""
         need = self.needs[level]
         return int((need.last - need.first).max())
 
     def positions_m(self, level: int) -> NDArray[np.float64]:
-        """Return virtual channels of a stage relative to the centres of their roots."""
+        """Return positions of a stage's virtual channels relative to the centres of their roots."""
         return self.virtual[level].position_m - self.root_m[:, None]
 
 
 def sector_of(geometry: Geometry, roots: NDArray[np.int64]) -> Sector:
-    """Return the geometry of some roots, given by their first pixels, [roots, 2]."""
-    division, track, surface = geometry.division, geometry.track, geometry.surface
+    """Return the sector of some roots, given by their first pixels, [roots, 2]."""
+    division, track = geometry.division, geometry.track
     sides, aperture = geometry.factorization.sides, geometry.factorization.aperture
     root_m = division.centres_m(0, roots)
     corners = [division.corners(level, roots) for level in range(len(sides))]
     relative_m = [
         division.centres_m(level, each) - root_m[:, None] for level, each in enumerate(corners)
     ]
-    together = geometry.seen.sides[1]
-    seen_m = geometry.seen.centres_m(1, geometry.seen.corners(1, roots))
-    half_m = surface.extents_in(together, sides[0], roots).max(axis=0) / 2
-    half_m = half_m[:, None] * surface.steps_m
-    inside = surface.holds(sides[-1], corners[-1])
+    inside = geometry.surface.holds(sides[-1], corners[-1])
     channels = slice(0, len(geometry.channels))
-    if not track.is_dense:
-        begin, end = (
-            each[:, geometry.seen.parents(2)]
-            for each in visibility.visible_stretches(
-                geometry.factorization.limits, track, geometry.along, seen_m, half_m
-            )
-        )
-        channels = aperture.used_channels(
-            track.coordinate, begin[inside], end[inside], geometry.slack
-        )
-    centres_m, some = geometry.phase_centres_m[channels], track.some(channels)
-    own = None if geometry.own_drift is None else geometry.own_drift[channels]
-    coordinate, across = _apparent(geometry, some, root_m, centres_m, own)
+    visible = None if track.is_dense else _visible_stretches(geometry, roots)
+    if visible is not None:
+        begin, end = (each[inside] for each in visible)
+        channels = aperture.used_channels(track.coordinate, begin, end, geometry.slack)
+    centres_m = geometry.phase_centres_m[channels]
+    coordinate, across = _apparent(geometry, channels, root_m)
     virtual = _virtual_channels(geometry, roots, root_m, coordinate, across, centres_m)
-    if track.is_dense:
+    if visible is None:
         needs = all_channels(virtual, coordinate.shape[1], _holding(geometry, inside))
     else:
-        needs = channel_ranges(division, virtual, coordinate, (begin, end), inside)
+        needs = channel_ranges(division, virtual, coordinate, visible, inside)
     return Sector(roots, root_m, channels, relative_m, virtual, needs, coordinate, across)
 
 
+def _visible_stretches(
+    geometry: Geometry, roots: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return aperture coordinates between which leaves are visible, [roots, leaves] each."""
+    rectangles, root = geometry.rectangles, geometry.factorization.sides[0]
+    middles_m = rectangles.centres_m(1, rectangles.corners(1, roots))
+    extents = geometry.surface.extents_in(rectangles.sides[1], root, roots).max(axis=0)
+    half_m = (extents / 2)[:, None] * geometry.surface.steps_m
+    limits, along = geometry.factorization.limits, geometry.along
+    begin, end = visibility.visible_stretches(limits, geometry.track, along, middles_m, half_m)
+    of_leaf = rectangles.parents(2)
+    return begin[:, of_leaf], end[:, of_leaf]
+
+
 def _apparent(
-    geometry: Geometry,
-    some: MeanTrack,
-    root_m: NDArray[np.float64],
-    centres_m: NDArray[np.float64],
-    own: NDArray[np.float64] | None,
+    geometry: Geometry, channels: slice, root_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Return coordinates at which channels appear: see `MeanTrack.apparent_coordinates`."""
-    if not some.is_sheet or own is not None or not geometry.on_sheet:
-        return some.apparent_coordinates(root_m, centres_m, own)
-    return some.coordinates_everywhere(len(root_m))
+    """Return the coordinates at which channels appear from the centres of roots.
+
+    See `MeanTrack.apparent_coordinates`.
+    """
+    track = geometry.track.some(channels)
+    drift = None if geometry.own_drift is None else geometry.own_drift[channels]
+    if track.is_sheet and drift is None and geometry.on_track:
+        return track.coordinates_everywhere(len(root_m))
+    return track.apparent_coordinates(root_m, geometry.phase_centres_m[channels], drift)
 
 
 def _holding(geometry: Geometry, inside: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
-    """Return which subimages hold a pixel, stage by stage, from those of the leaves."""
+    """Return which subimages contain a pixel, stage by stage, from the same for the leaves."""
     result = [inside]
     for level in range(len(geometry.division.sides) - 1, 0, -1):
-        held = geometry.division.by_parent(level, result[0])
-        result.insert(0, np.any(held, axis=-1))
+        children = geometry.division.by_parent(level, result[0])
+        result.insert(0, np.any(children, axis=-1))
     return result
 
 
@@ -147,7 +151,7 @@ def _virtual_channels(
     across: NDArray[np.float64] | None,
     centres_m: NDArray[np.float64],
 ) -> list[VirtualChannels]:
-    """Return the virtual channels of some roots, stage by stage, from their raw channels."""
+    """Return the virtual channels of some roots, stage by stage."""
     aperture, sides, track = (
         geometry.factorization.aperture,
         geometry.factorization.sides,
@@ -168,7 +172,7 @@ def _virtual_channels(
 def _beam_rate(
     geometry: Geometry, roots: NDArray[np.int64], root_m: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Return the phase rates of the beam's weights in some roots: see `beam_rate`."""
+    """Return the rates of the beam's weights in some roots on curves: see `beam_rate`."""
     if geometry.beam is None or geometry.along is None:
         return None
     return beam_rate(
@@ -179,7 +183,7 @@ def _beam_rate(
 def _sheet_beam_rates(
     geometry: Geometry, roots: NDArray[np.int64], root_m: NDArray[np.float64]
 ) -> SheetRates | None:
-    """Return the phase rates of the beam's weights in some roots, along and across a sheet."""
+    """Return the rates of the beam's weights in some roots, along and across a sheet."""
     if geometry.beam is None or geometry.directions is None:
         return None
     sides_m = _sides_m(geometry, roots)
@@ -187,14 +191,14 @@ def _sheet_beam_rates(
 
 
 def _sides_m(geometry: Geometry, roots: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the sides of the largest of some roots, [axes, 3]."""
+    """Return the sides of a box as large as the largest of some roots, [axes, 3]."""
     side = geometry.factorization.sides[0]
     extents = geometry.surface.extents_in(side, side, roots).max(axis=0)
     return extents[:, None] * geometry.surface.steps_m
 
 
 def _boxes(geometry: Geometry, roots: NDArray[np.int64], root_m: NDArray[np.float64]) -> PhaseBoxes:
-    """Return the boxes of some roots."""
+    """Return boxes around some roots."""
     image, surface = geometry.factorization, geometry.surface
     extents = surface.extents_in(image.sides[0], image.sides[0], roots).max(axis=0)
     nearest_m = min(surface.radius_m(image.sides[-1]), image.closest_m)
@@ -202,10 +206,10 @@ def _boxes(geometry: Geometry, roots: NDArray[np.int64], root_m: NDArray[np.floa
 
 
 def references(geometry: Geometry, sector: Sector) -> dict[str, NDArray]:
-    """Return how roots align the raw channels, by the names of the kernel's tables.
+    """Return the shifts and phases by which roots align raw channels, by names of kernel tables.
 
-    Each is [roots, channels], in the order of the virtual channels: the line, its first sample, the
-    position between samples, the phase in cycles and its change per sample.
+    Arrays are [roots, channels], in the order in which channels are added. They are the line, its
+    first sample, the position between samples, the phase in cycles and its change per sample.
     """
     lines, resampling, half = (
         geometry.lines,
@@ -237,7 +241,7 @@ def references(geometry: Geometry, sector: Sector) -> dict[str, NDArray]:
 
 
 def _ramp(geometry: Geometry, sector: Sector) -> NDArray[np.float64]:
-    """Return cycles per sample by which channels' phases grow faster than the mean of all."""
+    """Return the excess of each channel's phase rate over the mean of all, cycles per sample."""
     virtual_m = geometry.track.positions_m(sector.coordinate, sector.across)
     tx_m, rx_m, velocity, speed = antennas_of(geometry.lines, geometry.channels[sector.channels])
     plane = geometry.surface.plane
@@ -249,15 +253,17 @@ def _ramp(geometry: Geometry, sector: Sector) -> NDArray[np.float64]:
 
 
 class Roots:
-    """What all images of a geometry share, found when it is first needed.
+    """Geometry and sectors that all images of the same geometry share.
 
-    Nothing of it depends on samples. Sectors, and groups of points off a plane, are kept for the
-    next image unless they take much memory.
+    They do not depend on samples, and are computed when they are first needed. Sectors, and groups
+    of points off a plane, are kept for the next image unless they need much memory.
 
     Parameters
     ----------
-    lines, grid, factorization, beam
-        What is imaged, and how.
+    lines : RangeLines
+    grid : Grid
+    factorization : Factorization
+    beam : BeamWindow or None
     track, surface : optional
         Results of planning: see `geometry_of`.
     """
@@ -283,7 +289,10 @@ class Roots:
         return geometry_of(lines, surface or surface_of(grid), factorization, beam, track)
 
     def sectors(self, first: int, most: int) -> Iterator[Sector]:
-        """Yield all roots in sectors: of `first` roots, for a device to begin with, then more."""
+        """Yield all roots in sectors: a first one of `first` roots, then up to `most` in each.
+
+        The first is small, so that the device can start early.
+        """
         if self._sectors is not None:
             yield from self._sectors
             return
@@ -300,7 +309,7 @@ class Roots:
         self._sectors = found
 
     def groups(self, width: int) -> LeafGroups:
-        """Return the groups of points of all leaves, for a device of some width."""
+        """Return the groups of points of all leaves, for a device with `width` lanes."""
         if self._groups is not None:
             return self._groups
         found = leaf_groups(self.geometry, width)

@@ -1,4 +1,4 @@
-"""The surface of a grid: its pixels in cells of a plane, and their relief off the plane."""
+"""The surface of a grid: pixels in the cells of a plane, and their offsets from the plane."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ _CORNERS = {n: np.array(list(product((-0.5, 0.5), repeat=n))) for n in (2, 3)}  
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Positions of a grid's pixels: their cells in a plane, and their offsets from it.
+    """Positions of a grid's pixels, as cells of a plane and offsets from the plane.
 
-    Subimages are rectangles of cells. The pixels of a subimage lie in a box. Its extents are rows,
-    columns and, unless the grid is a plane, metres of relief; its sides are these times `steps_m`.
+    Subimages are rectangles of cells, and their pixels lie in boxes. The extents of a box are its
+    rows, its columns and, unless the grid is a plane, its relief in metres. The sides of the box
+    are its extents times `steps_m`.
 
     Attributes
     ----------
     grid : Grid
     plane : Grid
-        The cells: the grid itself, the plane that fits a height map best, or a plane through
-        points.
+        The cells: the grid itself if it is a plane, else the plane that fits best.
     steps_m : float64 [axes, 3]
-        Steps to the next row and to the next column of cells, and the unit vector of offsets from
-        the plane.
+        Steps to the next row and to the next column of cells and, unless the grid is a plane, the
+        unit vector of offsets.
     cell : int64 [pixels]
-        Number of the cell that holds each pixel, in row order; empty on a plane.
+        Number of the cell that contains each pixel, in row order; empty on a plane.
     off_m : float64 [pixels]
         Offsets of the pixels along the last of `steps_m`; empty on a plane.
     """
@@ -49,7 +49,7 @@ class Surface:
 
     @property
     def is_plane(self) -> bool:
-        """True if the grid is a plane: cells are pixels."""
+        """True if the grid is a plane, so that cells are pixels."""
         return self.plane is self.grid
 
     def counts(self, side: tuple[int, int]) -> NDArray[np.int64]:
@@ -59,7 +59,7 @@ class Surface:
     def middles_m(self, side: tuple[int, int], corners: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the middles of subimages of a size whose first cells are `corners`, [..., 3].
 
-        A middle is that of the box around the pixels, or of the cells if there are no pixels.
+        The middle is that of the box around the pixels or, without pixels, of the cells.
         """
         middle = corners + (np.array(side) - 1) / 2
         position_m = self.plane.vectors_m[0] + middle @ self.steps_m[:2]
@@ -70,16 +70,16 @@ class Surface:
         return position_m
 
     def holds(self, side: tuple[int, int], corners: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether subimages of a size, whose first cells are `corners`, hold a pixel."""
+        """Return whether subimages whose first cells are `corners` contain a pixel."""
         inside = np.all(corners < self.plane.shape, axis=-1)
         return inside if self.is_plane else inside & (_at(self.counts(side), side, corners) > 0)
 
     def relief_m(
         self, side: tuple[int, int], root: tuple[int, int] | None = None
     ) -> NDArray[np.float64]:
-        """Return the relief of subimages of a size, metres, [down, across].
+        """Return the relief of subimages of a size, [down, across], metres.
 
-        With a root size, return the largest relief within each root.
+        If a size of roots is given, return the largest relief of subimages within each root.
         """
         if self.is_plane:
             return np.zeros((1, 1))
@@ -88,7 +88,7 @@ class Surface:
         return relief_m if root is None else within_roots(np.maximum, relief_m, side, root)
 
     def extents(self, side: tuple[int, int], relief_m: float = 0.0) -> NDArray[np.float64]:
-        """Return the extents of subimages of a size with a relief, [axes]."""
+        """Return the extents of a subimage with a given size and relief, [axes]."""
         return np.array([*side, relief_m][: len(self.steps_m)], np.float64)
 
     def extents_in(
@@ -108,7 +108,7 @@ class Surface:
 
     @functools.cached_property
     def _smallest(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-        """Pixels of the smallest subimages, and the least and the most that these lie off."""
+        """Number of pixels of the smallest subimages, and their lowest and highest offsets."""
         rows, columns = self.plane.shape
         shape = -(-rows // LEAST_SIDE[0]), -(-columns // LEAST_SIDE[1])
         if self.is_plane or self.grid.height_m is not None:
@@ -136,7 +136,7 @@ class Surface:
 
     @staticmethod
     def _part(side: tuple[int, int]) -> tuple[int, int]:
-        """Return half a subimage of a size, if it divides into such; else the smallest."""
+        """Return the size of half a subimage if it can be halved, else the smallest size."""
         (rows, columns), (least_rows, least_columns) = side, LEAST_SIDE
         if columns // least_columns > rows // least_rows:
             part = rows, columns // 2
@@ -151,7 +151,7 @@ class Surface:
         return {}
 
     def _held(self, side: tuple[int, int]) -> tuple[NDArray, NDArray, NDArray]:
-        """Return how many pixels subimages hold, and the least and the most these lie off."""
+        """Return the number of pixels of subimages, and their lowest and highest offsets."""
         if side not in self._known:
             if side == LEAST_SIDE:
                 counts, low_m, high_m = self._smallest
@@ -175,7 +175,7 @@ def surface_of(grid: Grid) -> Surface:
     steps_m = np.stack(in_plane_m)
     if grid.height_m is None:
         return Surface(grid, grid, steps_m)
-    # Least-squares plane: over regular rows and columns, the two slopes are independent.
+    # The plane fits in the least-squares sense. On a regular grid its two slopes are independent.
     up = np.array([0.0, 0.0, 1.0])
     height_m, (rows, columns) = grid.height_m, grid.shape
     middle_m, slopes = height_m.mean(), []
@@ -193,9 +193,10 @@ def surface_of(grid: Grid) -> Surface:
 
 
 def _through_points(grid: Grid) -> Surface:
-    """Return the surface of points: the plane that fits them best, with about one point a cell.
+    """Return the surface of points, on the plane that fits them best.
 
-    Columns run as nearly along x, the usual direction of the track, as the plane allows.
+    Cells contain about one point each. Columns are as close to the x axis, the usual direction of
+    the track, as the plane allows.
     """
     points_m = grid.positions_m().reshape(-1, 3)
     middle_m = points_m.mean(axis=0)
@@ -205,7 +206,7 @@ def _through_points(grid: Grid) -> Surface:
     across = across - (across @ normal) * normal
     across /= np.linalg.norm(across)
     axes = np.stack([np.cross(normal, across), across])
-    # Axis by axis: NumPy multiplies and reduces long, narrow arrays ten times slower.
+    # One axis at a time, because NumPy takes ten times as long for long, narrow arrays.
     in_plane_m = [offset_m @ axis for axis in axes]
     low_m, high_m = (np.array([reduce(each) for each in in_plane_m]) for reduce in (np.min, np.max))
     span_m = high_m - low_m
@@ -227,7 +228,7 @@ def _through_points(grid: Grid) -> Surface:
 def within_roots(
     ufunc: np.ufunc, values: NDArray, side: tuple[int, int], root: tuple[int, int]
 ) -> NDArray:
-    """Reduce values of subimages of a size over each root with a ufunc."""
+    """Return the values of subimages reduced over each root with a ufunc."""
     for axis in range(2):
         starts = np.arange(0, values.shape[axis], root[axis] // side[axis])
         values = ufunc.reduceat(values, starts, axis=axis)
@@ -235,6 +236,6 @@ def within_roots(
 
 
 def _at(values: NDArray, side: tuple[int, int], corners: NDArray[np.int64]) -> NDArray:
-    """Return values of the subimages whose first cells are `corners`; the last one's beyond it."""
+    """Return values of subimages whose first cells are `corners`; past the ends, the last ones."""
     row, column = np.moveaxis(corners // np.array(side), -1, 0)
     return values[np.minimum(row, len(values) - 1), np.minimum(column, values.shape[1] - 1)]

@@ -1,4 +1,4 @@
-"""Pixels off a plane from the virtual channels of leaves, in groups of points."""
+"""Leaves off a plane: groups of points, formed from virtual channels."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class SurfaceLeaves:
         self.backproject = self.device.kernel("backproject_points", **options)
 
     def _numbers(self, sector: Sector, batch: slice = _ALL) -> slice:
-        """Return the numbers of a sector's roots, or of some of these, among all roots."""
+        """Return the numbers of a sector's roots, or of a batch of these, among all roots."""
         first = self.number[tuple(sector.roots[0])]
         some = range(first, first + len(sector.roots))[batch]
         return slice(some.start, some.stop)

@@ -1,7 +1,7 @@
 """The tree of a factorized image: subimages within subimages, and the channels that each needs.
 
-A tree of subimages, whose subapertures merge from stage to stage, makes factorized backprojection
-fast (McCorkle and Rofheart 1996; Yegulalp 1999; Ulander, Hellsten and Stenström 2003).
+Factorized backprojection is fast because subimages form a tree, along which subapertures merge from
+stage to stage (McCorkle and Rofheart 1996; Yegulalp 1999; Ulander, Hellsten and Stenström 2003).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Division:
     ----------
     surface : Surface
     sides : tuple of (rows, columns)
-        Cells along a subimage's sides, from the roots to the leaves; each divides the one before.
+        Sizes of subimages in cells, from the roots to the leaves. Each divides the one before.
     """
 
     surface: Surface
@@ -33,9 +33,9 @@ class Division:
 
     @property
     def roots(self) -> NDArray[np.int64]:
-        """First row and column of every root, [roots, 2], row by row.
+        """First row and column of each root, [roots, 2], row by row.
 
-        The rows of most grids run along the track, so that neighbouring roots use the same samples.
+        The rows of most grids are along the track, so that successive roots use the same samples.
         """
         rows, columns = (
             np.arange(0, n, side)
@@ -51,7 +51,7 @@ class Division:
     def corners(self, level: int, roots: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return first rows and columns of the subimages of a level within some roots.
 
-        They are in row order, [roots, subimages, 2].
+        The result is [roots, subimages, 2], with the subimages of a root in row order.
         """
         down, across = self._divided(0, level)
         inside: NDArray[np.int64] = np.stack(np.divmod(np.arange(down * across), across), axis=1)
@@ -62,16 +62,16 @@ class Division:
         return self.surface.middles_m(self.sides[level], corners)
 
     def parents(self, level: int) -> NDArray[np.int64]:
-        """Return the parent of each subimage: its number on the level before, [subimages]."""
+        """Return the number of each subimage's parent on the level before, [subimages]."""
         down, across = self._divided(0, level)
         rows, columns = self._divided(level - 1, level)
         row, column = np.divmod(np.arange(down * across), across)
         return row // rows * (across // columns) + column // columns
 
     def by_parent(self, level: int, values: NDArray) -> NDArray:
-        """Sort values of subimages by their parents.
+        """Return values [roots, subimages], sorted by the parents of subimages.
 
-        From [roots, subimages] to [roots, parents, subimages of each parent].
+        The result is [roots, parents, subimages of each parent].
         """
         down, across = self._divided(0, level - 1)
         rows, columns = self._divided(level - 1, level)
@@ -79,7 +79,7 @@ class Division:
         return split.reshape(len(values), down * across, rows * columns)
 
     def _divided(self, level: int, later: int) -> tuple[int, int]:
-        """Return rows and columns of the later level's subimages within one of a level."""
+        """Return the rows and columns of a later level's subimages within a subimage of a level."""
         (rows, columns), (less_rows, less_columns) = self.sides[level], self.sides[later]
         return rows // less_rows, columns // less_columns
 
@@ -91,25 +91,26 @@ def channel_ranges(
     visible: tuple[NDArray[np.float64], NDArray[np.float64]],
     inside: NDArray[np.bool_],
 ) -> list[ChannelRanges]:
-    """Return the channels that every subimage needs, stage by stage.
+    """Return the channels that each subimage needs, stage by stage.
 
-    Weighted by the beam, a steering function is 0 outside the stretch from which the subimage is
-    visible. Channels and virtual channels there are left out, though a filter's taps reach them.
+    Multiplied by the beam's weights, a steering function is 0 outside the stretch of the track from
+    which the subimage is visible. Channels and virtual channels outside it are omitted, even if the
+    taps of a filter extend to them.
 
     Parameters
     ----------
     division : Division
     virtual : list of VirtualChannels
-        One for each stage.
+        Virtual channels, stage by stage.
     coordinate : float64 [roots, channels]
-        Apparent aperture coordinate of the raw channels.
+        Apparent aperture coordinates of the raw channels.
     visible : two float64 [roots, leaves]
-        Aperture coordinates between which a leaf is visible.
+        Aperture coordinates between which each leaf is visible.
     inside : bool [roots, leaves]
-        Whether a leaf holds a pixel.
+        True for leaves that contain a pixel.
     """
     coordinates = [virtual[0].ordered(coordinate), *(each.coordinate for each in virtual)]
-    # Virtual channels beyond those to which channels contribute are empty.
+    # Trailing virtual channels to which no channel contributes are empty.
     counts = [np.full((len(coordinate), 1), coordinate.shape[1])]
     for each in virtual:
         counts.append(np.take_along_axis(each.base, counts[-1] - 1, axis=1) + each.taps)
@@ -127,7 +128,7 @@ def channel_ranges(
             stop = division.by_parent(level, stop).max(axis=-1)
     result = result[::-1]
     for level in range(1, len(virtual)):
-        # In a gap of the track, the parent's virtual channels are empty.
+        # Parents that are visible only from a gap of the track have no virtual channels.
         parent = result[level - 1]
         _clear(result[level], (parent.last <= parent.first)[:, division.parents(level)])
     return result
@@ -146,9 +147,9 @@ def _between(
     stop: NDArray[np.float64],
     nearest: bool,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return which of ascending coordinates lie from start to stop: the first, one past the last.
+    """Return the first of ascending coordinates from start to stop, and the one after the last.
 
-    With `nearest`, a stretch between two coordinates gets both.
+    With `nearest`, a stretch that lies between two coordinates gets both of them.
     """
     first, last = _rowwise(coordinates, start, "left"), _rowwise(coordinates, stop, "right")
     if nearest:
@@ -160,8 +161,8 @@ def _between(
 def _rowwise(
     rows: NDArray[np.float64], values: NDArray[np.float64], side: Literal["left", "right"]
 ) -> NDArray[np.int64]:
-    """Return np.searchsorted of every row: of [rows, values] in ascending [rows, n]."""
-    # One search for all rows: the rows are laid end to end, moved apart.
+    """Return `np.searchsorted` row by row, of values [rows, values] in ascending rows [rows, n]."""
+    # A single search serves all rows, which are shifted apart and concatenated.
     least, most = rows[:, 0].min(), rows[:, -1].max()
     apart = np.arange(len(rows))[:, None] * (most - least + 2)
     values = np.clip(values, least - 1, most + 1)

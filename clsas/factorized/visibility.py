@@ -1,4 +1,4 @@
-"""Visibility along the track: the stretch from which a beam covers a subimage."""
+"""Visibility: the stretches of the track from which a beam covers subimages."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from clsas.aperture.mean_track import MeanTrack
 from clsas.sonar.visibility import BeamTrack, Boxes
 
-_STEP = 2  # visibility is evaluated at every second sample of the track
-_MARGIN = 0.2  # of the step between two such samples, for what the beam does in between
+_STEP = 2  # step between the samples of the track at which visibility is evaluated
+_MARGIN = 0.2  # margin for motion of the beam between such samples, in steps between them
 
 
 def visible_stretches(
@@ -19,22 +19,26 @@ def visible_stretches(
     centres_m: NDArray[np.float64],
     half_m: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the stretch of the track from which each box is visible: two arrays [...].
-
-    They hold the first and the last aperture coordinate. These are infinite where the box is
-    visible from an end of the track, and both -inf where it is invisible.
+    """Return the stretch of the track from which each box is visible.
 
     Parameters
     ----------
     limits : (low, high), optional
-        Sines of the aspect angle at which the beam begins and ends. Without them every box is
+        Sines of the aspect angle at which the beam begins and ends. Without them, each box is
         visible from everywhere.
     track : MeanTrack
     along : float64 [samples, 3]
         The track's direction at `track.samples`; not needed without limits.
     centres_m : float64 [..., 3]
+        Middles of the boxes.
     half_m : float64 [axes, 3]
-        Half the boxes' sides, as vectors.
+        Half the sides of the boxes, as vectors.
+
+    Returns
+    -------
+    begin, end : float64 [...]
+        First and last aperture coordinate. Where a box is visible from an end of the track, that
+        one is infinite; where a box is invisible, both are -inf.
     """
     shape = centres_m.shape[:-1]
     if limits is None or along is None:
@@ -45,7 +49,7 @@ def visible_stretches(
     boxes = Boxes.equal(centres_m.reshape(-1, 3), half_m)
     spans = beam.spans(boxes)
     begin, end = np.full(len(boxes), -np.inf), np.full(len(boxes), -np.inf)
-    # A box that no sample's beam touches may be visible from between two samples.
+    # A box outside the beams of all samples may be visible from a point between two samples.
     bounds = np.concatenate([[-np.inf], coordinate[1:-1], [np.inf]])
     ever = spans.earliest <= spans.latest
     begin[ever] = bounds[np.maximum(spans.earliest[ever] - 1, 0)]
@@ -74,13 +78,13 @@ def _crossing(
     outermost : int64 [boxes]
         Outermost sample whose beam touches each box.
     outward : int
-        -1 or 1, towards the track's first or last sample.
+        -1 towards the first sample of the track, 1 towards the last.
     """
     beyond = (outermost == 0) if outward < 0 else (outermost == len(coordinate) - 1)
     index = outermost[:, None] + outward * np.array([1, 0, -1])
     index = index.clip(0, len(coordinate) - 1)
     outside, inside, further = beam.depth(boxes, index).T
-    # The depth changes nearly evenly between two samples, unless it is largest there.
+    # The depth changes almost linearly between two samples, unless its maximum is there.
     even = (further > inside) & (outside <= 0)
     share = np.divide(outside, outside - inside, out=np.full(len(boxes), _MARGIN), where=even)
     share = (share - _MARGIN).clip(0)

@@ -234,7 +234,7 @@ def test_the_order_of_channels_does_not_matter(bound):
     assert relative_error_db(former(bound)(shuffled), wanted) <= bound[0].same_db
 
 
-@pytest.mark.filterwarnings("ignore:lines are held in single precision, not in half")
+@pytest.mark.filterwarnings("ignore:lines are kept in single precision, not in half")
 @every_imager
 @pytest.mark.parametrize("scale", [1e-36, 1e-30, 1e-10, 1e10, 1e20, 1e30])
 def test_the_unit_of_the_samples_does_not_matter(bound, scale):
