@@ -30,10 +30,10 @@ def constants(device: Device) -> list[Constant]:
         ("exact.blocks", "_CHANNELS_AT_ONCE"),
         ("exact.blocks", "_PART_BYTES"),
         ("planning.memory", batch),
-        ("factorized.run", "_GROUPS_PER_UNIT"),
+        ("factorized.stages", "_GROUPS_PER_UNIT"),
     ]
     if device.info.width == 1:
-        names += [("factorized.run", "_GROUP"), ("opencl.upsampling", "_GROUP")]
+        names += [("factorized.stages", "_GROUP"), ("opencl.upsampling", "_GROUP")]
     return [Constant(importlib.import_module(f"clsas.{room}"), name) for room, name in names]
 
 

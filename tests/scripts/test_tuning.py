@@ -1,7 +1,7 @@
 import pytest
 from studies import tuning
 
-from clsas.factorized import run
+from clsas.factorized import stages
 from clsas.opencl.device import open_device
 from clsas.trials import cases
 
@@ -31,5 +31,5 @@ def test_a_device_of_one_lane_has_work_groups_to_tune(monkeypatch):
     info = dataclasses.replace(device.info, width=1, kind="gpu")
     single = dataclasses.replace(device, info=info, _kernels={})
     named = {(each.module.__name__, each.name) for each in tuning.constants(single)}
-    assert (run.__name__, "_GROUP") in named
+    assert (stages.__name__, "_GROUP") in named
     assert ("clsas.planning.memory", "_BATCH_BYTES") in named
