@@ -70,7 +70,7 @@ _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is 
 @options.device
 @options.picture("the image in dB")
 @options.levels
-@click.option("--profile", is_flag=True, help="Also report the time of every kernel.")
+@click.option("--profile", is_flag=True, help="Also report the time spent in each kernel.")
 @options.as_json
 @options.refusing_unreached
 def image(

@@ -131,7 +131,8 @@ def compress(
 @click.option(
     "--high-pass-hz",
     type=float,
-    help="Remove frequencies of the recorded signal below this one (Hz).",
+    help="Keep frequencies of the recorded signal above this one (Hz), and remove those below half "
+    "of it.",
     callback=options.checked(partial(validate.positive, "high_pass_hz", unit="Hz")),
 )
 @click.option(
