@@ -113,7 +113,7 @@ def known_points(
     "--element-length-m",
     type=float,
     callback=_positive("element_length_m", "m"),
-    help="Length of the elements (m); required if the beam is wide.",
+    help="Length of the elements (m), which wide beams need for accurate yaw.",
 )
 @click.option(
     "--sway-sd-m",
