@@ -32,7 +32,7 @@ _HDF5 = b"\x89HDF"
 @options.device
 @click.option(
     "--repeats", type=click.IntRange(0), default=0, show_default=True,
-    help="Also time the image with and without every effect, this many times.",
+    help="Also time the image with and without each effect, in this many runs.",
 )  # fmt: skip
 @options.as_json
 def assess(
@@ -45,10 +45,10 @@ def assess(
 ) -> None:
     """Show which effects an image needs, and what each costs.
 
-    For every effect the error without it is given. Assess a scene before anything is simulated, or
-    range lines with a grid from --scene or from --x, --y and --z. If the scene describes sonar and
-    track, element patterns are assessed too, and the motion of the receivers even if the lines have
-    no velocities. Grid, beam and tolerance are those of `clsas image`.
+    The table states the error of the image without each effect. Assess a scene before you simulate
+    it, or range lines with a grid from --scene or from --x, --y and --z. If the scene describes
+    sonar and track, element patterns are assessed too, and so is the motion of the receivers, even
+    if the lines have no velocities. Specify grid, beam and tolerance as for `clsas image`.
 
     \b
     Example:  clsas assess scene.toml --tolerance-db -40

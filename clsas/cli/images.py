@@ -70,7 +70,7 @@ _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is 
 @options.device
 @options.picture("the image in dB")
 @options.levels
-@click.option("--profile", is_flag=True, help="Also report the time of every kernel.")
+@click.option("--profile", is_flag=True, help="Also report the time spent in each kernel.")
 @options.as_json
 @options.refusing_unreached
 def image(
@@ -281,9 +281,9 @@ def plan(
 ) -> None:
     """Show how an image would be formed, its time and its error.
 
-    Grid, method and beam are those of `clsas image`. If the scene requests an exact image, a
-    tolerance of -50 dB is used instead. With --json and --filters the plan is complete: `clsas
-    show` draws it, and clsas.Plan.from_json reads it.
+    Specify grid, method and beam as for `clsas image`. If the scene requests an exact image, a
+    tolerance of -50 dB is used instead. With --json and --filters, the output is a complete plan,
+    which `clsas show` draws and clsas.Plan.from_json reads.
 
     \b
     Example:  clsas plan lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 --tolerance-db -40

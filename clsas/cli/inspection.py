@@ -33,9 +33,10 @@ def inspect(
 ) -> None:
     """Show what a recording contains, and what is wrong with it.
 
-    FILE is a recording that `clsas image` reads, or a file of echoes. Every finding comes with a
-    measured value and advice. The grid, the beam and the element length, of --scene or of the
-    options, are checked against the recording. `clsas convert` has options that remove faults.
+    FILE is a recording that `clsas image` reads, or a file of echoes. Every finding states a
+    measured value and what to do. The recording is checked against the grid and the beam from
+    --scene or from the options, and against the element length of the scene's sonar. `clsas
+    convert` has options that remove faults.
 
     \b
     Example:  clsas inspect recording.h5 --scene scene.toml --picture recording.png

@@ -31,7 +31,7 @@ from clsas.simulation.simulator import check_size
 def simulate(scene_file: Path, output: Path, picture: Path | None, as_json: bool) -> None:
     """Simulate the echoes that a scene file describes.
 
-    A warning is printed for every limit of sampling that the survey breaks.
+    A warning is printed for every sampling limit that the survey exceeds.
 
     \b
     Example:  clsas simulate scene.toml -o echoes.h5
@@ -87,7 +87,7 @@ def compress(
 ) -> None:
     """Compress echoes into range lines.
 
-    Window and oversampling are those of the options, or else of --scene.
+    Window and oversampling are taken from the options or, without these, from --scene.
 
     \b
     Example:  clsas compress echoes.h5 -o lines.h5 --window hamming
@@ -131,7 +131,8 @@ def compress(
 @click.option(
     "--high-pass-hz",
     type=float,
-    help="Remove frequencies of the recorded signal below this one (Hz).",
+    help="Keep frequencies of the recorded signal above this one (Hz), and remove those below half "
+    "of it.",
     callback=options.checked(partial(validate.positive, "high_pass_hz", unit="Hz")),
 )
 @click.option(

@@ -114,9 +114,12 @@ def quality(
 )
 @options.beam
 @options.device
-@click.option("--repeats", type=click.IntRange(1), default=3, show_default=True, help="Timed runs.")
+@click.option(
+    "--repeats", type=click.IntRange(1), default=3, show_default=True,
+    help="Number of timed runs of each image.",
+)  # fmt: skip
 @click.option("--csv", type=Output(".csv"), help="Also write the table.")
-@options.picture("time over error")
+@options.picture("time against error")
 @options.as_json
 def tradeoff(
     lines_file: Path | None,
@@ -134,8 +137,8 @@ def tradeoff(
 ) -> None:
     """Measure time and error of one image at many tolerances.
 
-    Use your own range lines with a grid as for `clsas image`, or the lines and grid of --case. The
-    errors are relative to the exact image. Resolution and side lobes are those of the strongest
+    Use your own range lines, with a grid as for `clsas image`, or the lines and the grid of --case.
+    Errors are relative to the exact image. Resolution and side lobes are measured at the strongest
     point.
 
     \b
@@ -208,7 +211,7 @@ def bench(
     Without CASE, all cases run, which takes minutes. Cases bp-... form an image exactly. Cases
     ffbp-... form a factorized image, and compare it with the exact one. mosaic-wreck forms a
     mosaic, and compares it with exact images with and without a beam; its lines are simulated once,
-    which takes minutes. With --json every case is one line.
+    which takes minutes. With --json, the results of each case are one line.
 
     \b
     Example:  clsas bench ffbp-2k --tolerance-db -40 --json

@@ -74,7 +74,7 @@ _LISTED = 3  # patches that are listed for each flag; arbitrary
 )  # fmt: skip
 @click.option(
     "--verify", is_flag=True,
-    help="Only compare the whole store with its checksums.",
+    help="Form nothing; compare the whole store with its checksums.",
 )  # fmt: skip
 @options.picture("an overview in dB")
 @options.levels
@@ -104,8 +104,9 @@ def mosaic(
 ) -> None:
     """Form an image of any size, patch by patch.
 
-    The patches go into a Zarr store. Grid, method and beam are those of `clsas image`. Without
-    --lines, the scene is simulated first. Without a scene, --lines, --x, --y and -o are required.
+    The patches are written to a Zarr store. Specify grid, method and beam as for `clsas image`.
+    Without --lines, the scene is simulated first. Without a scene, --lines, --x, --y and -o are
+    required.
 
     After an interruption, by Ctrl-C or anything else, the same command continues, and forms damaged
     patches again. With --verify it only lists damage; the exit code is then 1 if there is any.

@@ -49,7 +49,8 @@ def _positive(name: str, unit: str) -> Any:
     "--search-m",
     type=float,
     callback=_positive("search_m", "m"),
-    help="Largest error of a range that is searched (m). [default: 50 resolution cells]",
+    help="Largest range error to search for (m). [default: 50 resolution cells, or 70 % of the "
+    "smallest distance in range between two reflectors if that is less]",
 )
 @options.as_json
 def known_points(
@@ -112,7 +113,7 @@ def known_points(
     "--element-length-m",
     type=float,
     callback=_positive("element_length_m", "m"),
-    help="Length of the elements (m); required if the beam is wide.",
+    help="Length of the elements (m), which wide beams need for accurate yaw.",
 )
 @click.option(
     "--sway-sd-m",
@@ -212,8 +213,8 @@ def focus(
 ) -> None:
     """Correct a track by autofocus on bright responses.
 
-    The grid, of --scene or of --x, --y and --z, should contain some dozen bright responses. A
-    shift and a linear trend of the track cannot be observed, and stay as they are.
+    The grid, from --scene or from --x, --y and --z, should contain a dozen or so bright responses.
+    A shift and a linear trend of the track cannot be observed, and are not corrected.
 
     \b
     Example:  clsas focus lines.h5 --x 2:10:512 --y 28:32:320 -o focused.h5

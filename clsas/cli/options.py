@@ -46,12 +46,12 @@ def picture(what: str) -> Callable:
     """Return the option for a picture of the result; earlier versions called it --png."""
     return click.option(
         "--picture", "--png", "picture", type=Output(*PICTURES),
-        help=f"Also draw {what}; the suffix decides between PNG, PDF and SVG.",
+        help=f"Also draw {what}, as PNG, PDF or SVG according to the suffix.",
     )  # fmt: skip
 
 
 def refusing_unreached(command: Callable) -> Callable:
-    """Return a command that refuses grids which no line reaches, or takes --allow-unreached."""
+    """Return a command that refuses a grid that no line reaches, or takes --allow-unreached."""
 
     @functools.wraps(command)
     def run(*args: Any, allow_unreached: bool, **given: Any) -> Any:
@@ -61,7 +61,7 @@ def refusing_unreached(command: Callable) -> Callable:
             try:
                 return command(*args, **given)
             except UnreachedWarning as error:
-                raise ValueError(f"{error}. --allow-unreached forms it all the same") from None
+                raise ValueError(f"{error}. To form it anyway, use --allow-unreached") from None
 
     return click.option(
         "--allow-unreached", is_flag=True,
@@ -88,14 +88,14 @@ dynamic_range = click.option(
 )  # fmt: skip
 colour_map = click.option(
     "--colour-map", "--colours", "colour_map",
-    help="Colours of the picture: sonar (black, copper, cream), gray, cividis or any other of "
-    "matplotlib's. [default: inferno]",
+    help="Colours of the picture: sonar (black, copper, cream), gray, cividis or any other colour "
+    "map of Matplotlib. [default: inferno]",
 )  # fmt: skip
 levels = _together(
     dynamic_range,
     click.option(
         "--percentiles", type=PERCENTILES,
-        help="Show levels between these percentiles of all pixels instead, such as 1,99.5.",
+        help="Let the colours span these percentiles of the levels instead, such as 1,99.5.",
     ),
     colour_map,
 )  # fmt: skip
@@ -138,16 +138,16 @@ method = _together(
                 least=wavelengths(BEST_TOLERANCE_DB), most=wavelengths(WORST_TOLERANCE_DB),
             )
         ),
-        help="The same as a range error in wavelengths, such as 1/30.",
+        help="The tolerance, stated as a range error in wavelengths, such as 1/30.",
     ),
     click.option(
         "--stages", type=STAGES, metavar="QRxQI,...",
-        help="Use the thesis's method with these QR and QI of its stages, such as 2x2,2x2.",
+        help="Use the thesis's method with this QR and QI in each stage, such as 2x2,2x2.",
     ),
 )  # fmt: skip
 beam = _together(
     click.option(
-        "--beam-deg", type=float, help="Weigh channels by a beam of this full width (degrees)."
+        "--beam-deg", type=float, help="Weight channels with a beam of this full width (degrees)."
     ),
     click.option(
         "--beam-shape", type=click.Choice(SHAPES),

@@ -103,8 +103,8 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     Parameters
     ----------
     path : path-like
-        The file, whose folder must exist. A name that ends in .h5, .hdf5, .he5 or has no suffix
-        selects HDF5, and .cphd selects CPHD (see `write_cphd`).
+        File to write, in a folder that exists. The suffix selects the format: .h5, .hdf5, .he5 or
+        no suffix for HDF5, and .cphd for CPHD (see `write_cphd`).
     obj : Grid, RangeLines, Image or Echoes
         The object. `load` returns it from HDF5 bit for bit.
 

@@ -216,8 +216,9 @@ def survey_lines(
 ) -> RangeLines:
     """Return range lines of a single point, with the geometry and the band of a survey.
 
-    They take little time, and stand for the survey's own lines in `assess` and `plan`. They reach
-    from the nearest to the farthest pixel of the grid, with some samples beyond.
+    They take little time to compute, and can replace the lines of the survey in `assess` and
+    `plan`. They extend from the range of the nearest pixel of the grid to that of the farthest,
+    and some samples beyond.
 
     Parameters
     ----------
@@ -237,7 +238,7 @@ def survey_lines(
     Raises
     ------
     TypeError, ValueError
-        If an argument has the wrong type or is out of bounds, or the lines are too long for the
+        If an argument has the wrong type or is out of bounds, or the lines do not fit into
         memory.
 
     See Also

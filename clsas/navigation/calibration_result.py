@@ -19,7 +19,7 @@ UNITS = {"time_offset": "s", "sound_speed": "m/s", "forward": "m", "port": "m", 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Result of a calibration with known points. Values are corrections, which were added.
+    """Result of a calibration with known points. Its values are the corrections that were added.
 
     Attributes
     ----------
@@ -31,16 +31,16 @@ class Calibration:
         Corrections in s, m/s and m: time added to that of every sample, speed added to the lines'
         sound speed, and displacement added to all positions.
     covariance : float64 [unknowns, unknowns]
-        Covariance of the values.
+        Covariance matrix of the values, in the products of their units.
     held : tuple of str
-        Unknowns that the points do not distinguish from others, and that were not changed.
+        Unknowns that the points cannot distinguish from others. They were not changed.
     residual_m : float64 [channels, points]
         Measured ranges minus those of the corrected lines; NaN where a point was not seen.
     misfit_m : float
         Rms error of ranges in addition to the noise, due to the track, the points or the model.
     phases : bool [points]
-        Whether the phases of a point's response were used. If not, its ranges are those of the
-        envelope.
+        True where the phases of a point's response were used. Elsewhere, the ranges are those of
+        the peak of the envelope.
 
     See Also
     --------

@@ -59,13 +59,13 @@ def calibrate_track(
     points_m : array_like, [points, 3]
         Positions of the reflectors.
     unknowns : sequence of {"time_offset", "sound_speed", "forward", "port", "up"}
-        What to solve for, the most important first. A time offset is equivalent to a bias of
-        ranges. "forward", "port" and "up" are the lever arm, a displacement of all transmitters and
-        receivers in the frame of the platform.
+        Unknowns to solve for, the most important first. A time offset is equivalent to a bias of
+        all ranges. "forward", "port" and "up" are the lever arm, a displacement of all transmitters
+        and receivers in the frame of the platform.
     search_m : float, optional
-        Largest error of a range that is searched, metres. It should be less than the distance in
-        range between two reflectors. By default 50 range resolution cells, or 70 % of that
-        distance if this is less.
+        Largest range error to search for, metres. It should be less than the distance in range
+        between any two reflectors. The default is 50 range resolution cells, or 70 % of the
+        smallest such distance if that is less.
     track : Track, optional
         Attitude of the platform, ping by ping, which orients the lever arm. By default, forward is
         along the track, and up is perpendicular to it.
@@ -98,13 +98,13 @@ def calibrate_track(
     -----
     The range of a response is measured by the peak of its envelope, and its standard deviation is
     the Cramer-Rao bound. Where the fit of all these ranges predicts phases to a fraction of a
-    cycle, a second fit includes the changes of phase from channel to channel. The phase of a
-    reflector itself is unknown, so that phases contain no information about a constant range.
+    cycle, a second fit includes the changes of phase from channel to channel. Because the phase of
+    a reflector itself is unknown, phases contain no information about a bias of its ranges.
 
     Residuals in excess of the noise are attributed to an error of the same size for all reflectors.
-    The standard deviations include this error. They also take into account that it is common to
-    the receivers of a ping and persists over pings, as far as the residuals show it. They do not
-    include a displacement or a bend of the whole track.
+    The standard deviations include this error. They also take into account that the receivers
+    of a ping share this error, and that it persists over several pings as far as the residuals show
+    it. They do not include a displacement or a bend of the whole track.
 
     Examples
     --------

@@ -59,11 +59,11 @@ class Micronavigation:
     overlap : int64 [pings - 1]
         Number of pairs of channels that share a phase centre.
     persistence : float
-        Variance of the sum of the errors of many steps, over that of independent errors. It exceeds
-        1 because echoes stay in the beam for many pings. It is estimated from the scatter between
-        blocks of range, and is at least the number of pings times the share of the variance that
-        is due to having few echoes. The standard deviations of positions and of the track's shape
-        include it.
+        Variance of the sum of the errors of many steps, divided by the variance that independent
+        errors would have. It exceeds 1 because echoes stay in the beam for many pings. It is
+        estimated from the scatter between blocks of range, and is at least the number of pings
+        times the share of the variance that is due to having few echoes. The standard deviations
+        of positions and of the track's shape include it.
 
     See Also
     --------

@@ -39,7 +39,7 @@ class Processed:
     steps : tuple of StepRecord
         Records of the steps, in the order in which they ran.
     repeated : tuple of str
-        Steps that ran this time; the others had run before with the same inputs.
+        Steps that were run this time. The others had already been run with the same inputs.
     """
 
     folder: Path

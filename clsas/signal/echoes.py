@@ -31,14 +31,15 @@ class Echoes:
     sample_rate_hz : float
         Sample rate, hertz.
     carrier_hz : float
-        Frequency that was mixed out, hertz. For real samples the frequency of their carrier.
+        Frequency by which complex samples were mixed down, hertz. For real samples, the frequency
+        of their carrier.
     tx_m, rx_m : array_like, [channels, 3] or [3]
         Transmitter and receiver positions at transmission, metres.
     sound_speed_m_s : float
         Speed of sound, metres per second.
     pulse : Pulse, optional
-        Transmitted pulse, with the same carrier. None if the pulse is too short to need
-        compression.
+        Transmitted pulse, with the same carrier as the samples. Leave it out if the pulse is too
+        short to need compression.
     rx_velocity_m_s : array_like, [channels, 3] or [3], optional
         Velocity of the receivers while the sound travels, metres per second. None means
         stop-and-hop.

@@ -16,8 +16,8 @@ from clsas.core.extras import needed
 class Replica:
     """Pulse as measured in a tank, at a hydrophone, or through a loop of the electronics.
 
-    Sample n was taken n/sample_rate_hz after the start of transmission. An echo of A times these
-    samples becomes a point of amplitude A in the compressed lines.
+    Sample n was taken n/sample_rate_hz after the start of transmission. An echo that equals A times
+    these samples becomes a point of amplitude A in the compressed lines.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ _SLACK = 0.01
 
 @dataclass(frozen=True)
 class Finding:
-    """A problem of a survey or a recording.
+    """Problem that a check found in a survey or a recording.
 
     Parameters
     ----------
@@ -40,7 +40,8 @@ class Finding:
     remedy : str
         What to do about it.
     where : tuple of int
-        Numbers of the pings or channels concerned, from 0. The message says which of the two.
+        Indices of the pings or channels concerned, from 0. The message states whether they are
+        pings or channels.
 
     See Also
     --------
@@ -66,9 +67,8 @@ def check_sampling(
 ) -> list[Finding]:
     """Return the sampling limits that a survey of a grid violates.
 
-    Call it as `check_sampling(sonar, track, grid)` before a survey, and as
-    `check_sampling(lines, grid)` for range lines, for which the sonar and the track need not be
-    known.
+    To check a survey before it is recorded, call `check_sampling(sonar, track, grid)`. To check
+    range lines, call `check_sampling(lines, grid)`, which needs neither the sonar nor the track.
 
     Parameters
     ----------
@@ -104,9 +104,10 @@ def check_sampling(
     Notes
     -----
     The spacing of the phase centres along the track may exceed half an element by at most 1 %
-    [27], [31]. For elements without a length the limit keeps the grating lobes of every target off
-    the grid or out of the beam, whichever allows the wider spacing. The ping rate must leave time
-    for the last echo from the grid [24]. It is not checked for range lines, which have no times.
+    [27], [31]. For elements without a length, the limit is the spacing that keeps the grating lobes
+    of every target off the grid or out of the beam, whichever of the two spacings is wider. The
+    ping rate must leave time for the last echo from the grid [24]. It is not checked for range
+    lines, which have no times.
 
     References
     ----------

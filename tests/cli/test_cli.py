@@ -420,7 +420,7 @@ def test_a_grid_that_no_line_reaches_is_refused_unless_it_is_allowed(made, tmp_p
     assert stderr.startswith("Error: no pixel of the grid lies within any line's range")
     assert "the grid lies at 19999.6 to 21000.5 m" in stderr
     assert "would be reached if it were in mm" in stderr
-    assert stderr.endswith("--allow-unreached forms it all the same\n")
+    assert stderr.endswith("To form it anyway, use --allow-unreached\n")
     assert stderr.count("\n") == 1
     assert not path.exists()
     _, stderr = run(*command, "--allow-unreached")
