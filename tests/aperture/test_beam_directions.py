@@ -21,7 +21,7 @@ def lines_at(tx_m):
 
 @pytest.mark.parametrize("turns", ["circle", "helix"])
 def test_a_beam_on_a_target_stays_there_past_the_ends(turns):
-    """Positions go on straight ahead there; headings that stood still would lose the target."""
+    """Past the ends positions continue straight; with constant headings the beam would miss."""
     tx_m = TRACKS["helix"]() if turns == "helix" else TRACKS["helix"]()[:180] * [1, 1, 0]
     lines = lines_at(tx_m)
     track = (
@@ -44,7 +44,7 @@ def test_a_scan_to_and_fro_has_one_heading_without_a_squint(squint_deg):
 
 
 def test_rates_hold_all_over_a_box():
-    """Around the middle of a circle weights change at the corners of a box, not in its middle."""
+    """Around the centre of a circle, weights change at the corners of a box, not in its middle."""
     tx_m = TRACKS["helix"]()[:180] * [1, 1, 0]
     track = mean_track(lines_at(tx_m), WAVELENGTH)
     beam = BeamWindow(20, "hann")

@@ -85,12 +85,12 @@ def test_channels_beside_each_other_are_no_passes(name):
     assert sheet(lines_at(tx_m), WAVELENGTH).is_sheet
 
 
-def test_short_passes_have_none():
+def test_short_passes_have_no_strips():
     tx_m = TRACKS["passes"]().reshape(8, 200, 3)[:, :20].reshape(-1, 3)
     assert strips(lines_at(tx_m), WAVELENGTH) is None
 
 
-def test_only_channels_far_from_any_curve_begin_with_another_shape(monkeypatch):
+def test_only_channels_far_from_any_curve_get_another_shape(monkeypatch):
     tx_m = np.linspace([0, 0, 0], [50, 0, 0], 4000)
     assert simplest_track(lines_at(tx_m), WAVELENGTH)[0] == "track"
     assert simplest_track(lines_at(20 * TRACKS["planar"]()), WAVELENGTH)[0] == "sheet"
@@ -117,7 +117,7 @@ def test_points_on_a_sheet_lie_in_the_direction_of_channels():
 
 @pytest.mark.parametrize("name", ["helix", "planar", "spiral"])
 def test_weights_interpolate_smooth_functions_on_a_sheet(name):
-    """Over two stages: from channels to virtual ones, and from these to fewer."""
+    """There are two stages: from channels to virtual channels, and from these to fewer."""
     track = mean_track_of(lines_at(TRACKS[name]()), "sheet", WAVELENGTH)
     aperture = interpolation.design(6, 2.0, FLAT)
     samples = [line.samples.size for line in (track.line_along(0.5), track.line_across(0.5))]

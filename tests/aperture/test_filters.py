@@ -16,7 +16,7 @@ def power(error_db):
 @pytest.mark.parametrize("aperture_taps", [4, 8])
 @pytest.mark.parametrize("stages", [1, 4])
 @pytest.mark.parametrize("most_db", [-25.0, -50.0])
-def test_filters_take_what_they_may_err_by(of_highest, aperture_taps, stages, most_db):
+def test_filters_use_up_the_error_that_is_allowed(of_highest, aperture_taps, stages, most_db):
     steering = steering_spectrum(of_highest)
     choice = choose(LINES, 6, aperture_taps, stages, most_db)
     found = choice.design(LINES, steering, stages, most_db)
@@ -35,7 +35,7 @@ def test_few_frequencies_below_the_highest_allow_fewer_virtual_channels():
 
 @pytest.mark.parametrize("of_highest", [1.0, 0.5, np.linspace(0.1, 1.0, 33)])
 def test_the_spectrum_of_steering_functions(of_highest):
-    """All of the power, and none that turns faster than the fastest phase."""
+    """It contains all of the power, and none beyond the fastest phase."""
     spectrum = steering_spectrum(of_highest)
     assert spectrum.power.sum() == pytest.approx(1)
     assert (spectrum.power >= 0).all()

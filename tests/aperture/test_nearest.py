@@ -17,7 +17,7 @@ def range_error_m(r, t, a, b):
 
 
 def largest_by_angle(half_length_m, range_m, away_rad):
-    """The largest [40] over directions of the beam and of points up to some angle from it."""
+    """Largest error [40] over beam directions, and over points up to an angle from the beam."""
     angle = np.linspace(0, np.pi, 721)[:, None]
     away = np.linspace(-away_rad, away_rad, 41)
     return np.abs(range_error_m(range_m, half_length_m, angle, away)).max()
@@ -31,7 +31,7 @@ def test_operations_of_the_worked_example():
 
 
 def test_operations_of_lines_that_do_not_divide():
-    # 10 lines in threes are 4; every line of a stage costs gamma more.
+    # Sums of 3 of 10 lines are 4; each line of a stage costs gamma in addition.
     assert operations([(3, 2), (2, 1)], 10, (100, 50), 1000, gamma=5) == [
         10 * (4 * 100 + 5),
         4 * (4 * 50 + 5),
@@ -60,7 +60,7 @@ def test_stage_errors_near_the_aperture():
 
 
 def test_range_error_against_the_points_themselves():
-    # The end of the subaperture at (t, 0); the beam's point and the other at r under a and a + b.
+    # The subaperture ends at (t, 0). Two points are at range r, at angles a and a + b.
     random = np.random.default_rng(1)
     r, t = random.uniform(1, 50, 200), random.uniform(0, 50, 200)
     a, b = random.uniform(0, np.pi, 200), random.uniform(-1, 1, 200)

@@ -25,7 +25,7 @@ WAVELENGTH = 1500.0 / CARRIER
 
 
 def lines_of(tx, rx=None, velocity=None):
-    """Lines of one sample: only where they were taken matters."""
+    """Lines of one sample each, of which only the geometry matters."""
     rx = tx if rx is None else rx
     return RangeLines(np.ones((len(tx), 1), complex), 1.0, 0.01, tx, rx, CARRIER, 1500.0, velocity)
 
@@ -36,12 +36,12 @@ def circle(channels, degrees, radius_m=20.0):
 
 
 def distance_m(track, centres_m):
-    """Of phase centres from their places on the track."""
+    """Distances of phase centres from their positions on the track."""
     return np.linalg.norm(track.positions_m(track.coordinate) - centres_m, axis=1)
 
 
 def pings():
-    """Of 6 receivers each; the first of a ping lies behind the last of the one before."""
+    """Pings of 6 receivers. The first receiver of a ping is behind the last of the ping before."""
     tx = np.repeat(along_x(60, 0.07), 6, axis=0)
     return tx, tx + np.tile(along_x(6, 0.034), (60, 1))
 
@@ -64,11 +64,11 @@ def test_the_track_follows_a_smooth_path(name):
 
 
 @pytest.mark.parametrize("name", TRACKS)
-def test_places_rise_along_a_path(name):
-    place = mean_track(lines_of(TRACKS[name]), WAVELENGTH).coordinate
-    steps = np.diff(place)
+def test_coordinates_increase_along_a_path(name):
+    coordinate = mean_track(lines_of(TRACKS[name]), WAVELENGTH).coordinate
+    steps = np.diff(coordinate)
     assert (steps > 0).all() or (steps < 0).all()
-    assert np.ptp(place) == pytest.approx(1, abs=0.01)
+    assert np.ptp(coordinate) == pytest.approx(1, abs=0.01)
 
 
 @pytest.mark.parametrize("name", TRACKS)
@@ -78,7 +78,7 @@ def test_the_order_of_channels_does_not_matter(name):
     track = mean_track(lines_of(centres_m[order]), WAVELENGTH)
     assert distance_m(track, centres_m[order]).max() < 0.05 * WAVELENGTH
     steps = np.diff(track.coordinate[np.argsort(order)])
-    if name == "circle":  # which may begin anywhere
+    if name == "circle":  # its track may begin anywhere
         steps = np.delete(steps, np.abs(steps).argmax())
     assert (steps > 0).all() or (steps < 0).all()
 
@@ -93,7 +93,7 @@ def test_the_track_of_pings_of_many_receivers_is_straight():
 
 
 def test_the_track_does_not_follow_jitter():
-    """Errors of navigation, different from channel to channel, are no part of a smooth path."""
+    """Navigation errors that differ from channel to channel do not belong to a smooth path."""
     rng = np.random.default_rng(3)
     lines = lines_of(TRACKS["straight"] + rng.normal(0, 0.01, (300, 3)) * [0, 1, 1])
     tangent = mean_track(lines, WAVELENGTH).tangents_m(np.linspace(0, 1, 100))
@@ -102,7 +102,7 @@ def test_the_track_does_not_follow_jitter():
 
 
 @pytest.mark.parametrize("channels", [1, 2, 40])
-def test_channels_at_one_place_have_no_track(channels):
+def test_channels_at_one_position_have_no_track(channels):
     assert mean_track(lines_of(np.tile([1.0, 2, 3], (channels, 1))), WAVELENGTH) is None
 
 
@@ -128,7 +128,7 @@ def test_the_tangent_is_the_derivative():
     np.testing.assert_allclose(track.tangents_m(coordinate), slope, rtol=1e-5, atol=1e-4)
 
 
-def test_a_channel_off_the_track_is_seen_in_its_direction():
+def test_a_channel_off_the_track_appears_in_its_direction():
     centres_m = along_x(200, 0.03) + np.random.default_rng(4).normal(0, 0.05, (200, 3)) * [0, 1, 1]
     track = mean_track(lines_of(centres_m), WAVELENGTH)
     points_m = np.array([[0.5, 40, -5], [30, 30, -5], [-20, 25, 3]])
@@ -138,12 +138,12 @@ def test_a_channel_off_the_track_is_seen_in_its_direction():
         virtual, real = (way / np.linalg.norm(way, axis=1, keepdims=True) for way in ways)
         tangent = track.tangents_m(coordinate)
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-        # Along the track the directions agree, far better than the angle that channels are off.
+        # Along the track, directions agree far better than the angles by which channels are off.
         off = np.abs(np.einsum("ci,ci->c", virtual - real, tangent))
         assert off.max() < 2e-5
 
 
-def test_on_a_straight_track_channels_are_seen_where_they_are():
+def test_channels_on_a_straight_track_appear_where_they_are():
     track = mean_track(lines_of(TRACKS["straight"]), WAVELENGTH)
     coordinates, _ = track.apparent_coordinates(
         np.array([[0.0, 10, 0], [5, 3, 1]]), TRACKS["straight"]
@@ -159,8 +159,8 @@ def test_drift_is_the_mean_speed_of_receivers():
 
 
 @pytest.mark.parametrize("speed", [0.0, 20.0])
-def test_ranges_grow_as_those_of_places_do_once_stretched(speed):
-    """Also where every receiver moves otherwise during flight."""
+def test_stretched_ranges_grow_as_those_from_the_track(speed):
+    """This includes receivers with different velocities."""
     rng, length_m = np.random.default_rng(7), 1e-3
     tx = along_x(200, 0.03)
     rx = tx + rng.normal(0, 0.1, 3)
@@ -193,7 +193,7 @@ def test_ranges_grow_as_those_of_places_do_once_stretched(speed):
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_no_phase_turns_faster_than_its_bound(seed):
-    """The phase of any pixel against its subimage's centre, along any track."""
+    """The phase is that of any pixel relative to its subimage's centre, along any track."""
     rng = np.random.default_rng(seed)
     turn = np.linspace(-1, 1, 200)
     bends = rng.normal(size=(3, 3)) * [[4], [1], [0.5]]
@@ -208,7 +208,7 @@ def test_no_phase_turns_faster_than_its_bound(seed):
     boxes = PhaseBoxes(surface.steps_m, centre_m[None], extents, cycles_per_m, 0.1)
     bound = cycles_per_extent(track, boxes)[:, 0]
     bound = inside[0] * bound[0] + inside[1] * bound[1]
-    # A subimage of 16 x 8 pixels anywhere inside, and a pixel anywhere in that.
+    # A subimage of 16 x 8 pixels anywhere in the box, and a pixel anywhere in the subimage.
     coordinates = track.samples
     room = (np.array(side) - inside) / 2
     for _ in range(20):
@@ -227,7 +227,7 @@ def test_no_phase_turns_faster_than_its_bound(seed):
         assert (rate <= 1.1 * bound + 1e-3 * bound.max())[within].all()
 
 
-def test_rates_about_many_places_are_those_about_each():
+def test_rates_in_many_boxes_are_those_in_each():
     track = mean_track(lines_of(along_x(300, 0.02)), WAVELENGTH)
     surface = surface_of(Grid.plane((-1, 1, 40), (3, 5, 40)))
     centres_m = np.random.default_rng(2).uniform((-3, 2, -1), (3, 9, 1), (300, 3))
@@ -235,11 +235,11 @@ def test_rates_about_many_places_are_those_about_each():
     together = cycles_per_extent(track, boxes)
     for index in (0, 150, 299):
         alone = cycles_per_extent(track, replace(boxes, centres_m=centres_m[[index]]))
-        # Boxes are sampled more finely the nearer the nearest of them is.
+        # The density of points in all boxes depends on the distance of the nearest box.
         np.testing.assert_allclose(together[:, index], alone[:, 0], rtol=0.05)
 
 
-def test_turns_are_the_integral_of_rates():
+def test_phases_are_the_integral_of_rates():
     track = mean_track(lines_of(TRACKS["straight"]), WAVELENGTH)
     coordinate = track.samples
     cycles = cumulative_cycles(track, np.full((1, len(coordinate)), 7.0))[0]
@@ -257,7 +257,7 @@ def test_turns_are_the_integral_of_their_rate():
     assert np.ptp(cycles, axis=1) == pytest.approx([1.0, 0.25], rel=1e-3)
 
 
-def test_bistatic_channels_are_where_their_middles_are():
+def test_bistatic_channels_are_at_their_phase_centres():
     tx = TRACKS["straight"]
     track = mean_track(lines_of(tx, beside(tx, 0.4, 0.1, -0.1)), WAVELENGTH)
     middle_m = beside(tx, 0.2, 0.05, -0.05)

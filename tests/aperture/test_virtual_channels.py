@@ -15,7 +15,7 @@ FLAT = Spectrum(0.0, (np.arange(64) + 0.5) / 128, np.full(64, 1 / 64))
 
 
 def interpolation_error_db(case, side, aperture, root=(128, 128)):
-    """Of steering functions of pixels in subimages of a size, anywhere in a root; float64."""
+    """Error of interpolated steering functions of pixels in subimages of a size, in float64."""
     lines, grid = made(case)
     rng = np.random.default_rng(0)
     track, centres_m = mean_track(lines, WAVELENGTH), lines.phase_centres_m
@@ -57,7 +57,7 @@ def interpolation_error_db(case, side, aperture, root=(128, 128)):
 @pytest.mark.parametrize("side", [(64, 64), (16, 16), (64, 8)])
 @pytest.mark.parametrize("case", [straight, near, swaying, arc], ids=lambda case: case.__name__)
 def test_steering_functions_are_interpolated_as_well_as_designed(case, side, taps, density):
-    """But for what a slowly changing spacing of virtual channels adds, which plans account for."""
+    """A changing spacing of virtual channels adds a small error, which plans predict."""
     aperture = interpolation.design(taps, density, FLAT)
     designed, uneven = 10 ** (aperture.error_db / 10), 10**-6.3
     assert interpolation_error_db(case, side, aperture) <= 10 * np.log10(1.26 * designed + uneven)

@@ -16,7 +16,7 @@ HANN = BEAMS[0]
 
 @pytest.fixture(scope="module")
 def wide_plan():
-    """A beam that leaves most of the track unseen, over a scene beyond both ends of it."""
+    """A plan with a narrow beam, for a scene that extends past both ends of the track."""
     case = cases.scaled(512)
     lines, grid = case.lines(), case.grid
     return plan(lines, grid, tolerance_db=-40, beam=case.beam, costs=EXACT_IS_SLOW)
@@ -37,7 +37,7 @@ def beside():
 
 @pytest.fixture(scope="module", params=["whole", "gap"])
 def any_track(request, wide):
-    """The same, and with pings missing over more than a root and its beam."""
+    """The same geometry, and one with a gap in the track longer than a root and its beam."""
     if request.param == "whole":
         return wide
     case = cases.scaled(512)
@@ -48,11 +48,11 @@ def any_track(request, wide):
     return geometry_of(lines, surface_of(case.grid), chosen.factorization, chosen.beam)
 
 
-# What is formed
+# Channels that are formed
 
 
 @pytest.mark.slow
-def test_what_is_formed_is_what_was_planned(wide, wide_plan):
+def test_channels_are_as_many_as_planned(wide, wide_plan):
     sector = sector_of(wide, wide.division.roots)
     for level, (need, stage) in enumerate(zip(sector.needs, wide_plan.stages, strict=False)):
         formed = (need.end - need.begin).sum() * stage.samples
@@ -66,12 +66,12 @@ def test_both_ends_of_the_track_are_alike(wide):
     sector = sector_of(wide, wide.division.roots)
     need = sector.needs[-1]
     x_m = sector.root_m[:, 0]
-    assert abs(x_m.min() + x_m.max()) < 0.1  # metres: pixels are mirrored but for half of one
+    assert abs(x_m.min() + x_m.max()) < 0.1  # metres; pixels are symmetric except for half a pixel
     left, right = ((need.last - need.first)[x_m == end].mean() for end in (x_m.min(), x_m.max()))
     assert left == pytest.approx(right, rel=0.1, abs=1.5)
 
 
-def test_nothing_is_formed_that_no_channel_reaches(wide):
+def test_virtual_channels_without_contributions_are_not_formed(wide):
     sector = sector_of(wide, wide.division.roots)
     counts = np.full(len(sector.roots), sector.coordinate.shape[1])
     for virtual, need in zip(sector.virtual, sector.needs, strict=True):
@@ -91,7 +91,7 @@ def test_subimages_use_what_their_parents_have(any_track):
         assert (need.end <= above.last[:, parents])[used].all()
 
 
-# Together or one by one
+# Several roots together
 
 
 @pytest.mark.parametrize("case", [beside, swaying], ids=["straight", "swaying"])
@@ -115,7 +115,7 @@ def test_roots_do_not_depend_on_those_prepared_beside_them(case):
             )
 
 
-def test_leaves_are_seen_from_wherever_they_are_seen_alone():
+def test_leaves_are_visible_from_wherever_they_are_alone():
     lines, grid = beside()
     chosen = plan(lines, grid, tolerance_db=-40, beam=HANN, costs=EXACT_IS_SLOW)
     geometry = geometry_of(lines, surface_of(grid), chosen.factorization, chosen.beam)
@@ -133,7 +133,7 @@ def test_leaves_are_seen_from_wherever_they_are_seen_alone():
     )
     need, coordinate = sector.needs[-1], sector.virtual[-1].coordinate
     counts = np.full(len(sector.roots), sector.coordinate.shape[1])
-    for virtual in sector.virtual:  # as far as channels reach
+    for virtual in sector.virtual:  # only those to which channels contribute
         counts = virtual.base[np.arange(len(counts)), counts - 1] + virtual.taps
     inside = np.all(leaves < grid.shape, axis=-1)
     for root, leaf in np.argwhere(inside & (stop > start)):
@@ -145,7 +145,7 @@ def test_leaves_are_seen_from_wherever_they_are_seen_alone():
         assert need.last[root, leaf] > mine.max()
 
 
-# How roots see channels
+# Shifts and phases of raw channels
 
 
 def test_references_are_ranges_and_phases(wide):
@@ -156,7 +156,7 @@ def test_references_are_ranges_and_phases(wide):
     range_m = bistatic_range_m(sector.root_m[:, None], lines.tx_m[line], lines.rx_m[line])
     index = (range_m - lines.first_range_m[line]) / lines.range_step_m
     centre = found["start"] + found["nu"].astype(float) + (wide.factorization.align.taps - 1) / 2
-    # Of two channels the places differ as their ranges do, in upsampled samples.
+    # Positions of two channels differ as their ranges do, in upsampled samples.
     away = (centre - centre[:, :1]) / resampling.ratio
     np.testing.assert_allclose(away, index - index[:, :1], atol=1e-4)
     cycles = lines.carrier_cycles_per_m * range_m

@@ -109,7 +109,7 @@ def coarse_pixels():
 
 
 def rough():
-    """Every pixel at a height of its own."""
+    """A height map of white noise."""
     grid = around(0, 40)
     return over(grid.with_height(np.random.default_rng(0).normal(0, 0.05, grid.shape)))
 
@@ -120,13 +120,13 @@ def cliff():
     return over(grid.with_height(1.5 * (row + 0.5 * column > 110)))
 
 
-def seen_while_moving():
-    """The dunes, by an array of receivers that move."""
+def hills_while_moving():
+    """The hills, imaged by an array of receivers that move during flight."""
     return made(moving_array)[0], made(hills)[1]
 
 
 def scattered():
-    """Points at random, more here than there, and none in between."""
+    """Random points in two clusters, one denser than the other, with a gap between them."""
     rng = np.random.default_rng(5)
     points_m = np.concatenate([rng.normal(0, 0.4, (6000, 3)), rng.uniform(-1, 1, (6000, 3))])
     points_m[:, 2] *= 0.1
@@ -135,7 +135,7 @@ def scattered():
 
 
 def volume():
-    """Points in a box, and those of one place twice."""
+    """Random points in a box, some of them twice."""
     points_m = np.random.default_rng(6).uniform(-0.4, 0.4, (5000, 3)) + [0, 40, 0]
     return over(Grid.points(np.concatenate([points_m, points_m[:500]])))
 
@@ -152,7 +152,7 @@ def profile():
     return over(Grid.points([-1, 39, 0] + along * [2, 3, -1]))
 
 
-OFF_A_PLANE = (hills, rough, cliff, seen_while_moving, scattered, volume, section, profile)
+OFF_A_PLANE = (hills, rough, cliff, hills_while_moving, scattered, volume, section, profile)
 STRAIGHT = (straight, low_frequency, high_frequency, far, near, squinted, deep, oriented)
 TRACKS = (
     swaying,
@@ -172,7 +172,7 @@ def name_of(value):
 
 
 def check(case, tolerance_db, device, beam=None):
-    """The error keeps the promise, and the prediction is a bound that lies within 6 dB."""
+    """Check that the error is within the tolerance and at most 6 dB below its predicted bound."""
     chosen = planned(case, tolerance_db, beam)
     assert not chosen.is_exact
     image = factorize(*made(case), chosen, device=device)
@@ -181,7 +181,7 @@ def check(case, tolerance_db, device, beam=None):
     assert chosen.predicted_error_db <= error_db + 6
 
 
-# The promise
+# Tolerances
 
 
 @pytest.mark.slow
@@ -214,18 +214,18 @@ def test_on_every_platform(case, platform):
 @pytest.mark.parametrize("tolerance_db", [-30, -50])
 @pytest.mark.parametrize("band", [0.05, 0.3])
 def test_a_point_where_subimages_of_all_sizes_meet(band, tolerance_db):
-    """Phases turn fastest at the corners of subimages, where filters err most."""
+    """Phases turn fastest at the corners of subimages, where errors of filters are largest."""
     grid = around(0, 40, shape=(512, 512))
-    wish = {"tolerance_db": tolerance_db, "costs": EXACT_IS_SLOW}
+    request = {"tolerance_db": tolerance_db, "costs": EXACT_IS_SLOW}
     radio = {"carrier_hz": CARRIER, "bandwidth_hz": band * CARRIER}
 
     def lines_of(row, column):
         place_m = grid.origin_m + row * grid.row_step_m + column * grid.column_step_m
         return simulate_lines(TRACK, TRACK, PointTargets(place_m[None], [1.0]), **radio)
 
-    rows, columns = plan(lines_of(255.5, 255.5), grid, **wish).sides[0]
+    rows, columns = plan(lines_of(255.5, 255.5), grid, **request).sides[0]
     lines = lines_of(256 // rows * rows - 0.5, 256 // columns * columns - 0.5)
-    chosen = plan(lines, grid, **wish)
+    chosen = plan(lines, grid, **request)
     assert chosen.sides[0] == (rows, columns)
     formed = factorize(lines, grid, chosen)
     assert relative_error_db(formed, form_exactly(lines, grid, accuracy_db=-80)) <= tolerance_db
@@ -238,13 +238,13 @@ def test_pixels_much_coarser_than_the_resolution(device, tolerance_db):
 
 
 def wide_image():
-    """Much wider than the aperture: every pixel sees little of the beam."""
+    """An image much wider than the aperture, so that few channels cover each pixel."""
     grid = around(0, 40, pixel_m=(0.015, 0.06), shape=(100, 240))
     return over(grid, along_x(200, 0.014))
 
 
 def few_arrays():
-    """168 channels in steps of four, seen from all around."""
+    """168 channels all around the image, in groups of four."""
     angle = np.repeat(np.linspace(0, 2 * np.pi, 42, endpoint=False), 4)[:, None]
     radius = 20 * np.concatenate([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     along = np.concatenate([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
@@ -284,23 +284,23 @@ def test_with_a_beam(beam, tolerance_db):
 @pytest.mark.parametrize(
     "beam", [KINKED, BeamWindow(12, "tukey"), BeamWindow(12, "hamming"), BeamWindow(12, "taylor")]
 )
-def test_windows_with_kinks_and_steps_keep_the_promise(beam, tolerance_db):
-    """If need be by plain backprojection: neither nodes nor blocks follow them well."""
+def test_windows_with_kinks_and_steps_keep_the_tolerance(beam, tolerance_db):
+    """The image may be exact: virtual channels and blocks of pixels follow such windows poorly."""
     lines, grid = made(near)
     chosen = planned(near, tolerance_db, beam)
     exact = backproject(lines, Grid.points(grid.positions_m()), accuracy_db=-85, beam=beam)
     assert relative_error_db(factorize(lines, grid, chosen).pixels, exact.pixels) <= tolerance_db
 
 
-def few_seen(y, channels, spacing_m, *, pixel_m, off_m=0.0, **more):
-    """A small image, for the beam of which there are few channels; these `off_m` their track."""
+def few_channels(y, channels, spacing_m, *, pixel_m, off_m=0.0, **more):
+    """A small image with few channels in the beam, at random offsets of `off_m` from the track."""
     off = np.random.default_rng(1).normal(0, off_m, (channels, 3)) * [0.3, 1, 0.5]
     grid = around(0, y, shape=(96, 96), pixel_m=pixel_m)
     return over(grid, along_x(channels, spacing_m) + off, **more)
 
 
 def jittery_and_few(off_m):
-    return few_seen(110, 315, 0.457, pixel_m=(0.006, 0.004), off_m=off_m)
+    return few_channels(110, 315, 0.457, pixel_m=(0.006, 0.004), off_m=off_m)
 
 
 @pytest.mark.slow
@@ -308,21 +308,25 @@ def jittery_and_few(off_m):
 @pytest.mark.parametrize(
     ("case", "beam", "tolerance_db"),
     [
-        (lambda: few_seen(50, 240, 0.3, pixel_m=(0.005, 0.005)), BeamWindow(12, "hamming"), -50),
-        (lambda: few_seen(117, 260, 0.36, pixel_m=(0.004, 0.006)), BeamWindow(6.8), -60),
-        (lambda: few_seen(40, 150, 0.22, pixel_m=(0.02, 0.01)), BeamWindow(3.6, "hann"), -20),
+        (
+            lambda: few_channels(50, 240, 0.3, pixel_m=(0.005, 0.005)),
+            BeamWindow(12, "hamming"),
+            -50,
+        ),
+        (lambda: few_channels(117, 260, 0.36, pixel_m=(0.004, 0.006)), BeamWindow(6.8), -60),
+        (lambda: few_channels(40, 150, 0.22, pixel_m=(0.02, 0.01)), BeamWindow(3.6, "hann"), -20),
         (lambda: jittery_and_few(0.03), BeamWindow(2.4), -20),
         (lambda: jittery_and_few(0.03), BeamWindow(2.4), -40),
         (lambda: jittery_and_few(0.01), BeamWindow(2.4, "hann"), -40),
         (
-            lambda: few_seen(8.7, 438, 0.0078, pixel_m=(0.004, 0.008), carrier_hz=300e3),
+            lambda: few_channels(8.7, 438, 0.0078, pixel_m=(0.004, 0.008), carrier_hz=300e3),
             BeamWindow(3.4, "tukey", taper=0.2),
             -25,
         ),
     ],
 )
-def test_edges_of_a_beam_that_few_channels_see(case, beam, tolerance_db, costs):
-    """They lie between channels, beyond the last one that sees anything; so do kinks."""
+def test_edges_of_a_beam_with_few_channels(case, beam, tolerance_db, costs):
+    """Edges and kinks of the beam lie between the last channel inside it and the next."""
     lines, grid = case()
     chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=beam, costs=costs)
     exact = backproject(lines, grid, accuracy_db=-80, beam=beam)
@@ -332,7 +336,7 @@ def test_edges_of_a_beam_that_few_channels_see(case, beam, tolerance_db, costs):
 @pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-25, -40])
 def test_a_track_that_turns_back_within_a_few_channels(tolerance_db):
-    """These are further off the mean track than all others."""
+    """Channels at the turn are farther from the mean track than all others."""
     there, back = along_x(227, 0.1011), along_x(228, 0.1006)[::-1] + [0, -2.41, 0]
     grid = around(-10.86, 41.35, pixel_m=(0.0059, 0.0034), shape=(158, 74), z=-12.46)
     lines, grid = over(grid, np.concatenate([there, back]), band=0.05)
@@ -393,8 +397,8 @@ def off_track():
     ids=["below the track", "a strip below it", "off the track", "apart"],
 )
 @pytest.mark.parametrize("tolerance_db", [-30, -50])
-def test_spikes_keep_the_promise(wild, tolerance_db):
-    """Boxes of more relief than they are away, or than all others have, are still accounted for."""
+def test_spikes_keep_the_tolerance(wild, tolerance_db):
+    """The prediction includes a box whose relief exceeds its distance, or that of all others."""
     lines, grid = wild()
     chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=EXACT_IS_SLOW)
     reference = backproject(lines, grid, accuracy_db=-85)
@@ -424,8 +428,8 @@ def test_a_flat_height_map_is_a_plane(platform):
 
 
 @pytest.mark.slow
-def test_a_beam_with_edges_is_worth_no_more_channels_than_there_are():
-    """A rectangular window has no band: denser channels help little."""
+def test_a_beam_with_edges_gets_a_bounded_number_of_virtual_channels():
+    """A rectangular window is not band-limited, so that denser virtual channels help little."""
     chosen = planned(near, -30, BeamWindow(12))
     assert all(stage.channels <= 4 * made(near)[0].channels for stage in chosen.stages)
     image = factorize(*made(near), chosen)
@@ -456,7 +460,7 @@ def test_no_stages_are_plain_backprojection(platform):
 
 @pytest.mark.slow
 def test_a_point_on_a_hill_keeps_its_amplitude_and_phase(platform):
-    """Only where the height map has it does every line agree on it."""
+    """All lines add up in phase only if the height map is right."""
     row, column = np.indices((65, 65))
     grid = around(0.3, 40.6, shape=(65, 65), z=-13.0)
     grid = grid.with_height(0.2 * np.sin(row / 9) * np.cos(column / 7))
@@ -488,7 +492,7 @@ def test_pixels_outside_the_beam_of_every_channel_are_zero(platform):
     assert relative_error_db(image, reference) <= -40
 
 
-# Few channels, few pixels, odd places
+# Few channels, few pixels, unusual positions
 
 
 SHAPES = [(1, 160), (160, 1), (2, 90), (90, 2), (17, 33), (67, 131), (300, 20)]
@@ -507,7 +511,7 @@ def test_any_shape_of_grid(shape):
 
 @pytest.mark.slow
 def test_a_line_of_pixels_needs_no_second_step(platform):
-    """`Grid.plane` makes one column with a step of zero."""
+    """`Grid.plane` gives a single column a step of zero."""
     grid = Grid.plane((0.3, 0.3, 1), (39, 41, 60))
     lines, _ = over(grid)
     chosen = plan(lines, grid, tolerance_db=-50, costs=EXACT_IS_SLOW)
@@ -577,7 +581,7 @@ def test_a_grid_that_no_line_reaches_warns_and_is_zero():
 
 
 def halved(case, tolerance_db):
-    """A plan whose lines are of half precision, whatever the device."""
+    """A plan with lines in half precision, for any device."""
     return changed(planned(case, tolerance_db), half_precision=True)
 
 
@@ -592,8 +596,8 @@ def test_half_precision_adds_what_is_predicted(device):
 @pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-50, -56])
 @pytest.mark.parametrize("length_m", [1.0, 0.3])
-def test_dense_channels_keep_the_promise(length_m, tolerance_db):
-    """Virtual channels are sums of hundreds of these, which half precision rounds many times."""
+def test_dense_channels_keep_the_tolerance(length_m, tolerance_db):
+    """Virtual channels are sums of hundreds of channels, which half precision rounds many times."""
     grid = around(0, 40, shape=(64, 64))
     lines, _ = over(grid, along_x(20000, length_m / 20000))
     chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=EXACT_IS_SLOW)
@@ -602,8 +606,8 @@ def test_dense_channels_keep_the_promise(length_m, tolerance_db):
     assert error_db <= chosen.predicted_error_db <= tolerance_db
 
 
-def test_loud_samples_that_no_pixel_sees(platform):
-    """They decide how lines are scaled: where half precision would hold too little, single does."""
+def test_loud_samples_outside_the_image(platform):
+    """They determine the scale of lines. Single precision is used if half is then too coarse."""
     lines, grid = made(straight)
     loud = 1e7 * noise(lines.channels, 300)
     longer = dataclasses.replace(
@@ -627,7 +631,7 @@ def test_the_scale_of_samples_does_not_matter(scale, platform):
     assert relative_error_db(image / np.float32(scale) * largest, exact(straight)) <= -50
 
 
-def test_lines_too_small_for_half_precision_are_held_in_single():
+def test_lines_too_small_for_half_precision_are_kept_in_single():
     lines, grid = made(straight)
     tiny = dataclasses.replace(lines, samples=np.complex64(1e-37) * lines.samples)
     with pytest.warns(ClsasWarning, match="single precision, not in half"):
@@ -635,15 +639,15 @@ def test_lines_too_small_for_half_precision_are_held_in_single():
     assert relative_error_db(image / np.float32(1e-37), exact(straight)) <= -50
 
 
-def test_what_is_faint_beside_what_is_strong_is_kept(platform):
-    """Half precision rounds by what it rounds, not by the largest: here 80 dB more."""
+def test_faint_echoes_next_to_strong_ones_are_kept(platform):
+    """Half precision rounds relative to each sample, not to the largest, 80 dB stronger."""
     lines, grid = made(straight)
     range_m = lines.first_range_m[:, None] + np.arange(lines.length) * lines.range_step_m
     fades = 10.0 ** (-4 * np.clip(range_m - 39.5, 0, 1))
     fading = dataclasses.replace(lines, samples=(lines.samples * fades).astype(np.complex64))
     chosen = halved(straight, -50)
     single = changed(chosen, half_precision=False)
-    with pytest.warns(ClsasWarning, match="outside the band"):  # which fading widens
+    with pytest.warns(ClsasWarning, match="outside the band"):  # fading widens it
         image, better = (
             factorize(fading, grid, each, device=platform).pixels for each in (chosen, single)
         )
@@ -652,7 +656,7 @@ def test_what_is_faint_beside_what_is_strong_is_kept(platform):
     assert relative_error_db(image[faint], better[faint]) <= -64
 
 
-# Plans in other places
+# Plans that are reused
 
 
 def test_a_plan_from_text_gives_the_same_image(platform):
@@ -663,7 +667,7 @@ def test_a_plan_from_text_gives_the_same_image(platform):
 
 
 def test_a_plan_holds_its_beam():
-    """Also one whose directions are arrays."""
+    """This includes a beam with an array of directions."""
     lines, grid = made(near)
     beam = BeamWindow(12, "hann", along=np.tile([1.0, 0.02, 0], (lines.channels, 1)))
     chosen = plan(lines, grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
@@ -675,7 +679,7 @@ def test_a_plan_holds_its_beam():
 @pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-50, -75])
 def test_a_noise_floor_far_above_the_band(tolerance_db):
-    """Sampled at 96 kHz, carrier kept, a sonar of 15 to 25 kHz; noise of -26 dB up to 48 kHz."""
+    """Echoes from 15 to 25 kHz, sampled at 96 kHz with their carrier; noise of -26 dB to 48 kHz."""
     track = along_x(300, 1 / 30)
     grid = Grid.plane((-4, 4, 160), (38, 46, 300))
     step_m = 1500 / 2 / 96e3
@@ -693,7 +697,7 @@ def test_a_noise_floor_far_above_the_band(tolerance_db):
 
 @pytest.mark.parametrize(("half", "factor"), [(False, 1e3), (True, 1024)])
 def test_a_plan_serves_other_samples(half, factor):
-    """By a power of 2 they are rounded alike in half precision too."""
+    """Scaling by a power of 2 does not change rounding in half precision."""
     lines, grid = made(straight)
     louder = dataclasses.replace(lines, samples=factor * lines.samples)
     chosen = changed(planned(straight, -50), half_precision=half)
@@ -702,7 +706,7 @@ def test_a_plan_serves_other_samples(half, factor):
 
 
 def test_a_plan_for_another_band_warns():
-    """Lines with nothing outside its band are as good as its own."""
+    """Lines without power outside the band of the plan are imaged as well as the plan's own."""
     lines, grid = made(straight)
     chosen = planned(straight, -50)
     time = np.arange(lines.length)
@@ -716,11 +720,11 @@ def test_a_plan_for_another_band_warns():
     with pytest.warns(ClsasWarning, match="outside the band that the plan was made for"):
         wrong = factorize(shifted, grid, chosen)
     right = backproject(shifted, grid, accuracy_db=-80)
-    assert relative_error_db(wrong, right) > -50  # indeed
+    assert relative_error_db(wrong, right) > -50
 
 
-def test_a_plan_for_lines_of_which_few_are_loud_knows_them():
-    """The noise of the others fills the band, but holds next to nothing."""
+def test_a_plan_fits_its_own_lines_if_few_of_them_are_loud():
+    """The noise of the others fills the band, but has very little power."""
     lines, grid = made(straight)
     loud = np.full((lines.channels, 1), 1e-4)
     loud[some_channels(lines.channels, 256)[100:104]] = 1.0
@@ -733,7 +737,7 @@ def test_a_plan_for_lines_of_which_few_are_loud_knows_them():
 
 
 def test_a_plan_serves_another_device(device):
-    """Made for devices of any width."""
+    """The plan is made for devices of different vector widths."""
     lines, grid = made(straight)
     chosen = plan(lines, grid, tolerance_db=-45, device=device, costs=EXACT_IS_SLOW)
     assert relative_error_db(factorize(lines, grid, chosen), exact(straight)) <= -45
@@ -778,7 +782,7 @@ def test_progress_counts_pixels(platform):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 5])
 def test_roots_that_overhang_the_grid_keep_the_tolerance(seed):
-    """Pixels of a root of 512 rows on a grid of 257 lie further from its middle than half of it."""
+    """In a root of 512 rows on a grid of 257, pixels are farther from the middle than usual."""
     off_m = np.random.default_rng(seed).normal(0, 0.01, (200, 3)) * [0, 1, 1]
     grid = around(-10.0, 40.0, shape=(257, 100), pixel_m=(0.015, 0.01))
     lines, _ = over(grid, along_x(200, 0.008) + off_m)
@@ -790,7 +794,7 @@ def test_roots_that_overhang_the_grid_keep_the_tolerance(seed):
 
 @pytest.mark.slow
 def test_a_gap_in_the_track_stays_empty(platform):
-    """No channel sees the pixels beside it, though virtual channels lie there."""
+    """Pixels opposite the gap are visible from no channel, but from virtual channels in the gap."""
     x = np.arange(-14, 14, 0.02)
     x = x[np.abs(x - 0.5) > 7]
     lines, grid = over(
@@ -798,8 +802,8 @@ def test_a_gap_in_the_track_stays_empty(platform):
         np.stack([x, *np.zeros((2, len(x)))], axis=1),
     )
     beam = BeamWindow(2.0, "hann")
-    wish = {"tolerance_db": -40, "beam": beam, "costs": EXACT_IS_SLOW, "device": platform}
-    chosen = plan(lines, grid, memory_bytes=15 << 20, **wish)
+    request = {"tolerance_db": -40, "beam": beam, "costs": EXACT_IS_SLOW, "device": platform}
+    chosen = plan(lines, grid, memory_bytes=15 << 20, **request)
     assert not chosen.is_exact
     exact = backproject(lines, grid, beam=beam, accuracy_db=-80, device=platform)
     image = factorize(lines, grid, chosen, device=platform)
@@ -818,8 +822,8 @@ def test_a_gap_in_the_track_stays_empty(platform):
         (-38, BeamWindow(8.2), -30),
     ],
 )
-def test_steps_of_a_beam_beside_a_gap_keep_the_promise(x, beam, tolerance_db):
-    """The track, which runs through the gap, is looked at more coarsely than channels lie."""
+def test_steps_of_a_beam_beside_a_gap_keep_the_tolerance(x, beam, tolerance_db):
+    """Samples of the track, which continues through the gap, are coarser than the channels."""
     grid = around(x, 91.5, shape=(64, 84), pixel_m=(0.0029, 0.0014))
     lines, grid = over(grid, with_gap(457, 0.2345, 64.3), carrier_hz=300e3, band=0.1)
     chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=beam, costs=EXACT_IS_SLOW)
@@ -833,11 +837,11 @@ def test_steps_of_a_beam_beside_a_gap_keep_the_promise(x, beam, tolerance_db):
 @pytest.mark.parametrize(
     "beam", [BeamWindow(39, "hamming"), BeamWindow(20, "hann")], ids=["hamming", "hann"]
 )
-def test_pixels_that_see_the_ends_of_a_gap_keep_the_promise(beam, gap_m, tolerance_db):
-    """Beside it channels weigh little, and what is expected of the track is not of them."""
+def test_pixels_opposite_the_ends_of_a_gap_keep_the_tolerance(beam, gap_m, tolerance_db):
+    """Channels near the gap have small weights; the track's average does not describe them."""
     lines, grid = over(around(-0.2, 6.5, shape=(113, 150)), with_gap(300, 0.022, gap_m))
-    wish = {"beam": beam, "tolerance_db": tolerance_db}
-    chosen = plan(lines, grid, costs=EXACT_IS_SLOW, **wish)
+    request = {"beam": beam, "tolerance_db": tolerance_db}
+    chosen = plan(lines, grid, costs=EXACT_IS_SLOW, **request)
     exact = backproject(lines, grid, beam=beam, accuracy_db=-80)
     assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
 
@@ -855,12 +859,12 @@ def test_pixels_that_see_the_ends_of_a_gap_keep_the_promise(beam, gap_m, toleran
     ],
 )
 def test_an_edge_of_the_beam_that_crosses_the_image(shape, squint_deg, tolerance_db):
-    """Few pixels see it: most see all of a short track, or nothing."""
+    """The edge affects few pixels: most are visible from all of a short track or from none."""
     grid = around(-10.7, 18.8, pixel_m=(0.0144, 0.0184), shape=(214, 164), z=-1.3)
     lines, _ = over(grid, along_x(99, 0.01))
-    wish = {"beam": BeamWindow(12.2, shape, squint_deg=squint_deg), "tolerance_db": tolerance_db}
-    chosen = plan(lines, grid, costs=EXACT_IS_SLOW, **wish)
-    exact = backproject(lines, grid, beam=wish["beam"], accuracy_db=-80)
+    request = {"beam": BeamWindow(12.2, shape, squint_deg=squint_deg), "tolerance_db": tolerance_db}
+    chosen = plan(lines, grid, costs=EXACT_IS_SLOW, **request)
+    exact = backproject(lines, grid, beam=request["beam"], accuracy_db=-80)
     assert relative_error_db(factorize(lines, grid, chosen), exact) <= tolerance_db
 
 
@@ -877,10 +881,10 @@ def test_device_memory_is_as_planned(monkeypatch, beam, tolerance_db, relief_m, 
     if relief_m is not None:
         row, column = np.indices(grid.shape)
         grid = grid.with_height(relief_m * np.sin(row / 30) * np.cos(column / 50))
-    wish = {"tolerance_db": tolerance_db, "beam": beam, "costs": EXACT_IS_SLOW}
-    chosen = plan(lines, grid, **wish)
+    request = {"tolerance_db": tolerance_db, "beam": beam, "costs": EXACT_IS_SLOW}
+    chosen = plan(lines, grid, **request)
     if share < 1:
-        chosen = plan(lines, grid, memory_bytes=int(share * chosen.memory_bytes), **wish)
+        chosen = plan(lines, grid, memory_bytes=int(share * chosen.memory_bytes), **request)
     assert not chosen.is_exact
     peak = peak_device_bytes(monkeypatch, lambda: factorize(lines, grid, chosen), grid.shape)
     assert peak <= 1.1 * chosen.memory_bytes
@@ -889,14 +893,14 @@ def test_device_memory_is_as_planned(monkeypatch, beam, tolerance_db, relief_m, 
 @pytest.mark.slow
 def test_little_memory_makes_small_roots_or_is_refused():
     lines, grid = over(around(0, 40, shape=(600, 700)))
-    wish = {"tolerance_db": -40, "costs": EXACT_IS_SLOW}
-    plenty = plan(lines, grid, **wish)
+    request = {"tolerance_db": -40, "costs": EXACT_IS_SLOW}
+    plenty = plan(lines, grid, **request)
     little_bytes = int(0.7 * plenty.memory_bytes)
-    little = plan(lines, grid, memory_bytes=little_bytes, **wish)
+    little = plan(lines, grid, memory_bytes=little_bytes, **request)
     assert not little.is_exact
     assert little.memory_bytes <= little_bytes
     with pytest.raises(ValueError, match=r"memory_bytes must be at least [\d.]+ MiB"):
-        plan(lines, grid, memory_bytes=1 << 20, **wish)
+        plan(lines, grid, memory_bytes=1 << 20, **request)
 
 
 # The thesis's method
@@ -905,7 +909,7 @@ def test_little_memory_makes_small_roots_or_is_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize("width_deg", [3, 8, 30])
 def test_given_stages_with_a_beam(width_deg):
-    """Leaves of many tiles, each of which sees other channels."""
+    """Leaves contain many tiles, which are visible from different channels."""
     lines, grid = over(around(0, 20, shape=(128, 256)), along_x(400, 0.015))
     beam = BeamWindow(width_deg, "hann")
     chosen = plan(lines, grid, stages=[(1, 1), (1, 2)], beam=beam)
@@ -923,7 +927,7 @@ def test_given_stages_refuse_what_they_cannot_do():
 
 
 def array_pings(sway_m, period_m):
-    """Pings of 6 receivers that overlap, of an array that does not turn with its track."""
+    """Overlapping pings of 6 receivers, on an array that keeps its heading."""
     x_m = 0.4 * (np.arange(80) - 39.5)
     sway = sway_m * np.sin(2 * np.pi * x_m / period_m)
     ping_m = np.stack([x_m, sway, np.full(80, 15.0)], axis=1)
@@ -935,7 +939,7 @@ def array_pings(sway_m, period_m):
 @pytest.mark.parametrize("beam", [None, BeamWindow(6.0, "hann")], ids=["all", "beam"])
 @pytest.mark.parametrize("tolerance_db", [-25, -45])
 def test_overlapping_pings_of_a_swaying_array(device, beam, tolerance_db):
-    """No curve goes through such phase centres; ranges are stretched instead."""
+    """No curve passes through all these phase centres; ranges are stretched instead."""
     grid = Grid.plane((-3, 3, 150), (36, 44, 200))
     lines, _ = over(grid, *array_pings(0.2, 40.0), carrier_hz=125e3, band=0.12)
     chosen = plan(
@@ -954,7 +958,7 @@ def swinging():
 
 
 def wide_circle():
-    """Every pixel but the middle sees two stretches of the circle."""
+    """Each pixel except the middle is visible from two stretches of the circle."""
     turn = np.linspace(0, 2 * np.pi, 1500, endpoint=False)
     track = np.stack([8 * np.cos(turn), 8 * np.sin(turn), 0 * turn + 3], axis=1)
     return over(around(0, 0, pixel_m=(0.03, 0.03)), track, carrier_hz=60e3)
@@ -965,7 +969,7 @@ def wide_circle():
 @pytest.mark.parametrize("squint_deg", [0.0, 2.0])
 @pytest.mark.parametrize("case", [swinging, circle, wide_circle], ids=name_of)
 def test_a_beam_that_swings_as_fast_as_it_passes_by(case, squint_deg, tolerance_db):
-    """Weights of all channels are interpolated, wherever the beam touches a pixel."""
+    """Weights of all channels are interpolated, from wherever the beam covers a pixel."""
     lines, grid = made(case)
     beam = BeamWindow(8.0, "hann", track_pings=21, squint_deg=squint_deg)
     chosen = plan(lines, grid, tolerance_db=tolerance_db, beam=beam, costs=EXACT_IS_SLOW)
@@ -977,7 +981,7 @@ def test_a_beam_that_swings_as_fast_as_it_passes_by(case, squint_deg, tolerance_
 @pytest.mark.slow
 @pytest.mark.parametrize("costs", [EXACT_IS_SLOW, Costs(call_ns=1e12)], ids=["stages", "exact"])
 def test_data_may_arrive_in_pieces(costs, platform):
-    """Images of parts of the lines add up, also where one is backprojected."""
+    """Images of parts of the lines add up, whether factorized or exact."""
     lines, grid = made(straight)
     whole = backproject(lines, grid, device=platform)
     image = None

@@ -15,7 +15,7 @@ def waves(shape=(150, 90)):
 
 
 def cloud():
-    """With most of the plane empty."""
+    """Points that leave most of the plane empty."""
     rng = np.random.default_rng(1)
     points_m = np.concatenate([rng.normal(0, 0.3, (500, 3)), rng.normal(2, 0.5, (900, 3))])
     return Grid.points(points_m + [0, 40, 0])
@@ -29,7 +29,7 @@ GRIDS = {"heights": waves(), "points": cloud(), "an upright plane": steep()}
 
 
 def members(surface, side):
-    """Pixels of every subimage, by its first cell."""
+    """Pixels of each subimage, by its first cell."""
     row, column = np.divmod(surface.cell, surface.plane.shape[1])
     corner = np.stack([row // side[0] * side[0], column // side[1] * side[1]], axis=1)
     for each in np.unique(corner, axis=0):
@@ -37,7 +37,7 @@ def members(surface, side):
 
 
 def parts(surface, position_m):
-    """What of a position goes along each of the steps."""
+    """Components of positions along each of the steps."""
     return np.linalg.solve(surface.steps_m.T, position_m.T).T
 
 
@@ -82,7 +82,7 @@ def test_the_most_relief_in_a_root():
     surface = surface_of(waves())
     small, of_roots = surface.relief_m((32, 16)), surface.relief_m((32, 16), (64, 32))
     assert of_roots[1, 0] == small[2:4, :2].max()
-    assert of_roots[2, 2] == small[4, 4:6].max()  # beyond the ends there is nothing
+    assert of_roots[2, 2] == small[4, 4:6].max()  # there is nothing past the ends
     assert (surface.relief_m((64, 32)) >= of_roots).all()
 
 

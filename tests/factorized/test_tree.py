@@ -51,7 +51,7 @@ def test_a_centre_is_the_mean_of_pixels():
         assert np.linalg.norm(pixels_m - centre_m, axis=1).max() <= surface.radius_m(SIDES[1])
 
 
-# What subimages need
+# Channels that subimages need
 
 
 def with_all_channels(lines, grid, chosen):
@@ -77,7 +77,7 @@ def with_all_channels(lines, grid, chosen):
 @pytest.mark.slow
 @pytest.mark.parametrize("beam", BEAMS, ids=["hann", "wide", "squint"])
 def test_leaves_have_all_the_virtual_channels_they_need(beam):
-    """Channels outside a beam have no weight: the image is as good without them."""
+    """Channels outside a beam have no weight, so that the image is as good without them."""
     grid = around(0, 12, pixel_m=(0.015, 0.05), shape=(130, 150))
     lines, _ = over(grid, along_x(700, 0.012))
     chosen = plan(lines, grid, tolerance_db=-45, beam=beam, costs=EXACT_IS_SLOW)

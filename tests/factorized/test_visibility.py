@@ -50,10 +50,8 @@ def test_visible_stretches_are_hardly_longer_than_they_must_be(beam, range_m):
     centres_m = random.uniform((-70, 0.7 * range_m, -1), (70, 1.3 * range_m, 1), (300, 3))
     half_m = range_m * np.array([[0.02, 0, 0], [0, 0.01, 0]])
     begin, end = visibility.visible_stretches(beam.limits, track, along, centres_m, half_m)
-    coordinate, spacing = (
-        np.linspace(0, 1, 4001),
-        2 / 256,
-    )  # of the samples at which visibility is evaluated
+    coordinate = np.linspace(0, 1, 4001)
+    spacing = 2 / 256  # of the samples at which visibility is evaluated
     direction = directions_of(beam, beam.directions(lines), track).at(coordinate)
     boxes = Visibility.of(centres_m, half_m, track.positions_m(coordinate), direction)
     visible = boxes.overlap(beam.limits, np.ones(2)) > 0

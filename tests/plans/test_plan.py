@@ -50,7 +50,7 @@ def any_plan(request):
     return request.getfixturevalue(request.param)
 
 
-# Text
+# JSON
 
 
 def changeable(plan):
@@ -61,7 +61,7 @@ def changeable(plan):
 
 
 def signed(values):
-    """The text of a changed dict, with its own digest."""
+    """The JSON of a changed dict, with a new digest."""
     return json.dumps(values | {"digest": _json_digest(values)})
 
 
@@ -90,7 +90,7 @@ def test_text_gives_the_same_plan(any_plan):
 
 
 @pytest.mark.parametrize("along", [None, [1.0, 0.1, 0], "every channel"])
-def test_text_holds_the_beam(along):
+def test_json_contains_the_beam(along):
     lines, grid = made(straight)
     if along == "every channel":
         along = np.tile([1.0, 0.02, 0], (lines.channels, 1))
@@ -185,7 +185,7 @@ def test_text_that_is_no_plan_is_refused(text):
     ],
 )
 def test_a_plan_with_a_wrong_value_is_refused(chosen, field, value):
-    """Before a device reads what is not there; the message names the field."""
+    """Otherwise a kernel might read outside its buffers. The message names the field."""
     with pytest.raises(ValueError, match=r"^text must be a plan as of Plan\.to_json: ") as refused:
         Plan.from_json(replaced(chosen, field, value))
     named = re.findall(r"\w+", str(refused.value))
@@ -213,7 +213,7 @@ def test_a_plan_with_a_wrong_value_is_refused(chosen, field, value):
         ),
     ],
 )
-def test_what_is_wrong_is_told(chosen, field, value, message):
+def test_the_message_names_the_mistake(chosen, field, value, message):
     with pytest.raises(ValueError, match=message):
         Plan.from_json(replaced(chosen, field, value))
 
@@ -221,7 +221,7 @@ def test_what_is_wrong_is_told(chosen, field, value, message):
 @pytest.mark.parametrize("version", [1, VERSION + 1, "2"])
 def test_a_plan_of_another_version_is_refused(chosen, version):
     values = changeable(chosen) | {"version": version}
-    if version == 1:  # its fields were flat, and had no number
+    if version == 1:  # it had no number, and its fields were not nested
         values = values["method"] | {"tolerance_db": -50.0}
     with pytest.raises(ValueError, match=r"written by .*: make the plan again with clsas\.plan"):
         Plan.from_json(json.dumps(values))
@@ -260,7 +260,7 @@ def test_a_plan_with_a_field_too_many_or_too_few_is_refused(chosen):
         Plan.from_json(signed(values))
 
 
-# What it is
+# Properties and descriptions
 
 
 def test_it_is_immutable(any_plan):
@@ -279,7 +279,7 @@ def test_it_is_immutable(any_plan):
 
 def test_a_changed_number_is_found(chosen):
     text = chosen.to_json()
-    Plan.from_json(json.dumps(json.loads(text), indent=None, sort_keys=True))  # says the same
+    Plan.from_json(json.dumps(json.loads(text), indent=None, sort_keys=True))  # the same values
     start = text.index('"coefficients"')
     position = start + re.search(r"\.0*[1-8]", text[start:]).end() - 1  # a leading digit
     changed = text[:position] + str(int(text[position]) + 1) + text[position + 1 :]
@@ -330,10 +330,10 @@ def test_it_describes_itself(chosen):
     assert len({len(line) for line in table}) == 1  # columns that line up
 
 
-@pytest.mark.parametrize(("asked", "told"), [(-12.338089, "-12.34 dB"), (-50.5, "-50.5 dB")])
-def test_a_tolerance_is_told_sensibly(chosen, asked, told):
+@pytest.mark.parametrize(("asked", "shown"), [(-12.338089, "-12.34 dB"), (-50.5, "-50.5 dB")])
+def test_a_tolerance_is_shown_with_few_digits(chosen, asked, shown):
     text = dataclasses.replace(chosen, tolerance_db=asked).describe()
-    assert f"tolerance {told};" in text
+    assert f"tolerance {shown};" in text
 
 
 def test_given_stages_describe_themselves(given_stages):
@@ -344,7 +344,7 @@ def test_given_stages_describe_themselves(given_stages):
 
 def test_plain_backprojection_says_so(exact):
     assert "Plain backprojection" in exact.describe()
-    # Nobody asked for a tolerance.
+    # Without a tolerance there is no reason to report.
     assert "nearest beam" not in exact.describe()
 
 
@@ -360,7 +360,7 @@ def test_device_memory_of_plain_backprojection(monkeypatch, case, beam):
         lines, grid = over(around(0, 40, shape=(1, 1) if case == "one pixel" else (150, 160)))
         lines = lines.select(slice(100, 220)) if case == "few channels" else lines
     planned = plan(lines, grid, stages=[], beam=beam).memory_bytes
-    # A plan with given stages simplifies nothing: points on a plane stay points.
+    # A plan with given stages neglects no effects, and treats points on a plane as points.
     whole = partial(form_exactly, lines, grid, accuracy_db=-60, beam=beam, full_model=True)
     peak = peak_device_bytes(monkeypatch, whole, None)
     assert 0.5 * planned <= peak <= 1.01 * planned
@@ -394,7 +394,7 @@ def test_louder_lines_are_the_same_lines():
     assert lines_digest(louder) == lines_digest(lines)
 
 
-def test_grids_are_told_apart():
+def test_other_grids_have_other_digests():
     grid = around(0, 40, shape=(4, 6))
     others = (
         around(1e-9, 40, shape=(4, 6)),
@@ -435,7 +435,7 @@ def test_an_image_by_an_invalid_plan_is_refused(chosen, field, value):
 
 
 def test_a_frequency_that_lines_cannot_hold_is_refused(chosen):
-    """It would take memory without bounds."""
+    """It would need unlimited memory."""
     lines, grid = made(swaying)
     with pytest.raises(ValueError, match=r"highest_cycles_per_m must be .* cycles/m, got 1e\+09"):
         factorize(lines, grid, changed(chosen, highest_cycles_per_m=1e9))
@@ -479,7 +479,7 @@ def test_json_may_leave_out_filters(chosen):
         return {key: without(part) for key, part in values.items() if key != "coefficients"}
 
     values = json.loads(whole)
-    del values["digest"]  # which is of whole plans
+    del values["digest"]  # it applies to complete plans only
     assert json.loads(short) == without(values)
     with pytest.raises(ValueError, match=r"lacks 'digest', like .* without filters"):
         Plan.from_json(short)
