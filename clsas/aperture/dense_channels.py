@@ -33,31 +33,40 @@ def strip_channels(
 
     The parameters are those of `interpolated_channels`. Channels are in the order of strips.
     """
-    roots, before = len(coordinate), 0
-    samples, channels = (track.strip_of(each) for each in (track.samples, coordinate[0]))
-    orders, found, bounds = [], [], [0]
-    firsts, widths = [], []
+    strip_of_sample = track.strip_of(track.samples)
+    # Channels are in the order of strips, those of a strip from one bound to the next.
+    bounds = np.searchsorted(track.strip_of(coordinate[0]), np.arange(track.strips + 1))
+    orders, coordinates, bases, between = [], [], [], []
+    first = [0]
     for number, strip in enumerate(track.alone):
-        start, stop = np.searchsorted(channels, [number, number + 1])
+        start, stop = bounds[number], bounds[number + 1]
         apart = track.apart_of(number)
-        some = coordinate[:, start:stop] - apart
-        virtual = interpolated_channels(strip, rate[:, samples == number], some, aperture)
-        own = np.broadcast_to(np.arange(stop - start), some.shape)
-        orders.append(start + (own if virtual.order is None else virtual.order))
-        found.append((virtual.coordinate + apart, virtual.base + before, virtual.between))
-        firsts.append(before)
-        widths.append(virtual.coordinate.shape[1])
-        bounds.append(int(stop))
-        before += widths[-1]
-    coordinates, base, between = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
-    order = np.concatenate(orders, axis=1)
+        local = coordinate[:, start:stop] - apart
+        virtual = interpolated_channels(strip, rate[:, strip_of_sample == number], local, aperture)
+        own_order = np.broadcast_to(np.arange(stop - start), local.shape)
+        orders.append(start + (own_order if virtual.order is None else virtual.order))
+        coordinates.append(virtual.coordinate + apart)
+        bases.append(virtual.base + first[-1])
+        between.append(virtual.between)
+        first.append(first[-1] + virtual.coordinate.shape[1])
+    order, found = np.concatenate(orders, axis=1), np.concatenate(coordinates, axis=1)
     in_order = bool((order == np.arange(order.shape[1])).all())
-    every = np.ones((roots, 1), np.int64)
-    none = 0 * every * np.array(firsts)
-    bands = Bands(every * bounds, every * firsts, every * widths, none, None)
-    positions_m = track.positions_m(coordinates)
+    every = np.ones((len(coordinate), 1), np.int64)
+    bands = Bands(
+        bounds=every * bounds,
+        first=every * first[:-1],
+        width=every * np.diff(first),
+        old=np.zeros((len(coordinate), track.strips), np.int64),
+        between=None,
+    )
     return VirtualChannels(
-        coordinates, positions_m, None if in_order else order, base, between, aperture, bands
+        coordinate=found,
+        position_m=track.positions_m(found),
+        order=None if in_order else order,
+        base=np.concatenate(bases, axis=1),
+        between=np.concatenate(between, axis=1),
+        aperture=aperture,
+        bands=bands,
     )
 
 

@@ -56,6 +56,22 @@ class Plan:
     --------
     clsas.plan : Make a plan.
     clsas.factorize : Form an image by a plan.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> import numpy as np
+    >>> track_m = np.c_[np.linspace(-2, 2, 64), np.zeros((64, 2))]
+    >>> point = clsas.PointTargets([[0, 20, 0]])
+    >>> lines = clsas.simulate_lines(
+    ...     track_m, track_m, point, carrier_hz=100e3, bandwidth_hz=20e3
+    ... )
+    >>> grid = clsas.Grid.plane((-0.5, 0.5, 32), (19.5, 20.5, 32))
+    >>> plan = clsas.plan(lines, grid, tolerance_db=-40)
+    >>> plan.predicted_error_db <= -40
+    True
+    >>> clsas.Plan.from_json(plan.to_json()).tolerance_db
+    -40.0
     """
 
     tolerance_db: Number | None

@@ -20,4 +20,4 @@ def test_every_fault_can_be_planted(monkeypatch):
     for mutant in _mutants(monkeypatch):
         found = (ROOT / mutant.file).read_text().count(mutant.text)
         assert found == 1, f"{mutant.name}: {mutant.text!r} stands {found} times in {mutant.file}"
-        assert any((ROOT / test).exists() for test in mutant.tests)
+        assert all((ROOT / test).exists() for test in mutant.tests)
