@@ -85,7 +85,7 @@ class _Commands(click.Group):
         except click.UsageError as error:
             if args[0] in _RENAMED:
                 error.message = _RENAMED[args[0]]  # type: ignore[misc]
-            elif close := difflib.get_close_matches(args[0], _COMMANDS):
+            elif close := difflib.get_close_matches(args[0].lower(), _COMMANDS):
                 guesses = " or ".join(map(repr, close))
                 error.message += f" Did you mean {guesses}?"  # type: ignore[misc]
             raise

@@ -105,6 +105,8 @@ def _beside(file: Path) -> Path:
     context = click.get_current_context()
     (option,) = (each for each in context.command.params if each.name == "output")
     path = file.resolve() if file.name in ("", "..") else file
+    if not path.name:
+        raise click.UsageError(f"{path} is not a mosaic of clsas")
     name = path.stem if path.suffix.lower() in _ENDINGS else path.name
     return option.type.convert(path.with_name(f"{name}.png"), option, context)
 
@@ -208,6 +210,8 @@ def _of_points(image: clsas.Image, near: tuple[float, ...] | None, how: dict[str
     from clsas import plot
 
     if near is not None:
+        if len(near) != 3:
+            raise click.UsageError("--near must be X,Y,Z for an image on points")
         return plot.volume(image, kind="slices", at=near, **how)
     try:
         return plot.volume(image, **how)

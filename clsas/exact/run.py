@@ -95,7 +95,7 @@ class ExactImager:
             p = replace(p, lines=replace(p.lines, samples=lines.samples))
         layout, device, grid = p.layout, p.device, p.given_grid or p.grid
         if not p.is_reached:
-            self._warn_unreached()
+            self._warn_unreached(lines)
             return Image(np.zeros(grid.shape, np.complex64), grid)
         pixels = np.empty(layout.parts * layout.part_pixels, np.complex64)
         normalise = p.beam is not None and p.beam.normalise
@@ -117,14 +117,14 @@ class ExactImager:
             device.finish()  # an interrupted run leaves nothing in use
         image = Image(layout.collect(pixels), grid)
         if not holds_any(image.pixels):
-            self._warn_unreached()
+            self._warn_unreached(lines)
         return image
 
-    def _warn_unreached(self) -> None:
-        """Warn once that no line contributes to the image."""
-        if not self._warned:
+    def _warn_unreached(self, lines: RangeLines) -> None:
+        """Warn once that no line adds anything to the image, unless all samples are zero."""
+        if not self._warned and lines.samples.any():
             self._warned, p = True, self.preparation
-            warn_unreached(p.lines, p.given_grid or p.grid, p.beam, p.along)
+            warn_unreached(lines, p.given_grid or p.grid, p.beam, p.along)
 
 
 @dataclass(frozen=True, eq=False)

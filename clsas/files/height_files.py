@@ -68,5 +68,5 @@ def _from_npy(path: Path) -> NDArray:
     """Return an array that is mapped to memory, so that its shape is known before it is read."""
     try:
         return np.lib.format.open_memmap(path, mode="r")
-    except (ValueError, EOFError):
+    except (ValueError, EOFError, OverflowError):
         raise ValueError(f"must be an intact NumPy file of numbers: {path}") from None

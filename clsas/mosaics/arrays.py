@@ -49,9 +49,13 @@ def create_store(
 
     Raises
     ------
+    ValueError
+        If a patch does not fit in memory.
     OSError
         If the parent folder cannot be written.
     """
+    chunk_bytes = 8 * math.prod(patch_shape)  # complex64
+    validate.memory("a chunk of pixels", 2 * chunk_bytes)
     plane = None
     if grid.points_m is None:
         plane = {name: getattr(grid, name).tolist() for name in VECTORS}

@@ -78,8 +78,8 @@ class Imager:
     Notes
     -----
     Between images the imager keeps the geometry of a factorization, or the references of an exact
-    image, up to 256 MiB of host memory. It is freed with the imager, or at the end of a `with`
-    block. An imager must not be shared by threads.
+    image, up to 256 MiB of host memory, and the lines that it was made from. They are freed with
+    the imager, or at the end of a `with` block. An imager must not be shared by threads.
 
     Examples
     --------
@@ -214,6 +214,8 @@ class Imager:
         if isinstance(self._former, ExactImager):
             preparation = self._former.preparation
             band, allowed_db = preparation.band, preparation.requested_db
+            if self.plan is not None:
+                allowed_db = self.plan.tolerance_db
         else:
             assert self.plan is not None
             band, allowed_db = self.plan.factorization.band, self.plan.tolerance_db
@@ -224,12 +226,12 @@ class Imager:
             if outside_db <= allowed_db:
                 return
         if lines.samples.any():
-            self._warned_of_band = True
             validate.warn(
                 f"the lines have {outside_db:.0f} dB of their power outside the band that the "
-                f"plan was made for, so the error may exceed {allowed_db:g} dB: plan anew with "
-                "clsas.plan, or make another clsas.Imager"
+                f"images are made for, so the error may exceed {allowed_db:g} dB: make another "
+                "plan or clsas.Imager from these lines"
             )
+            self._warned_of_band = True
 
     def close(self) -> None:
         """Free what is kept between images; no image can be formed afterwards."""

@@ -717,7 +717,7 @@ def test_a_plan_for_another_band_warns():
     silent = dataclasses.replace(lines, samples=np.zeros_like(lines.samples))
     assert not factorize(silent, grid, chosen).pixels.any()
     shifted = dataclasses.replace(lines, samples=lines.samples * np.exp(2j * np.pi * 0.3 * time))
-    with pytest.warns(ClsasWarning, match="outside the band that the plan was made for"):
+    with pytest.warns(ClsasWarning, match="outside the band that the images are made for"):
         wrong = factorize(shifted, grid, chosen)
     right = backproject(shifted, grid, accuracy_db=-80)
     assert relative_error_db(wrong, right) > -50

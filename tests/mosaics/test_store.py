@@ -329,3 +329,12 @@ def test_a_pipe_or_device_in_place_of_a_chunk_is_refused(path, make):
     damaged = clsas.Store.opened(path).damage()
     assert len(damaged) == 1
     assert "must be an ordinary file" in next(iter(damaged.values()))
+
+
+def test_patches_that_do_not_fit_in_memory_leave_no_store(path, tmp_path):
+    grid = Grid.plane((-1, 1, 2_000_000), (9, 11, 2_000_000))
+    inputs = read_document(path)["inputs"] | {"pixels": list(grid.shape)}
+    new = Store.at(tmp_path / "new.zarr")
+    with pytest.raises(ValueError, match="a chunk of pixels must ask for at most"):
+        new.begin(inputs, grid, grid.shape)
+    assert not new.path.exists()

@@ -192,6 +192,14 @@ def test_it_warns_once_that_nothing_is_reached():
 
 
 @pytest.mark.parametrize("method", ["plan", "accuracy_db"])
+def test_it_does_not_warn_of_lines_of_zeros(method):
+    lines, grid = made(straight)
+    request = {"plan": planned(lines, grid)} if method == "plan" else {"accuracy_db": -50}
+    silent = dataclasses.replace(lines, samples=0 * lines.samples)
+    assert warnings_of(lines, grid, request, [silent]) == []
+
+
+@pytest.mark.parametrize("method", ["plan", "accuracy_db"])
 def test_it_warns_once_of_another_band(method):
     lines, grid = over(around(0, 40))
     request = {"plan": planned(lines, grid)} if method == "plan" else {"accuracy_db": -50}
