@@ -27,9 +27,9 @@ def everything_tried(*arguments):
     for option in range(len(options.choices)):
         for root in range(len(sizes.pairs)):
             division = sizes.in_root(root)
-            onward_s = options.onward_s(division, np.array([option]))[0][-1]
-            place = np.searchsorted(division.index, root)
-            best = min(best, options.roots_s[option, root] + onward_s[0, place])
+            onward_s = options.times(division, np.array([option])).onward_s()[-1]
+            size = np.searchsorted(division.index, root)
+            best = min(best, options.roots_s[option, root] + onward_s[0, size])
     return best
 
 
@@ -49,7 +49,7 @@ def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, cost
     (choice,) = options.choices
     path = [sizes.pairs.index(side) for side in tree.sides]
     division = sizes.in_root(path[0])
-    cycles, place = division.cycles, {int(size): n for n, size in enumerate(division.index)}
+    cycles, number = division.cycles, {int(size): n for n, size in enumerate(division.index)}
 
     taps_past_ends = choice.aperture_taps * (search.OVERHANG if len(path) > 1 else 1)
 
@@ -60,10 +60,10 @@ def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, cost
 
     total = options.roots_s[0, path[0]]
     for parent, child in pairwise(path):
-        used = channels(cycles[place[child], place[parent]])
+        used = channels(cycles[number[child], number[parent]])
         total += used * options.channel_s[0, child] + options.subimages_s[child]
     leaf = path[-1]
-    of_leaf = cycles[place[leaf], place[leaf]] + beam_cycles * sizes.beam_cycles[leaf]
+    of_leaf = cycles[number[leaf], number[leaf]] + beam_cycles * sizes.beam_cycles[leaf]
     return total + channels(of_leaf) * options.leaves_s[0, leaf]
 
 
