@@ -32,6 +32,7 @@ from clsas.planning.stretches import stretch_of
 from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator
+from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
 # Rms error of a phase in the stages over the phase across a root, from float32: measured. With half
@@ -143,26 +144,54 @@ def _mean_track_error(model: VisibilityModel, side: Side, extents: NDArray[np.fl
     offsets_m = np.stack([pixels_m(model, extents, point)[0] for point in channels.points])
     points_m = model.points_m[channels.points, None] + offsets_m
     virtual_m = channels.virtual_m(points_m[:, 0])
-    wrong = _phase_error(model, channels, points_m, virtual_m)
-    weights = np.ones_like(wrong)
-    if model.beam is not None and model.directions is not None:
-        weights, of_virtual = _weights(model, channels, points_m, virtual_m)
-        wrong = weights**2 * wrong + (weights - of_virtual) ** 2
-    counts = channels.weight[:, None]
-    return float(np.sum(counts * wrong) / max(np.sum(counts * weights**2), 1e-30))
+    error = phase_error(model, channels, points_m, virtual_m)
+    if model.beam is None:
+        return relative_error(channels.weight, error, np.ones_like(error))
+    weights, of_virtual = beam_weights(model, model.beam, channels, points_m, virtual_m)
+    return relative_error(
+        channels.weight, weights**2 * error + (weights - of_virtual) ** 2, weights
+    )
 
 
-def _phase_error(
+def relative_error(
+    channel_power: NDArray[np.float64], error: NDArray[np.float64], weights: NDArray[np.float64]
+) -> float:
+    """Return the power of errors over that of the contributions to an image.
+
+    Parameters
+    ----------
+    channel_power : float64 [points, channels]
+    error : float64 [points, pixels, channels]
+        Error power of each contribution, for channels of unit power.
+    weights : float64 [points, pixels, channels]
+        Weights of the contributions; 1 without a beam.
+    """
+    channel_power = channel_power[:, None]
+    image_power = max(np.sum(channel_power * weights**2), 1e-30)
+    return float(np.sum(channel_power * error) / image_power)
+
+
+def phase_error(
     model: VisibilityModel,
     channels: SampledChannels,
     points_m: NDArray[np.float64],
     virtual_m: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the error power of pixels' phases and envelopes, [points, pixels - 1, channels].
+    """Return the error power of phases and envelopes, float64 [points, pixels - 1, channels].
 
-    The range from a channel changes between the centre of a root, the first pixel, and another
-    pixel. The error is what that change differs by from the one for the virtual position, stretched
-    as the first stage does.
+    Channels are replaced by positions on the mean track that have the same range to the centre of a
+    root. Their phase is wrong by the difference between the changes of both ranges from the centre
+    to a pixel. The first stage makes up for a part of it by stretching the range from the virtual
+    position.
+
+    Parameters
+    ----------
+    model : VisibilityModel
+    channels : SampledChannels
+    points_m : float64 [points, pixels, 3]
+        The centre of a root at each sample point, and then pixels of the root.
+    virtual_m : float64 [points, channels, 3]
+        Positions on the mean track that replace the channels.
     """
     along, stretch = drift(model.lines), stretch_of(model)
     range_m = pairwise_range_m(points_m.reshape(-1, 3), *channels.antennas)
@@ -176,26 +205,30 @@ def _phase_error(
     residual_m = change_m - virtual_change_m * (1 + of_channels)
     # A line's phase follows its channel's stretch, its envelope the mean of all.
     envelope_m = virtual_change_m * (of_channels - stretch.mean)
-    wrong = (2 * np.pi * model.highest_cycles_per_m * residual_m) ** 2
-    wrong += (2 * np.pi * model.rms_cycles_per_m * envelope_m) ** 2
-    return wrong
+    error = (2 * np.pi * model.highest_cycles_per_m * residual_m) ** 2
+    error += (2 * np.pi * model.rms_cycles_per_m * envelope_m) ** 2
+    return error
 
 
-def _weights(
+def beam_weights(
     model: VisibilityModel,
+    beam: BeamWindow,
     channels: SampledChannels,
     points_m: NDArray[np.float64],
     virtual_m: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the beam's weights of channels and of their virtual positions, as `_phase_error`."""
-    assert model.beam is not None
+    """Return a beam's weights of channels and of the positions that replace them.
+
+    Arguments and shapes are those of `phase_error`.
+    """
     assert model.directions is not None
+    assert model.channels_along is not None
     part, along = channels.part, model.channels_along[channels.index]
     directions = model.directions.at(part.coordinate, part.across)
     virtual = [sines(*each, directions) for each in zip(points_m, virtual_m, strict=True)]
     real = [sines(each, channels.phase_centres_m, along) for each in points_m]
     weights, of_virtual = (
-        model.beam.weights(np.stack(each).swapaxes(1, 2)[:, 1:], wavelength_m(model.lines))
+        beam.weights(np.stack(each).swapaxes(1, 2)[:, 1:], wavelength_m(model.lines))
         for each in (real, virtual)
     )
     return weights, of_virtual
