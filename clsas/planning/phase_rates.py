@@ -37,7 +37,7 @@ def of_beam_along(model: VisibilityModel) -> NDArray[np.float64]:
 
     The largest within roots of the model's size, if it has any: see `beam_rate`.
     """
-    if model.beam is None:
+    if model.beam is None or model.along is None:
         return np.zeros(model.distance_m.shape)
     if model.track.is_sheet:
         return _of_beam_on_sheet(model).along
@@ -48,6 +48,8 @@ def of_beam_along(model: VisibilityModel) -> NDArray[np.float64]:
 @cached
 def of_beam_across(model: VisibilityModel) -> NDArray[np.float64]:
     """Return the same across a sheet, at the samples of a line across."""
+    if model.beam is None:
+        return np.zeros((len(model.points_m), len(model.track.line_across(0.5).samples)))
     return _of_beam_on_sheet(model).across
 
 
@@ -130,8 +132,7 @@ def _of_sheet(
         )
 
     key = "sheet rates", tuple(extents), centres_m.tobytes(), every
-    found: SheetRates = model.from_cache(key, find)
-    return found
+    return model.from_cache(key, find)
 
 
 @cached
