@@ -38,7 +38,7 @@ def trimmed(model: VisibilityModel, share: float) -> VisibilityModel:
         return model.with_limits(*_EVERY_DIRECTION)
     low, high = np.clip(model.limits, -1, 1)
     on_track, bounds = model.on_track, []
-    of_track = sines(_points_m(model), model.track_m[on_track], model.along[on_track])
+    of_track = sines(_points_m(model), model.track_m[on_track], _along(model)[on_track])
     # The channels alone do not suffice: the track may have gaps, into which filters extend. Neither
     # does one point: a pixel sees but a small part of the beam from a short aperture.
     for sine in (_sines_of_channels(model), of_track):
@@ -80,8 +80,9 @@ def _directions_unknown(model: VisibilityModel) -> bool:
 
     The smooth directions are then those of no channel, and may be anything.
     """
-    assert model.directions is not None
     track, (columns, rows) = model.track, _CELLS
+    assert model.directions is not None
+    assert track.across is not None
     at = model.directions.at(track.coordinate, track.across)
     if np.linalg.norm(at - at.mean(axis=0), axis=1).max() <= _MOST_TURNED * _width(model):
         return False
@@ -105,6 +106,7 @@ def _turns_between_channels(model: VisibilityModel) -> bool:
     At a kink the beam may swing past a point within a few channels, and a track may lead back
     beside itself.
     """
+    assert model.channels_along is not None
     order = np.argsort(model.track.coordinate, kind="stable")
     strip = model.track.strip_of(model.track.coordinate[order])
     turned = np.linalg.norm(np.diff(model.channels_along[order], axis=0), axis=1)
@@ -131,7 +133,7 @@ def _sweeps_once(model: VisibilityModel, of_strip: NDArray[np.bool_]) -> bool:
     on_track = model.on_track & of_strip
     position = model.track_m[on_track]
     along_m = np.concatenate([[0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])
-    sine = np.einsum("psi,si->ps", model.sight[:, on_track], model.along[on_track])
+    sine = np.einsum("psi,si->ps", model.sight[:, on_track], _along(model)[on_track])
     along_m += 1e-9 * np.arange(len(along_m))  # a track may stand still
     rate = -np.gradient(sine, along_m, axis=1)
     rate *= model.distance_m[:, on_track] / np.maximum(1 - sine**2, 1e-3)
@@ -164,15 +166,21 @@ def partly_visible_share(model: VisibilityModel) -> float:
     return float(((visible > 0) & (visible < 1)).mean())
 
 
+def _along(model: VisibilityModel) -> NDArray[np.float64]:
+    """Return the beam's unit directions at the track's samples, [samples, 3]; only with a beam."""
+    assert model.along is not None
+    return model.along
+
+
+@shared
 def _points_m(model: VisibilityModel) -> NDArray[np.float64]:
-    found: NDArray[np.float64] = model.from_cache(
-        "points of beam coverage", lambda: points_at_m(model.surface, _SAMPLED_POINTS)
-    )
-    return found
+    """Return points all over the grid, [points, 3]."""
+    return points_at_m(model.surface, _SAMPLED_POINTS)
 
 
 @shared
 def _sines_of_channels(model: VisibilityModel) -> NDArray[np.float64]:
     """Sines of the aspect angle at points all over the grid, [channels, points]."""
+    assert model.channels_along is not None
     some = some_channels(model.lines.channels)
     return sines(_points_m(model), model.lines.phase_centres_m[some], model.channels_along[some])

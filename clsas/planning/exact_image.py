@@ -13,7 +13,7 @@ from clsas.exact.groups import Groups, GroupsEstimate
 from clsas.exact.tiles import STACK, Tiles
 from clsas.opencl.buffers import beam_buffers, pixel_buffers, total_bytes
 from clsas.opencl.device import Device
-from clsas.planning.visibility_model import VisibilityModel
+from clsas.planning.visibility_model import LinesModel, VisibilityModel
 from clsas.planning.work import backprojecting, upsampling
 from clsas.plans.predictions import Work
 
@@ -66,7 +66,7 @@ class Exact:
         return Work(call=1.0) + lines + pixels
 
 
-def expect(model: VisibilityModel, accuracy_db: float, device: Device) -> Exact:
+def expect(model: LinesModel, accuracy_db: float, device: Device) -> Exact:
     """Predict an exact image, by the same decision that forms it."""
     lines, beam = model.lines, model.beam
     decided = partial(
@@ -90,7 +90,7 @@ def expect(model: VisibilityModel, accuracy_db: float, device: Device) -> Exact:
         others = [decided(windows=each) for each in (STACK, 0)]
         largest = max((decision, *others), key=lambda each: each.resampling.length)
     share = most = 1.0
-    if beam is not None and model.track is not None:
+    if beam is not None and isinstance(model, VisibilityModel):
         share, most = model.visible_share(model.small), model.visible_share(_LARGE, most=True)
     blocks = blocks_of(
         device,
@@ -117,7 +117,7 @@ def expect(model: VisibilityModel, accuracy_db: float, device: Device) -> Exact:
 
 
 def _memory_bytes(
-    model: VisibilityModel,
+    model: LinesModel,
     device: Device,
     blocks: Blocks,
     layout: Tiles | Groups | GroupsEstimate,

@@ -10,7 +10,7 @@ from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.opencl.device import Device
 from clsas.planning.imager import Imager
-from clsas.planning.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
+from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
 from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 

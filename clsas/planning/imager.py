@@ -18,6 +18,7 @@ from clsas.exact.run import ExactImager
 from clsas.opencl.device import Device, open_device
 from clsas.planning.former import Former, former
 from clsas.planning.planner import planned
+from clsas.planning.request import Request
 from clsas.plans.plan import Plan
 from clsas.signal.spectrum import FEW_CHANNELS, MEASURED_CHANNELS, power_outside
 from clsas.sonar.beam import BeamWindow
@@ -130,7 +131,8 @@ class Imager:
             preparation.warn_of_ambiguity()
             self._former = ExactImager(preparation)
         elif plan is None:
-            found = planned(lines, grid, tolerance_db=tolerance_db, beam=beam, device=self.device)
+            request = Request(lines, grid, tolerance_db=tolerance_db, beam=beam, device=self.device)
+            found = planned(request)
             self.plan = found.plan
             self._former = former(
                 lines,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from clsas.planning.exact_image import Exact
 from clsas.planning.memory import BufferSizes, batches_within
 from clsas.planning.range_extents import half_line_lengths
 from clsas.planning.stretches import stretch_of, uncompensated
-from clsas.planning.visibility_model import VisibilityModel
+from clsas.planning.visibility_model import LinesModel, VisibilityModel
 from clsas.planning.work import adding_in_rows, backprojecting_leaves, combining, upsampling
 from clsas.plans.factorization import ExactImage, Factorization
 from clsas.plans.plan import Plan
@@ -123,7 +122,7 @@ def predicted_plan(
     """
     sides, device = candidate.sides, conditions.device
     lines = _upsampled(model, candidate, other_errors)
-    if model.track is not None and model.track.is_dense:
+    if model.track.is_dense:
         lines = _trimmed(model, candidate, lines)
     half_lengths = half_line_lengths(
         model, sides, candidate.align, candidate.final, lines.resampling
@@ -133,9 +132,10 @@ def predicted_plan(
     errors, phase_terms, half_precision = _with_arithmetic(
         model, candidate, lines, channels, conditions
     )
-    stages, work = _stages(
-        model, candidate, lines, levels, channels, conditions, half_precision=half_precision
-    )
+    forming = _Forming(model, candidate, lines, levels, channels, device, half_precision)
+    parts = [*(forming.stage(level) for level in range(len(sides))), forming.leaves()]
+    work = sum((part.work for part in parts), Work(call=1.0))
+    stages = [part.predicted(conditions.costs) for part in parts]
     sizes = BufferSizes(
         model=model,
         width=device.info.width,
@@ -178,7 +178,7 @@ def predicted_plan(
     return _plan(model, image, conditions, batches.memory_bytes, stages, work, errors)
 
 
-def exact_plan(model: VisibilityModel, conditions: Conditions, reason: str) -> Plan:
+def exact_plan(model: LinesModel, conditions: Conditions, reason: str) -> Plan:
     """Return the plan of the exact image; see `ExactImage` for the reason."""
     exact = conditions.exact
     image = ExactImage(accuracy_db=exact.accuracy_db, reason=reason)
@@ -209,7 +209,7 @@ def half_precision_error(stages: int) -> float:
 
 
 def _plan(
-    model: VisibilityModel,
+    model: LinesModel,
     image: Factorization | ExactImage,
     conditions: Conditions,
     memory_bytes: int,
@@ -288,72 +288,104 @@ def _trimmed(model: VisibilityModel, candidate: Candidate, lines: _Lines) -> _Li
     return replace(lines, resampling=window)
 
 
-def _stages(
-    model: VisibilityModel,
-    candidate: Candidate,
-    lines: _Lines,
-    levels: Sequence[Level],
-    channels: Sequence[StageChannels],
-    conditions: Conditions,
-    *,
-    half_precision: bool,
-) -> tuple[list[Stage], Work]:
-    """Return the prediction of every stage and of the leaves, and the work of all."""
-    device, costs = conditions.device, conditions.costs
-    width, aperture = device.info.width, candidate.aperture.filter
-    dimensions = candidate.aperture.dimensions
-    taps = candidate.align.taps + aperture.taps**dimensions
-    error_db = in_db(power(lines.align_db) + dimensions * power(aperture.error_db))
-    stages, total = [], Work(call=1.0)
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Subimages of a stage or the leaves, and the work of forming them.
 
-    def add(side: tuple[int, int], count: int, samples: int, work: Work, **figures: Any) -> None:
-        nonlocal total
-        total += work
-        rows, columns = side
-        seconds = float(costs.seconds(work))
-        stages.append(Stage(rows, columns, count, samples=samples, seconds=seconds, **figures))
+    Attributes
+    ----------
+    side, count, channels, samples, operations, error_db
+        As those of `Stage`, without rounding.
+    work : Work
+    """
 
-    for level, (side, of_stage) in enumerate(zip(candidate.sides, channels, strict=True)):
-        count = model.subimages.count(side)
-        samples = levels[level].length
-        combined = count * of_stage.used
+    side: tuple[int, int]
+    count: int
+    channels: float
+    samples: int
+    operations: float
+    error_db: float
+    work: Work
+
+    def predicted(self, costs: Costs) -> Stage:
+        """Return this part's prediction."""
+        return Stage(
+            *self.side,
+            self.count,
+            channels=round(self.channels),
+            samples=self.samples,
+            operations=self.operations,
+            error_db=self.error_db,
+            seconds=float(costs.seconds(self.work)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Forming:
+    """A candidate with all that the work of forming its image depends on, [stages] each.
+
+    Attributes
+    ----------
+    model, candidate, lines
+    levels : sequence of Level
+        Lengths of the lines.
+    channels : sequence of StageChannels
+    device : Device
+    half_precision : bool
+        True if stages hand on lines in half precision.
+    """
+
+    model: VisibilityModel
+    candidate: Candidate
+    lines: _Lines
+    levels: Sequence[Level]
+    channels: Sequence[StageChannels]
+    device: Device
+    half_precision: bool
+
+    def stage(self, level: int) -> _Part:
+        """Return a stage: its channels are aligned and combined."""
+        candidate, channels = self.candidate, self.channels[level]
+        side = candidate.sides[level]
+        aperture, dimensions = candidate.aperture.filter, candidate.aperture.dimensions
+        count, samples = self.model.subimages.count(side), self.levels[level].length
+        combined = count * channels.used
+        taps = candidate.align.taps + aperture.taps**dimensions
         work = combining(
-            combined, samples, taps, given=level == 0, half_precision=half_precision
+            combined, samples, taps, given=level == 0, half_precision=self.half_precision
         ) + Work(subimage=count)
         if dimensions == 2:
-            work += adding_in_rows(count * of_stage.count, levels[level].pitch, aperture.taps)
+            work += adding_in_rows(count * channels.count, self.levels[level].pitch, aperture.taps)
         if level == 0:
-            upsampled = model.lines.channels * lines.resampling.length
-            work += Work(reference=count * references(model))
-            work += upsampling(upsampled, filtered=lines.upsampler is not None)
-        add(
-            side,
-            count,
-            samples,
-            work,
-            channels=round(of_stage.count),
-            operations=combined * samples,
-            error_db=error_db,
+            upsampled = self.model.lines.channels * self.lines.resampling.length
+            work += Work(reference=count * references(self.model))
+            work += upsampling(upsampled, filtered=self.lines.upsampler is not None)
+        error_db = in_db(power(self.lines.align_db) + dimensions * power(aperture.error_db))
+        operations = combined * samples
+        return _Part(side, count, channels.count, samples, operations, error_db, work)
+
+    def leaves(self) -> _Part:
+        """Return the leaves: their virtual channels are backprojected to their pixels."""
+        model, final, side = self.model, self.candidate.final, self.candidate.sides[-1]
+        channels, samples = self.channels[-1].count, self.levels[-1].length
+        count, pixels = (
+            model.subimages.count(side),
+            model.subimages.padded_pixels(side, self.device.info.width),
         )
-    pixels, backprojected = model.subimages.padded_pixels(side, width), count * of_stage.count
-    tiled, weighted = model.surface.is_plane, model.beam is not None
-    taps = candidate.final.taps
-    gathered = not tiled and _looked_up_singly(model, candidate, lines, device)
-    work = backprojecting_leaves(
-        backprojected, pixels, taps, tiled=tiled, weighted=weighted, gathered=gathered
-    )
-    if not tiled:
-        work += Work(group=count * pixels)
-    add(
-        side,
-        count,
-        samples,
-        work,
-        channels=round(of_stage.count),
-        operations=count * pixels * of_stage.count,
-        error_db=candidate.final.scatter_db,
-    )
-    return stages, total
+        tiled = model.surface.is_plane
+        work = backprojecting_leaves(
+            count * channels,
+            pixels,
+            final.taps,
+            tiled=tiled,
+            weighted=model.beam is not None,
+            gathered=not tiled
+            and _looked_up_singly(model, self.candidate, self.lines, self.device),
+        )
+        if not tiled:
+            work += Work(group=count * pixels)
+        operations = count * pixels * channels
+        return _Part(side, count, channels, samples, operations, final.scatter_db, work)
 
 
 def _with_arithmetic(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from clsas.aperture.filters import Gain
 from clsas.aperture.phase_rates import drift, stretches
-from clsas.planning.channels import SampledChannels, sampled_channels
+from clsas.planning.channels import sampled_channels
 from clsas.planning.subimages import SMALL
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator
@@ -45,12 +45,11 @@ class Stretch:
 
 def stretch_of(model: VisibilityModel) -> Stretch:
     """Return the stretch of lines as seen from the sample points, whatever the roots."""
-    found: Stretch = model.from_cache(("stretch", model.limits), lambda: _stretch_of(model))
-    return found
+    return model.from_cache(("stretch", model.limits), lambda: _stretch_of(model))
 
 
 def _stretch_of(model: VisibilityModel) -> Stretch:
-    channels: SampledChannels = sampled_channels(replace(model, root=None), SMALL)
+    channels = sampled_channels(replace(model, root=None), SMALL)
     power = float(channels.weight.sum())
     if not power:  # no channel's beam touches the grid, or those are silent
         return Stretch()
