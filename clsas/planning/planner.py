@@ -61,63 +61,116 @@ def plan(
     depth: int | None = None,
     full_model: bool = False,
 ) -> Plan:
-    """Plan the fastest image whose error keeps a tolerance.
+    """Return the plan of the fastest image within a tolerance.
 
     Exactly one of `tolerance_db`, `tolerance_wavelengths` and `stages` must be given.
 
     Parameters
     ----------
     lines : RangeLines
-        Lines to image. Of their samples only the spectrum and the fading at the ends matter.
+        Lines to image. Only the spectrum of their samples, and how far they fade towards the ends
+        of the lines, influence the plan.
     grid : Grid
         Pixels of the image.
-    tolerance_db : float
-        Requested relative rms error against the exact image, dB, from -75 to -10.
-    tolerance_wavelengths : float
-        The same as a range error in wavelengths of the carrier. Errors that are spread evenly
-        between minus and plus this value make 4 pi/sqrt(3) radians rms per wavelength.
-    stages : sequence of (QR, QI)
-        Form the image as THESIS chapter 4 does. Every stage sums QR neighbouring lines and divides
-        subimages by QI along either side; then the last subimages are backprojected. An empty
-        sequence is plain backprojection. Range is interpolated linearly.
+    tolerance_db : float, optional
+        Largest relative rms error against the exact image, dB, from -75 to -10.
+    tolerance_wavelengths : float, optional
+        The same tolerance as a range error, in wavelengths of the carrier; see Notes.
+    stages : sequence of (QR, QI), optional
+        Form the image by the thesis's method, with nearest beams and linear interpolation in range
+        [2]_. Every stage sums QR neighbouring lines and divides subimages by QI along either side;
+        the last subimages are backprojected. An empty sequence is plain backprojection.
     beam : BeamWindow, optional
-        Weights of the channels.
+        Weights of the channels by aspect angle.
     device : Device, str or int, optional
         Device that forms the image; see `clsas.opencl.device.choose`.
     memory_bytes : int, optional
-        Device memory that may be used. By default half of the device's, or as much as plain
-        backprojection takes.
+        Device memory that may be used. The default is half of the device's memory, or as much as
+        plain backprojection needs.
     costs : Costs, optional
-        Costs in place of those stored for the device. Where none are stored, a measurement of 0.3
-        to 0.6 s scales the defaults, and is stored, before the first search for a factorization.
+        Costs of each kind of work, instead of those stored for the device. If none are stored, the
+        first search for a factorization measures how fast the device is, for 0.3 to 0.6 s, scales
+        the default costs and stores them.
     taps : (range, aperture), optional
-        For study, with a tolerance: numbers of taps, 4, 6 or 8, in place of the fastest.
+        For studies, with a tolerance: number of taps of the filters in range and along the
+        aperture, 4, 6 or 8 each, instead of the fastest.
     depth : int, optional
-        For study, with a tolerance: number of stages, 1 to 5, in place of the fastest.
+        For studies, with a tolerance: number of stages, 1 to 5, instead of the fastest.
     full_model : bool
-        For study: model every effect, also those whose error lies far below the tolerance.
+        For studies: model every effect, including those whose error lies far below the tolerance.
 
     Returns
     -------
     Plan
-        An exact image if nothing is faster: near the aperture, with few channels or pixels, or much
-        relief.
+        How the image is formed, with its predicted error, time and memory. The plan is that of an
+        exact image if no factorization is faster: close to the aperture, with few channels or
+        pixels, or with much relief.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not allowed, or no plan fits the memory: the message names what the least
-        demanding one needs.
+        If an argument is not allowed, or no plan fits the memory. In the latter case the message
+        states how much memory is needed.
     DeviceError
-        If there is no such device.
+        If the device does not exist.
 
     Warns
     -----
     ClsasWarning
-        If the tolerance may be missed because lines do not fade towards ends that the grid
-        reaches, or because the lines' band fills all that is sampled; or if no pixel lies within
-        any line's range, or the beam, so that the image will be zero; or if costs stored for the
-        device cannot be read, or those measured cannot be stored.
+        If the image may miss the tolerance, because the grid reaches ends of lines that do not
+        fade, or because the lines' band fills the whole sampled band; if no pixel lies within the
+        range of any line and the beam, so that the image will be zero; or if the costs stored for
+        the device cannot be read, or measured ones cannot be stored.
+
+    See Also
+    --------
+    factorize : Form the image by a plan.
+    Imager : Form several images by a plan.
+    backproject : Form the exact image.
+
+    Notes
+    -----
+    A factorized image divides the grid into subimages within subimages, and combines the channels
+    of each into fewer, virtual ones, stage by stage [1]_. The search tries numbers of stages, sizes
+    of subimages and taps of filters. It predicts the time of each factorization from counts of its
+    operations, and the error from the sum of the powers of independent contributions
+    (`Plan.errors`). The plan is the fastest factorization whose predicted error, with a margin for
+    the scatter of measured ones, is within the tolerance.
+
+    Range errors that are spread evenly between minus and plus w wavelengths turn phases by up to
+    4 pi w. The relative rms error is therefore 4 pi w/sqrt(3), and ::
+
+        tolerance_db = 20 log10(4 pi tolerance_wavelengths/sqrt(3))
+
+    References
+    ----------
+    .. [1] Ulander, Hellsten, Stenström, "Synthetic-aperture radar processing using fast factorized
+       back-projection", IEEE Transactions on Aerospace and Electronic Systems 39(3), 2003.
+    .. [2] Ødegaard, "Fast time domain beamforming for synthetic aperture sonar", thesis,
+       University of Oslo, 2004, chapter 4.
+
+    Examples
+    --------
+    The planner decides whether a factorization is faster than the exact image. A small image is
+    exact:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> tx_m = np.outer(np.arange(64), [0.02, 0, 0])
+    >>> point = clsas.PointTargets([[0.6, 20.0, 0.0]], [1.0])
+    >>> lines = clsas.simulate_lines(tx_m, tx_m, point, carrier_hz=100e3, bandwidth_hz=20e3)
+    >>> grid = clsas.Grid.plane((0.4, 0.8, 32), (19.8, 20.2, 32))
+    >>> plan = clsas.plan(lines, grid, tolerance_db=-40)
+    >>> plan.is_exact
+    True
+
+    Given a number of stages, it returns the fastest factorization that has them:
+
+    >>> plan = clsas.plan(lines, grid, tolerance_db=-40, depth=1)
+    >>> plan.is_exact, len(plan.sides)
+    (False, 1)
+    >>> plan.predicted_error_db <= -40
+    True
     """
     request = Request(
         lines,
