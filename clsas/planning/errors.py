@@ -1,4 +1,4 @@
-"""Errors of a factorized image besides those of its filters: roots, spacing and leaves."""
+"""Errors of a factorized image other than those of its range filters."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ from clsas.signal.interpolation import Interpolator
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
-# Rms error of a phase in the stages over the phase across a root, from float32: measured. With half
-# of it images at -60 dB are up to 3 % faster; with twice of it measured errors fall by 0.1 dB.
+# Rms error of a phase in the stages, from float32, over the phase across a root: measured. With
+# half of it, images at -60 dB are up to 3 % faster; with twice, measured errors fall by 0.1 dB.
 _FLOAT32 = 4.5e-8
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Error powers of a tree besides those of its range filters.
+    """Error powers of a tree other than those of its range filters.
 
     Attributes
     ----------
     aperture : float
-        The aperture's filter, in all stages.
+        The filter along the aperture, in all stages.
     roots : float
-        Rounding, and channels that are replaced by places on the mean track.
+        Rounding, and channels that are replaced by positions on the mean track.
     spacing : tuple of float
         Uneven spacing of virtual channels, and beam weights that change between them, by stage.
     leaves : float
@@ -71,7 +71,7 @@ def other_errors(
     beam_cycles: float,
     device: Device,
 ) -> Errors:
-    """Return the errors of a tree; `model` is that within its roots, whose error is known."""
+    """Return the errors of a tree. `model` must have its root size; `roots` is its root error."""
     stages = spaced_stages(sides, aperture, oversampling, beam_cycles)
     each_stage = [stages[: level + 1] for level in range(len(stages))]
     filters = sum(filter_error(model, to) for to in each_stage)
@@ -89,7 +89,7 @@ def spaced_stages(
     oversampling: tuple[float, ...],
     beam_cycles: float | None,
 ) -> Stages:
-    """Return the stages of a tree; only the last one's virtual channels follow the beam."""
+    """Return the stages of a tree. Only the virtual channels of the last stage follow the beam."""
     last = len(sides) - 1
     return tuple(
         SpacedStage(side, aperture, denser, beam_cycles if level == last else 0.0)
@@ -100,10 +100,10 @@ def spaced_stages(
 def leaf_error(
     model: VisibilityModel, sides: NDArray[np.int64], device: Device
 ) -> NDArray[np.float64]:
-    """Return the error power that expanding a leaf adds, per size.
+    """Return the error power of expanding ranges and weights in leaves, [sizes].
 
     As in `clsas.exact.tiles.lay_out`, the remainder is of fourth order; in long leaves its rms is
-    0.35 of its maximum. Off a plane nothing is expanded, and float32 rounds.
+    0.35 of its maximum. Off a plane nothing is expanded, and the error is float32's rounding.
     """
     if not model.surface.is_plane:
         radius_m = np.array([model.surface.radius_m(tuple(side)) for side in sides.tolist()])
@@ -237,9 +237,10 @@ def beam_weights(
 def nearest_errors(
     model: VisibilityModel, stages: Sequence[tuple[int, int]]
 ) -> tuple[float, list[float]]:
-    """Return the error power of nearest beams, THESIS [45], and that of each stage.
+    """Return the error power of nearest beams, and that of each stage.
 
-    Range errors are taken as spread evenly up to the bound. Those of stages add, not their powers.
+    Range errors are assumed to be spread evenly up to the bound of Ødegaard (2004), eq. [45]. The
+    errors of stages add, not their powers.
     """
     centres_m = model.lines.phase_centres_m[np.argsort(model.track.coordinate)]
     spacing_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1).mean()

@@ -37,11 +37,11 @@ from clsas.signal.interpolation import PHASES, Interpolator, Resampling, Upsampl
 HALF_ROUNDING = 4e-8
 """Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms."""
 MARGIN_DB = 1.0
-"""Margin of predicted errors for the scatter of measured ones."""
-_ROUNDING_SHARE = 0.1  # of an image's error power, for half precision; half or twice: the same
-_MOST_CHUNKS = 16  # in a sum rounded to half precision; more lose what is added
-_FEW_CHANNELS = 7.0, 30.0  # per pixel, that double the scatter of errors; the latter with steps
-_ROOM = 1.06  # of buffers, over the predicted virtual channels; twice the spare room: 2 % slower
+"""Margin of predicted errors, for the scatter of measured ones."""
+_ROUNDING_SHARE = 0.1  # of an image's error power, for half precision; half or twice: no change
+_MOST_CHUNKS = 16  # in a sum in half precision; in longer sums, addends vanish by rounding
+_FEW_CHANNELS = 7.0, 30.0  # per pixel, that double the scatter of errors; second: beams with steps
+_ROOM = 1.06  # size of buffers over the predicted virtual channels; with 1.12: 2 % slower
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Conditions:
     Attributes
     ----------
     tolerance_db : float or None
-        None where stages were given.
+        None if stages were given.
     exact : Exact
     device : Device
     costs : Costs
@@ -73,7 +73,7 @@ class Candidate:
     Attributes
     ----------
     sides, tile, align, final, aperture
-        As those of `clsas.plans.plan.Factorization`.
+        Fields of `clsas.plans.factorization.Factorization`.
     margin : float
         Factor of the predicted error power, for the scatter of measured errors.
     """
@@ -88,16 +88,16 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """Upsampled lines.
+    """How lines are upsampled, with the errors of their filters.
 
     Attributes
     ----------
     upsampler, resampling
-        As those of `Factorization`.
+        Fields of `Factorization`.
     align_db : float
-        Error of an interpolation between their samples.
+        Error of one interpolation between upsampled samples.
     errors : ErrorBudget
-        Contributions of all filters, and those given.
+        Errors of all range filters, and those found before.
     """
 
     upsampler: Upsampler | None
@@ -114,10 +114,10 @@ def predicted_plan(
     Parameters
     ----------
     model : VisibilityModel
-        That within the candidate's roots, where the aperture is interpolated.
+        With the candidate's root size, if the aperture is interpolated.
     candidate : Candidate
     other_errors : ErrorBudget
-        Contributions of all but the range filters.
+        Errors other than those of the range filters.
     conditions : Conditions
     """
     sides, device = candidate.sides, conditions.device
@@ -151,7 +151,7 @@ def predicted_plan(
     )
     roots = stages[0].subimages
     batches = batches_within(sizes, roots, device, conditions.memory_bytes)
-    # A stage of a sector takes the host as long for each strip as a batch does.
+    # For each strip of a sector, a stage takes the host as long as a batch.
     sectors = 1 + max(roots - batches.at_once, 0) // batches.prepared
     launched = -(-roots // batches.at_once) + sectors * (model.track.strips - 1)
     work += Work(batch=float(launched * len(sides)))
@@ -179,7 +179,7 @@ def predicted_plan(
 
 
 def exact_plan(model: LinesModel, conditions: Conditions, reason: str) -> Plan:
-    """Return the plan of the exact image; see `ExactImage` for the reason."""
+    """Return the plan of the exact image. `reason` says why it cannot be factorized, if so."""
     exact = conditions.exact
     image = ExactImage(accuracy_db=exact.accuracy_db, reason=reason)
     errors = ErrorBudget(exact=power(exact.accuracy_db))
@@ -190,9 +190,9 @@ def exact_plan(model: LinesModel, conditions: Conditions, reason: str) -> Plan:
 def margin_db(model: VisibilityModel) -> float:
     """Return the margin of predicted errors, dB, which covers the scatter of measured ones.
 
-    Errors scatter more if few channels see a pixel, or a few hold most of the power: they depend on
-    the positions of these between virtual channels, and relative to a step of the beam. They also
-    scatter more if the lines' power lies at few frequencies.
+    Errors scatter more if a pixel receives from few channels, or if few channels have most of the
+    power: they then depend on the positions of these channels between virtual ones, and relative to
+    a step of the beam. They also scatter more if the lines' power lies at few frequencies.
     """
     power = model.channel_power
     channels = power.sum() ** 2 / (power @ power) * model.visible_share(model.small)
@@ -203,7 +203,7 @@ def margin_db(model: VisibilityModel) -> float:
 def half_precision_error(stages: int) -> float:
     """Return the least error power that half precision adds through some stages.
 
-    It is more if virtual channels are sums of many: see `_half_rounding`.
+    The error is larger if virtual channels are sums of many: see `_half_rounding`.
     """
     return HALF_ROUNDING * (1 + 1.5 * stages)
 
@@ -217,7 +217,7 @@ def _plan(
     work: Work,
     errors: ErrorBudget,
 ) -> Plan:
-    """Return an image with its prediction."""
+    """Return the plan of an image, with its prediction."""
     costs = conditions.costs
     prediction = Prediction(
         error_db=errors.total_db,
@@ -240,9 +240,9 @@ def _plan(
 
 
 def _upsampled(model: VisibilityModel, candidate: Candidate, other_errors: ErrorBudget) -> _Lines:
-    """Return how lines are upsampled, and the errors of all filters.
+    """Return how lines are upsampled, with the errors of all filters.
 
-    A gain that makes up for the range filters' attenuation leaves only their scatter.
+    A gain that corrects the attenuation of the range filters leaves only their scatter.
     """
     align, final, aperture = candidate.align, candidate.final, candidate.aperture
     stages, samples = len(candidate.sides), model.lines.length
@@ -254,10 +254,10 @@ def _upsampled(model: VisibilityModel, candidate: Candidate, other_errors: Error
         in_range += uncompensated(model, align, final, stages, PHASES / step, gain)
     errors = replace(other_errors, range_filters=in_range)
     if gain is not None:
-        wanted_db, most_db = (
+        allowed_db, most_db = (
             in_db(share * errors.total) for share in (UPSAMPLING_SHARE, LONGEST_UPSAMPLING_SHARE)
         )
-        upsampler = interpolation.upsampler(model.spectrum, step, gain, wanted_db, most_db)
+        upsampler = interpolation.upsampler(model.spectrum, step, gain, allowed_db, most_db)
         if upsampler is not None:
             resampling = upsampler.resampling(samples, align.taps // 2, model.spectrum)
             errors = replace(errors, upsampling=power(upsampler.error_db))
@@ -280,7 +280,7 @@ def _trimmed(model: VisibilityModel, candidate: Candidate, lines: _Lines) -> _Li
         for each_m in (low_m, high_m)
     )
     first, last = max(first - spare, 0), min(last + 1 + spare, resampling.length)
-    # Whole turns of the filters' phases, and a line at least.
+    # The filters' phases repeat every PHASES samples, where a line must begin.
     first -= first % PHASES
     if last - first < 1 or candidate.aperture.method != "interpolated":
         return lines
@@ -395,9 +395,10 @@ def _with_arithmetic(
     channels: Sequence[StageChannels],
     conditions: Conditions,
 ) -> tuple[ErrorBudget, int, bool]:
-    """Add the errors of polynomials and rounding.
+    """Return the errors with those of polynomials and rounding.
 
-    Return also how many terms polynomials have, and whether lines have half precision.
+    Return also the number of terms of the polynomials for sine and cosine, and whether stages store
+    lines in half precision.
     """
     tolerance_db, errors = conditions.tolerance_db, lines.errors
     if tolerance_db is None:
@@ -419,9 +420,9 @@ def _with_arithmetic(
 def _looked_up_singly(
     model: VisibilityModel, candidate: Candidate, lines: _Lines, device: Device
 ) -> bool:
-    """Return whether leaves of points are too thick to look samples up in a register.
+    """Return whether leaves of points are too thick to look samples up in registers.
 
-    CPUs convert single samples of half precision ten times slower than whole registers.
+    CPUs convert single samples of half precision ten times more slowly than whole registers.
     """
     if model.grid.points_m is None or device.info.width == 1:
         return False
@@ -433,10 +434,11 @@ def _looked_up_singly(
 def _half_rounding(model: VisibilityModel, summed: Sequence[float], bands: int) -> float:
     """Return the error power of rounding lines to half precision.
 
-    `summed` is the number of channels that a virtual one sums, stage by stage, and `bands` that of
-    the bands that add to it one after another, in every stage of a sheet. Upsampled lines are
+    `summed` is the number of channels that a virtual one sums, stage by stage, and `bands` the
+    number of bands that add to it one after another, in every stage of a sheet. Upsampled lines are
     rounded once. Lines of a stage are rounded once per chunk of channels, while the sum still
-    grows, which counts as half. A sum of very many chunks loses what is added last.
+    grows; such a rounding counts half. In a sum of very many chunks, the last ones vanish by
+    rounding, and the error is infinite.
     """
     chunks = np.array(summed) / CHUNK
     chunks[0] *= peak_density(model)

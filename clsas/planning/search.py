@@ -1,8 +1,8 @@
-"""The fastest tree of subimages whose filters err by no more than allowed.
+"""Search for the fastest tree of subimages whose filters are accurate enough.
 
-For every root, number of stages and choice of filters, the fastest division down to the leaves is a
-shortest path over the sizes of subimages (dynamic programming). Roots are tried in the order of a
-lower bound of their time, until none of the others can be faster.
+For every size of roots, number of stages and choice of filters, the fastest division down to the
+leaves is a shortest path over the sizes of subimages (dynamic programming). Roots are tried in the
+order of a lower bound of their time, until none of the others can be faster.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from clsas.signal.interpolation import PHASES, upsampler
 from clsas.signal.spectrum import Spectrum
 
 OVERHANG = 1.5
-"""Factor of a filter's taps that extend past an aperture's ends after several stages: those of the
-stage before count half, where subimages are half as long."""
+"""Factor of the taps that extend past an aperture's ends in trees of several stages. The taps of
+the previous stage count half, because subimages are half as long."""
 MOST_STAGES = 5
-"""Most stages of a tree. More add errors without saving work."""
-# Share of the filters' error power that expanding a leaf may add. Half of it leaves some near grids
-# without a leaf, so that they are imaged exactly; twice gains 3 % of time.
+"""Largest number of stages of a tree. More stages add errors without saving work."""
+# Share of the filters' error power that the expansion of ranges in leaves may add. With half of it,
+# some grids close to the track have no leaf and are imaged exactly; with twice, times fall by 3 %.
 _LEAF_SHARE = 0.25
-_SPARE_SAMPLES = 16  # of a line, for filters and padding; twice moves times by 3 % at most
+_SPARE_SAMPLES = 16  # of a line, for filters and padding; twice changes times by 3 % at most
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Tree:
     dimensions: int = 1
 
     def filters(self, spectrum: Spectrum, filters_db: float) -> FilterRates | None:
-        """Return filters whose errors together are no more than `filters_db`; None without any."""
+        """Return filters whose errors add up to at most `filters_db`; None if there are none."""
         stages = len(self.sides)
         return choose(
             spectrum, self.align_taps, self.aperture_taps, stages, filters_db, self.dimensions
@@ -76,31 +76,33 @@ class Tree:
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """Choices of filters and numbers of stages, and the time that things take with each.
+    """Choices of filters and numbers of stages, and the times of operations with each.
 
     Attributes
     ----------
     choices : list of FilterRates, [options]
     stages : int64 [options]
-        Never increasing.
+        Numbers of stages, never increasing.
     density, ends : float64 [options, 1, 1]
-        Virtual channels per cycle, and those besides; see `AperturePhases.virtual_channels`.
+        Virtual channels per cycle of phase, and their number without any phase: see
+        `AperturePhases.virtual_channels`.
     channel_s : float64 [options, sizes]
-        Each channel of all subimages of a size, in stages after the first.
+        Time per channel of all subimages of a size, in stages after the first.
     subimages_s : float64 [sizes]
-        These subimages themselves.
+        Time of these subimages that does not depend on channels.
     leaves_s : float64 [options, sizes]
-        Each virtual channel of all leaves of a size; infinite where leaves may not have it.
+        Time per virtual channel of all leaves of a size; infinite if leaves cannot have this size.
     roots_s : float64 [options, sizes]
-        The first stage with roots of a size, and all that does not depend on the division.
+        Time of the first stage with roots of a size, and of all work that does not depend on the
+        division.
     leaf_beam_cycles : float64 [sizes]
         Phase cycles that the beam's weights add to those of a leaf.
     rows : float64 [options, 1]
-        Rows of virtual channels besides those for the phase across a sheet.
+        Rows of virtual channels of a sheet without any phase across it.
     leaf_beam_rows : float
         Phase cycles across a sheet that the beam's weights add to those of a leaf.
     row_lines_s : float64 [options, sizes]
-        Each virtual channel of a sheet, for all subimages of a size: see `adding_in_rows`.
+        Time per virtual channel of a sheet, for all subimages of a size: see `adding_in_rows`.
     """
 
     choices: list[FilterRates]
@@ -125,7 +127,7 @@ class Options:
     def _times_on_curve(self, division: Division, some: NDArray[np.int64]) -> Times:
         """Return the times where virtual channels lie on a curve, or on strips."""
         density, ends = self.density[some], self.ends[some]
-        # A child uses those of its parent's channels whose beam touches it.
+        # A child uses the channels of its parent whose beam touches it.
         used = density * division.cycles
         used += ends
         columns = density[..., 0] * self._leaf_cycles(division) + ends[..., 0]
@@ -241,7 +243,7 @@ def all_options(
     costs: Costs,
     allowed: Allowed,
 ) -> Options | None:
-    """Return all choices of filters that err by no more than `filters_db`; None without any."""
+    """Return all options whose filters are as accurate as `filters_db`; None if there are none."""
     model, counts, channels = sizes.model, sizes.counts, sizes.model.lines.channels
     choices, stages, dimensions = [], [], 1 + model.track.is_sheet
     aligned = aligned_spectrum(model)
@@ -272,7 +274,7 @@ def all_options(
     leaf = sizes.leaf_error <= _LEAF_SHARE * power(filters_db)
     leaf &= np.prod(sizes.sides, axis=1) >= leaf_pixels
     density = np.array([2 * choice.oversampling for choice in choices])
-    # Past the ends filters extend as if they had more taps, but in the first stage.
+    # In trees of several stages, filters extend past the ends as if they had more taps.
     further = np.where(np.array(stages) > 1, OVERHANG, 1.0)
     aperture_taps = further * [choice.aperture_taps for choice in choices]
     return Options(
@@ -303,16 +305,16 @@ def search(
     costs: Costs,
     allowed: Allowed,
 ) -> Tree | None:
-    """Return the fastest tree whose filters err by no more than `filters_db` together.
+    """Return the fastest tree whose filters are, together, as accurate as `filters_db`.
 
-    None where there is none with roots of `most` rows and columns and leaves of `leaf_pixels` at
-    least.
+    Return None if there is no such tree whose roots have at most `most` rows and columns, and whose
+    leaves have at least `leaf_pixels` pixels.
     """
     sizes = all_sizes(model, most, device)
     options = all_options(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed)
     if options is None or not sizes.pairs:
         return None
-    # The phase rate is lowest at a root's centre, so these are lower bounds.
+    # The phase rate is lowest at a root's centre, so that these are lower bounds.
     every = np.arange(len(options.choices))
     bound_s = options.roots_s + options.times(sizes.anywhere, every).onward_s()[-1]
     least_s = bound_s.min(axis=0)

@@ -1,4 +1,4 @@
-"""Geometry between track and grid, sampled: the cost and error models are evaluated on it."""
+"""Sampled geometry between track and grid, on which costs and errors are evaluated."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ from clsas.signal.spectrum import (
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility
 
-_DENSE = 65  # points along either side, for the least distance of the grid; half: 0.05 dB
-_NEAREST_CHANNELS = 4096  # of a dense aperture, for that distance
+_DENSE = 65  # points along either side, for the least distance; half moves errors by 0.05 dB
+_NEAREST_CHANNELS = 4096  # of a dense aperture, for the least distance
 _MOST_OUTSIDE = 1e-6  # share of power above the highest frequency; half or twice: no change
-_AMBIGUITY = "ambiguity"  # key of what mean tracks of all shapes have in common
+_AMBIGUITY = "ambiguity"  # key of the cached value that does not depend on the mean track
 
 
 _Value = TypeVar("_Value")
@@ -158,7 +158,7 @@ class VisibilityModel(LinesModel):
         return replace(self, limits=(low, high))
 
     def within(self, root: Side) -> VisibilityModel:
-        """Return this model with the phase rates of subimages in roots of a size."""
+        """Return this model with the largest phase rates in roots of a size."""
         return replace(self, root=root)
 
     @property
@@ -181,7 +181,7 @@ class VisibilityModel(LinesModel):
     @property
     @shared
     def spacing(self) -> NDArray[np.float64]:
-        """Weight of each sample in integrals over the track's parameter."""
+        """Weight of each sample in integrals over the aperture coordinate."""
         return trapezoidal_weights(self.track.samples)
 
     @property
@@ -212,14 +212,14 @@ class VisibilityModel(LinesModel):
 
     @property
     def small(self) -> Side:
-        """Rows and columns of subimages that stand for a pixel; they divide the model's roots."""
+        """Rows and columns of subimages that represent a pixel; they divide the model's roots."""
         rows, columns = self.root or SMALL
         return math.gcd(rows, SMALL[0]), math.gcd(columns, SMALL[1])
 
     def extents(self, side: Side, *, most: bool = False) -> NDArray[np.float64]:
-        """Return the extents of subimages of a size in roots of the model's: see `Subimages`.
+        """Return the extents of subimages of a size in roots: see `Subimages.extents`.
 
-        Without a size of roots every subimage is one.
+        If the model has no root size, every subimage is a root.
         """
         return self.subimages.extents(side, self.root or side, most=most)
 
@@ -311,9 +311,9 @@ def model_of(
 
 
 def _nearest_m(lines: RangeLines, surface: Surface, track: MeanTrack) -> float:
-    """Lower bound of the distance between pixels and channels."""
+    """Return a lower bound of the distance between pixels and channels."""
     dense_m = points_at_m(surface, np.linspace(0, 1, _DENSE))
-    # Pixels between the dense points may be closer; half a step bounds by how much.
+    # Pixels between the dense points may be closer, by half a step at most.
     steps_m = np.linalg.norm(surface.steps_m[:2], axis=1)
     step_m = steps_m @ (np.array(surface.plane.shape) - 1) / (_DENSE - 1)
     between_m = (step_m + surface.relief_m(LEAST_SIDE).max()) / 2
