@@ -18,10 +18,10 @@ from clsas.aperture.mean_track import MeanTrack
 from clsas.core.decibels import in_db, power
 from clsas.opencl import phases
 from clsas.planning.beam_coverage import trimmed
+from clsas.planning.candidate import Candidate
 from clsas.planning.channels import frequencies
 from clsas.planning.errors import Errors, other_errors, root_error, spaced_stages
 from clsas.planning.prediction import (
-    Candidate,
     Conditions,
     margin_db,
     predicted_plan,
@@ -168,7 +168,7 @@ def fastest(
         return Outcome(obstacle=_NOT_SMOOTH)
     beam_cycles = 0.0 if model.beam is None else _LEAST_BEAM_CYCLES
     trial: _Trial | None = _Trial(choices, most_root, beam_cycles, problem.reserved)
-    needed = math.inf
+    least_bytes = math.inf
     while trial is not None:
         tree = trial.tree
         if tree is None:
@@ -178,19 +178,17 @@ def fastest(
         if filters is None:
             trial = _with_fewer_stages(problem, trial, tree)
             continue
-        errors, found = _estimated(problem, trial, tree, filters)
+        errors, found = _predicted(problem, trial, tree, filters)
         if found.predicted_seconds >= seconds:
             break
         if found.predicted_error_db > problem.tolerance_db:
             trial = _more_accurate(problem, trial, errors, found)
         elif found.memory_bytes > conditions.memory_bytes:
-            needed = min(needed, found.memory_bytes)
-            rows, columns = found.sides[0]
-            smaller = (rows // 2, columns) if rows > columns else (rows, columns // 2)
-            trial = replace(trial, most_root=smaller, tree=None)
+            least_bytes = min(least_bytes, found.memory_bytes)
+            trial = _with_smaller_roots(trial, found)
         else:
             return Outcome(found, model.track)
-    return Outcome(least_bytes=needed)
+    return Outcome(least_bytes=least_bytes)
 
 
 def off_track(model: VisibilityModel, conditions: Conditions) -> bool:
@@ -238,7 +236,7 @@ def _filters(problem: _Problem, trial: _Trial, tree: Tree) -> Filters | None:
     return problem.designs[key]
 
 
-def _estimated(
+def _predicted(
     problem: _Problem, trial: _Trial, tree: Tree, filters: Filters
 ) -> tuple[Errors, Plan]:
     """Return the errors of a candidate other than those of its range filters, and its plan."""
@@ -277,6 +275,13 @@ def _estimated(
         margin=power(margin_db(within)),
     )
     return errors, predicted_plan(within, candidate, budget, conditions)
+
+
+def _with_smaller_roots(trial: _Trial, found: Plan) -> _Trial:
+    """Return a trial whose roots have at most half as many pixels, which need less memory."""
+    rows, columns = found.sides[0]
+    smaller = (rows // 2, columns) if rows > columns else (rows, columns // 2)
+    return replace(trial, most_root=smaller, tree=None)
 
 
 def _with_fewer_stages(problem: _Problem, trial: _Trial, tree: Tree) -> _Trial | None:

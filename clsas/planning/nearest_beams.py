@@ -11,8 +11,9 @@ import numpy as np
 from clsas.aperture.nearest import NearestBeams
 from clsas.core.decibels import in_db, power
 from clsas.opencl.device import Device
+from clsas.planning.candidate import Candidate
 from clsas.planning.errors import leaf_error, nearest_errors
-from clsas.planning.prediction import Candidate, Conditions, predicted_plan
+from clsas.planning.prediction import Conditions, predicted_plan
 from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.plans.plan import Plan

@@ -8,31 +8,31 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from clsas.aperture.filters import LONGEST_UPSAMPLING_SHARE, UPSAMPLING_SHARE
-from clsas.aperture.interpolated import InterpolatedAperture
-from clsas.aperture.nearest import NearestBeams
 from clsas.aperture.predicted_channels import StageChannels
 from clsas.core.decibels import in_db, power
 from clsas.core.digests import grid_digest, lines_digest
-from clsas.exact.lookup import lookup_room
 from clsas.factorized.buffers import CHUNK, Level
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
 from clsas.opencl.device import Device
 from clsas.planning.aperture_phases import AperturePhases
-from clsas.planning.channels import peak_density, range_window_m, references
+from clsas.planning.candidate import (
+    Candidate,
+    UpsampledLines,
+    looked_up_singly,
+    upsampling_of,
+)
+from clsas.planning.channels import peak_density, references
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact
 from clsas.planning.memory import BufferSizes, batches_within
 from clsas.planning.range_extents import half_line_lengths
-from clsas.planning.stretches import stretch_of, uncompensated
+from clsas.planning.stretches import stretch_of
 from clsas.planning.visibility_model import LinesModel, VisibilityModel
 from clsas.planning.work import adding_in_rows, backprojecting_leaves, combining, upsampling
 from clsas.plans.factorization import ExactImage, Factorization
 from clsas.plans.plan import Plan
 from clsas.plans.predictions import ErrorBudget, Prediction, Stage, Work
-from clsas.signal import interpolation
-from clsas.signal.interpolation import PHASES, Interpolator, Resampling, Upsampler
 
 HALF_ROUNDING = 4e-8
 """Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms."""
@@ -66,46 +66,6 @@ class Conditions:
     memory_bytes: int
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A factorization that the planner considers.
-
-    Attributes
-    ----------
-    sides, tile, align, final, aperture
-        Fields of `clsas.plans.factorization.Factorization`.
-    margin : float
-        Factor of the predicted error power, for the scatter of measured errors.
-    """
-
-    sides: tuple[tuple[int, int], ...]
-    tile: tuple[int, int]
-    align: Interpolator
-    final: Interpolator
-    aperture: InterpolatedAperture | NearestBeams
-    margin: float = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Lines:
-    """How lines are upsampled, with the errors of their filters.
-
-    Attributes
-    ----------
-    upsampler, resampling
-        Fields of `Factorization`.
-    align_db : float
-        Error of one interpolation between upsampled samples.
-    errors : ErrorBudget
-        Errors of all range filters, and those found before.
-    """
-
-    upsampler: Upsampler | None
-    resampling: Resampling
-    align_db: float
-    errors: ErrorBudget
-
-
 def predicted_plan(
     model: VisibilityModel, candidate: Candidate, other_errors: ErrorBudget, conditions: Conditions
 ) -> Plan:
@@ -121,9 +81,7 @@ def predicted_plan(
     conditions : Conditions
     """
     sides, device = candidate.sides, conditions.device
-    lines = _upsampled(model, candidate, other_errors)
-    if model.track.is_dense:
-        lines = _trimmed(model, candidate, lines)
+    lines = upsampling_of(model, candidate, other_errors)
     half_lengths = half_line_lengths(
         model, sides, candidate.align, candidate.final, lines.resampling
     )
@@ -239,55 +197,6 @@ def _plan(
     )
 
 
-def _upsampled(model: VisibilityModel, candidate: Candidate, other_errors: ErrorBudget) -> _Lines:
-    """Return how lines are upsampled, with the errors of all filters.
-
-    A gain that corrects the attenuation of the range filters leaves only their scatter.
-    """
-    align, final, aperture = candidate.align, candidate.final, candidate.aperture
-    stages, samples = len(candidate.sides), model.lines.length
-    step = max(int(PHASES / align.upsampling), 1)
-    gain = aperture.lines_gain(align, final, PHASES / step)
-    align_db = align.error_db if gain is None else align.scatter_db
-    in_range = stages * power(align_db) + power(final.scatter_db)
-    if gain is not None:
-        in_range += uncompensated(model, align, final, stages, PHASES / step, gain)
-    errors = replace(other_errors, range_filters=in_range)
-    if gain is not None:
-        allowed_db, most_db = (
-            in_db(share * errors.total) for share in (UPSAMPLING_SHARE, LONGEST_UPSAMPLING_SHARE)
-        )
-        upsampler = interpolation.upsampler(model.spectrum, step, gain, allowed_db, most_db)
-        if upsampler is not None:
-            resampling = upsampler.resampling(samples, align.taps // 2, model.spectrum)
-            errors = replace(errors, upsampling=power(upsampler.error_db))
-            return _Lines(upsampler, resampling, align_db, errors)
-    resampling = interpolation.resampling(samples, align, model.spectrum)
-    return _Lines(None, resampling, align_db, errors)
-
-
-def _trimmed(model: VisibilityModel, candidate: Candidate, lines: _Lines) -> _Lines:
-    """Return upsampled lines without the samples that no pixel needs.
-
-    Dense apertures have so many channels that upsampling whole lines takes most of the time.
-    """
-    resampling = lines.resampling
-    low_m, high_m = range_window_m(model, candidate.sides[0])
-    step_m = model.lines.range_step_m
-    spare = len(candidate.sides) * (candidate.align.taps // 2 + 1) + candidate.final.taps + 2
-    first, last = (
-        math.floor((each_m / step_m + resampling.lead) * resampling.ratio) - resampling.first
-        for each_m in (low_m, high_m)
-    )
-    first, last = max(first - spare, 0), min(last + 1 + spare, resampling.length)
-    # The filters' phases repeat every PHASES samples, where a line must begin.
-    first -= first % PHASES
-    if last - first < 1 or candidate.aperture.method != "interpolated":
-        return lines
-    window = replace(resampling, first=resampling.first + first, length=last - first)
-    return replace(lines, resampling=window)
-
-
 @dataclass(frozen=True, eq=False)
 class _Part:
     """Subimages of a stage or the leaves, and the work of forming them.
@@ -337,7 +246,7 @@ class _Forming:
 
     model: VisibilityModel
     candidate: Candidate
-    lines: _Lines
+    lines: UpsampledLines
     levels: Sequence[Level]
     channels: Sequence[StageChannels]
     device: Device
@@ -379,8 +288,7 @@ class _Forming:
             final.taps,
             tiled=tiled,
             weighted=model.beam is not None,
-            gathered=not tiled
-            and _looked_up_singly(model, self.candidate, self.lines, self.device),
+            gathered=not tiled and looked_up_singly(model, self.candidate, self.lines, self.device),
         )
         if not tiled:
             work += Work(group=count * pixels)
@@ -391,7 +299,7 @@ class _Forming:
 def _with_arithmetic(
     model: VisibilityModel,
     candidate: Candidate,
-    lines: _Lines,
+    lines: UpsampledLines,
     channels: Sequence[StageChannels],
     conditions: Conditions,
 ) -> tuple[ErrorBudget, int, bool]:
@@ -407,7 +315,7 @@ def _with_arithmetic(
     errors = replace(errors, phases=phases.error(terms) ** 2)
     if lines.upsampler is None or not conditions.device.info.half_precision:
         return errors, terms, False
-    if _looked_up_singly(model, candidate, lines, conditions.device):
+    if looked_up_singly(model, candidate, lines, conditions.device):
         return errors, terms, False
     # Each row of a sheet is read and written for about twice as many bands as it has taps.
     bands = 2 * candidate.aperture.filter.taps if candidate.aperture.dimensions == 2 else 0
@@ -415,20 +323,6 @@ def _with_arithmetic(
     if rounding > _ROUNDING_SHARE * power(tolerance_db):
         return errors, terms, False
     return replace(errors, half_precision=rounding), terms, True
-
-
-def _looked_up_singly(
-    model: VisibilityModel, candidate: Candidate, lines: _Lines, device: Device
-) -> bool:
-    """Return whether leaves of points are too thick to look samples up in registers.
-
-    CPUs convert single samples of half precision ten times more slowly than whole registers.
-    """
-    if model.grid.points_m is None or device.info.width == 1:
-        return False
-    room = lookup_room(2, candidate.final.taps, device.info.width)
-    thickness_m = float(model.surface.relief_m(candidate.sides[-1]).max())
-    return thickness_m / 2 * lines.resampling.samples_per_m(model.lines) > room
 
 
 def _half_rounding(model: VisibilityModel, summed: Sequence[float], bands: int) -> float:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +17,10 @@ from scipy.sparse import csr_array
 
 from clsas.aperture.beam_directions import interpolated_directions
 from clsas.aperture.dense_channels import strip_channels
-from clsas.aperture.mean_track import MeanTrack
 from clsas.aperture.virtual_channels import VirtualChannels, interpolated_channels
 from clsas.core.decibels import power
 from clsas.core.lines import wavelength_m
-from clsas.planning import phase_rates
+from clsas.planning.aperture_lines import Line, SampledLine, sampled_line, visible_channels
 from clsas.planning.caching import cached
 from clsas.planning.channels import carriers
 from clsas.planning.sample_pixels import SAMPLED_PIXELS, SPREAD_POINTS, mean_over_relief, pixels_m
@@ -64,26 +62,9 @@ Stages = tuple[SpacedStage, ...]
 """A stage, the last, and those before it."""
 
 
-@dataclass(frozen=True)
-class _Line:
-    """A line of the aperture along which steering functions are interpolated.
-
-    Attributes
-    ----------
-    direction : str
-        "track" for the whole mean track, if it is a curve or strips; "along" or "across" for a line
-        of a sheet.
-    coordinate : float
-        Where a line of a sheet lies, in the sheet's other coordinate.
-    """
-
-    direction: Literal["track", "along", "across"]
-    coordinate: float = 0.0
-
-
-_TRACK = (_Line("track"),)
-_ALONG = (_Line("along", 0.5),)
-_ACROSS = (_Line("across", 0.2), _Line("across", 0.5))
+_TRACK = (Line("track"),)
+_ALONG = (Line("along", 0.5),)
+_ACROSS = (Line("across", 0.2), Line("across", 0.5))
 
 
 @cached
@@ -128,7 +109,7 @@ def bias_error(model: VisibilityModel, stages: Stages) -> float:
     return float(max(biases.sum() ** 2 - biases @ biases, 0.0))
 
 
-def _bias(model: VisibilityModel, lines: tuple[_Line, ...], stages: Stages) -> float:
+def _bias(model: VisibilityModel, lines: tuple[Line, ...], stages: Stages) -> float:
     """Return the mean relative error of amplitudes over some lines, in the last stage."""
     extents = tuple(model.surface.extents(stages[-1].side))
     errors = [_interpolation_error(model, each, stages, extents) for each in lines]
@@ -140,10 +121,10 @@ def _sum_over_dimensions(
 ) -> float:
     """Return a part of the error of interpolating along the track, or along and across a sheet."""
 
-    def error(line: _Line, extents: NDArray[np.float64]) -> float:
+    def error(line: Line, extents: NDArray[np.float64]) -> float:
         return part(_interpolation_error(model, line, stages, tuple(extents)).power)
 
-    def mean(lines: tuple[_Line, ...]) -> float:
+    def mean(lines: tuple[Line, ...]) -> float:
         side = stages[-1].side
         found = [mean_over_relief(model, side, functools.partial(error, each)) for each in lines]
         return sum(found) / len(found)
@@ -169,75 +150,16 @@ class _InterpolationError:
     bias: float
 
 
-@dataclass(frozen=True, eq=False)
-class _SampledLine:
-    """A line of the aperture with its phase rates, channels and beam directions.
-
-    Attributes
-    ----------
-    track : MeanTrack
-        The line as a curve of its own.
-    rates : float64 [axes, points, samples]
-        Phase rates: see `clsas.planning.phase_rates`.
-    channels : float64 [channels]
-        Aperture coordinates of channels, ascending. On a sheet they are evenly spaced.
-    along : float64 [samples, 3] or None
-        Unit directions of the beam at `track.samples`.
-    beam_rates : float64 [points, samples]
-        Phase rates of the beam's weights, 0 without a beam.
-    """
-
-    track: MeanTrack
-    rates: NDArray[np.float64]
-    channels: NDArray[np.float64]
-    along: NDArray[np.float64] | None
-    beam_rates: NDArray[np.float64]
-
-    def past_ends(self, coordinate: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which aperture coordinates lie past the ends of the curve, or of their strip."""
-        strip = self.track.strip_of(self.channels)
-        first, last = (
-            np.searchsorted(strip, np.arange(self.track.strips), side) for side in ("left", "right")
-        )
-        of_strip = self.track.strip_of(coordinate)
-        past: NDArray[np.bool_] = coordinate < self.channels[first][of_strip]
-        return past | (coordinate > self.channels[last - 1][of_strip])
-
-
-@cached
-def _sampled(model: VisibilityModel, line: _Line) -> _SampledLine:
-    """Return a line of the aperture with what is sampled along it."""
-    if line.direction == "track":
-        return _SampledLine(
-            model.track,
-            phase_rates.along(model),
-            np.sort(model.track.coordinate),
-            model.along,
-            phase_rates.of_beam_along(model),
-        )
-    if line.direction == "along":
-        track = model.track.line_along(line.coordinate)
-        coordinates = track.samples, np.full(track.samples.shape, line.coordinate)
-        rates, beam_rates = phase_rates.along(model), phase_rates.of_beam_along(model)
-    else:
-        track = model.track.line_across(line.coordinate)
-        coordinates = np.full(track.samples.shape, line.coordinate), track.samples
-        rates, beam_rates = phase_rates.across(model), phase_rates.of_beam_across(model)
-    along = None if model.directions is None else model.directions.at(*coordinates)
-    evenly = np.linspace(0, 1, 4 * _SAMPLED_CHANNELS)
-    return _SampledLine(track, rates, evenly, along, beam_rates)
-
-
 @cached
 def _interpolation_error(
-    model: VisibilityModel, line_at: _Line, stages: Stages, extents: tuple[float, ...]
+    model: VisibilityModel, line_at: Line, stages: Stages, extents: tuple[float, ...]
 ) -> _InterpolationError:
     """Return the error of steering functions in the last stage's subimages of some extents.
 
     It is 1, as large as the image, if no beam touches a subimage.
     """
     weighted = model.beam is not None and stages[-1].beam_cycles is not None
-    line = _sampled(model, line_at)
+    line = sampled_line(model, line_at)
     samples = _samples(model, line_at, stages[-1].side, weighted, extents)
     if samples is None:
         return _InterpolationError(power=1.0, bias=0.0)
@@ -265,7 +187,7 @@ def _interpolation_error(
 
 
 def _virtual_channels(
-    line: _SampledLine,
+    line: SampledLine,
     points: NDArray[np.int64],
     stage: SpacedStage,
     extents: Sequence[float],
@@ -296,7 +218,7 @@ class _Sources:
 
 
 def _with_ends(
-    model: VisibilityModel, line: _SampledLine, samples: _Samples, before: Stages
+    model: VisibilityModel, line: SampledLine, samples: _Samples, before: Stages
 ) -> _Sources:
     """Return sampled channels, with the earlier stages' virtual channels past the aperture's ends.
 
@@ -367,14 +289,14 @@ class _Samples:
 @cached
 def _samples(
     model: VisibilityModel,
-    line_at: _Line,
+    line_at: Line,
     side: Side,
     weighted: bool,
     extents: tuple[float, ...],
 ) -> _Samples | None:
     """Return the samples for subimages of a size, None if no beam touches any."""
-    line = _sampled(model, line_at)
-    channels, first, count = _visible_channels(model, line, side)
+    line = sampled_line(model, line_at)
+    channels, first, count = visible_channels(model, line, side)
     if not count.any():
         return None
     points = np.flatnonzero(count)
@@ -416,31 +338,9 @@ def _within_roots_m(model: VisibilityModel, extents: tuple[float, ...]) -> NDArr
     return (_CORNERS.reshape(-1, 2) * spare / 2) @ model.surface.steps_m[:2]
 
 
-def _visible_channels(
-    model: VisibilityModel, line: _SampledLine, side: Side
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return which channels' beams touch subimages of a size at the sample points.
-
-    These are the channels' aperture coordinates, ascending; then for each point the first channel,
-    and the number of channels, which is 0 where the track has a gap. The edges of visibility lie
-    between samples of the track, so the range is one sample wider on either side.
-    """
-    channels, samples = line.channels, model.track.samples
-    if model.track.is_sheet:
-        none = np.zeros(len(model.points_m), np.int64)
-        return channels, none, none + len(channels)
-    visible = model.visible(side)
-    begin = samples[np.maximum(visible.argmax(axis=1) - 1, 0)]
-    last = visible.shape[1] - visible[:, ::-1].argmax(axis=1)
-    end = samples[np.minimum(last, len(samples) - 1)]
-    end[~visible.any(axis=1)] = -np.inf
-    first = np.searchsorted(channels, begin)
-    return channels, first, np.maximum(np.searchsorted(channels, end, "right") - first, 0)
-
-
 def _steering(
     model: VisibilityModel,
-    line: _SampledLine,
+    line: SampledLine,
     pixels: _Pixels,
     weighted: bool,
     at: NDArray[np.float64],

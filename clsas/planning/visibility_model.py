@@ -47,7 +47,7 @@ _Value = TypeVar("_Value")
 
 @dataclass(frozen=True, eq=False)
 class LinesModel:
-    """What planning measures of the lines of an image, whether or not they form an aperture.
+    """Lines, grid and beam of an image, with the properties of the lines that planning needs.
 
     Attributes
     ----------

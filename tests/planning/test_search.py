@@ -14,9 +14,9 @@ from clsas.planning.sizes import all_sizes
 from clsas.planning.visibility_model import VisibilityModel
 
 
-def priced(view, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
-    """All sizes, and the options with the time of what they do."""
-    sizes = all_sizes(view, most, device)
+def priced(model, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
+    """All sizes, and the options with the times of their operations."""
+    sizes = all_sizes(model, most, device)
     return sizes, search.all_options(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed)
 
 
@@ -34,17 +34,17 @@ def everything_tried(*arguments):
 
 
 @pytest.fixture(scope="module", params=[None, BEAMS[0]], ids=["wide", "beam"])
-def view(request):
+def model(request):
     grid = around(0, 40, shape=(500, 700))
     return VisibilityModel.of(over(grid)[0], grid, request.param)
 
 
-def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
-    """What a tree costs, stage by stage."""
+def cost_of(tree, model, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
+    """The time of a tree, summed stage by stage."""
     taps = (tree.align_taps,), (tree.aperture_taps,)
     allowed = Allowed(*taps, stages=(len(tree.sides),))
     sizes, options = priced(
-        view, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed
+        model, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed
     )
     (choice,) = options.choices
     path = [sizes.pairs.index(side) for side in tree.sides]
@@ -54,7 +54,7 @@ def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, cost
     taps_past_ends = choice.aperture_taps * (search.OVERHANG if len(path) > 1 else 1)
 
     def channels(phase_cycles):
-        return AperturePhases(view).virtual_channels(
+        return AperturePhases(model).virtual_channels(
             taps_past_ends, 2 * choice.oversampling, phase_cycles
         )
 
@@ -70,21 +70,21 @@ def cost_of(tree, view, filters_db, most, leaf_pixels, beam_cycles, device, cost
 @pytest.mark.slow
 @pytest.mark.parametrize("filters_db", [-20.0, -55.0])
 @pytest.mark.parametrize("costs", [Costs(), Costs(leaf_ns=50.0), Costs(reference_ns=1e5)])
-def test_nothing_is_faster_than_what_is_found(view, filters_db, costs):
-    arguments = (view, filters_db, (512, 512), 1, 0.5, open_device(), costs, Allowed())
+def test_nothing_is_faster_than_what_is_found(model, filters_db, costs):
+    arguments = (model, filters_db, (512, 512), 1, 0.5, open_device(), costs, Allowed())
     tree = search.search(*arguments)
     assert cost_of(tree, *arguments) == pytest.approx(everything_tried(*arguments), rel=1e-9)
 
 
-def test_leaves_are_as_large_as_asked(view):
+def test_leaves_are_as_large_as_asked(model):
     for pixels in (1, 512, 4096):
         tree = search.search(
-            view, -40.0, (512, 512), pixels, 0.5, open_device(), Costs(), Allowed()
+            model, -40.0, (512, 512), pixels, 0.5, open_device(), Costs(), Allowed()
         )
         assert math.prod(tree.sides[-1]) >= pixels
 
 
-def test_without_any_size_that_fits_there_is_none(view):
+def test_without_any_size_that_fits_there_is_none(model):
     arguments = (0.5, open_device(), Costs(), Allowed())
-    assert search.search(view, -40.0, (8, 2), 1, *arguments) is None
-    assert search.search(view, -40.0, (512, 512), 10**9, *arguments) is None
+    assert search.search(model, -40.0, (8, 2), 1, *arguments) is None
+    assert search.search(model, -40.0, (512, 512), 10**9, *arguments) is None
