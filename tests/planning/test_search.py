@@ -1,5 +1,5 @@
 import math
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -88,3 +88,22 @@ def test_without_any_size_that_fits_there_is_none(model):
     arguments = (0.5, open_device(), Costs(), Allowed())
     assert search.search(model, -40.0, (8, 2), 1, *arguments) is None
     assert search.search(model, -40.0, (512, 512), 10**9, *arguments) is None
+
+
+@pytest.mark.parametrize("is_sheet", [False, True])
+def test_the_recurrence_finds_the_least_of_all_divisions(is_sheet):
+    """Of 4 sizes in 1 to 3 stages; each size divides into those before it."""
+    rng, sizes, stages = np.random.default_rng(0), 4, np.array([3, 2, 1])
+    step_s = rng.random((3, sizes, sizes)) + np.where(np.tri(sizes, dtype=bool), np.inf, 0.0)
+    forming_s = rng.random((3, sizes)) if is_sheet else np.zeros((3, 1))
+    leaves_s = rng.random((3, sizes)) + forming_s
+    found = search.Times(stages, step_s, forming_s, leaves_s).onward_s()[-1]
+    formed_s = np.broadcast_to(forming_s, leaves_s.shape)
+    for option, root in product(range(3), range(sizes)):
+        least = math.inf
+        for path in product(range(sizes), repeat=int(stages[option]) - 1):
+            path = (root, *path)
+            total = leaves_s[option, path[-1]] + formed_s[option, list(path[:-1])].sum()
+            total += sum(step_s[option, child, parent] for parent, child in pairwise(path))
+            least = min(least, total)
+        assert found[option, root] == pytest.approx(least)
