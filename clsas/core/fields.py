@@ -125,7 +125,7 @@ def explained(error: ValidationError, values: Any) -> str:
     path, here = [], values
     for part in mistake["loc"]:  # some parts are names of union members, not keys
         try:
-            here = getattr(here, part) if dataclasses.is_dataclass(here) else here[part]
+            here = getattr(here, str(part)) if dataclasses.is_dataclass(here) else here[part]
         except (AttributeError, KeyError, IndexError, TypeError):
             continue
         path.append(part)

@@ -27,7 +27,8 @@ from clsas.mosaics.survey import Survey, largest_gap_m, open_files
 from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import Device
 from clsas.planning.former import former
-from clsas.planning.planner import planned, tolerance_in_db
+from clsas.planning.planner import planned
+from clsas.planning.request import Request, tolerance_in_db
 from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches
@@ -202,7 +203,8 @@ def _formed(
         return execute(preparation, warned=True), how  # the record reports if the patch is zero
     before = time.perf_counter()
     available = min(job.memory_bytes - patch_bytes, device.info.memory_bytes // 2)
-    found = planned(lines, grid, **job.request, beam=beam, device=device, memory_bytes=available)
+    request = Request(lines, grid, **job.request, beam=beam, device=device, memory_bytes=available)
+    found = planned(request)
     chosen = found.plan
     how = {
         "plan_seconds": time.perf_counter() - before,

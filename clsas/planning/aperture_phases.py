@@ -1,4 +1,4 @@
-"""Phases that subimages accumulate over the aperture, and the virtual channels that these need."""
+"""Phases that subimages accumulate over the aperture, and the virtual channels they require."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clsas.planning.visibility_model import VisibilityModel
 class AperturePhases:
     """Phases along the aperture and across a sheet: means over the sample points, or maxima.
 
-    With a model within roots of a size they are the largest in these.
+    If the model has a root size, the phases are the largest within such roots.
     """
 
     model: VisibilityModel
@@ -28,17 +28,17 @@ class AperturePhases:
     ) -> float:
         """Return the cycles of the fastest phase in subimages of a size.
 
-        They are accumulated along the visible part of the aperture, bool [points, samples].
+        The phase is accumulated along the visible part of the aperture, bool [points, samples].
         """
         extents = self.model.extents(side, most=most)
         return self._along(np.tensordot(extents, phase_rates.along(self.model), 1), visible, most)
 
     def beam_phase_cycles(self, visible: NDArray[np.bool_], *, most: bool = False) -> float:
-        """Return the cycles that the beam's weights count for along the visible aperture."""
+        """Return the cycles that the beam's weights add along the visible aperture."""
         return self._along(phase_rates.of_beam_along(self.model), visible, most)
 
     def beam_phase_cycles_across(self, *, most: bool = False) -> float:
-        """Return the cycles that the beam's weights count for across a sheet; 0 without one."""
+        """Return the cycles that the beam's weights add across a sheet; 0 without a sheet."""
         if not self.model.track.is_sheet:
             return 0.0
         return self._across(phase_rates.of_beam_across(self.model), most)
@@ -52,10 +52,10 @@ class AperturePhases:
         *,
         most: bool = False,
     ) -> float:
-        """Return the number of rows of virtual channels across a sheet; 1 without one.
+        """Return the number of rows of virtual channels across a sheet; 1 without a sheet.
 
-        They are as many per cycle of the phase as `density`, and per cycle of the beam's weights as
-        `beam_density`.
+        `density` and `beam_density` are the rows per cycle of the phase, and per cycle of the
+        beam's weights. `taps` are those of the filter, which extends past the edges.
         """
         if not self.model.track.is_sheet:
             return 1.0
@@ -69,18 +69,18 @@ class AperturePhases:
     def virtual_channels(self, taps: Any, density: float, phase_cycles: Any) -> Any:
         """Return the number of virtual channels of a subimage, from its phase in cycles.
 
-        All may be arrays. `taps` and `density`, virtual channels per cycle, are the aperture
-        filter's. The filter extends beyond the track's ends.
+        `taps` and `density`, in virtual channels per cycle, are those of the filter along the
+        aperture, which extends past the track's ends. All arguments may be arrays.
         """
         strips, ends = self.model.track.strips, self.model.visible_track_ends
         return density * phase_cycles + strips + ends * (taps / 2 - 0.5)
 
     def _along(self, rates: NDArray[np.float64], visible: NDArray[np.bool_], most: bool) -> float:
-        """Return the cycles of rates along the track, [points, samples], where it is visible."""
+        """Return the integral of rates, [points, samples], over the visible part of the track."""
         return over_points(np.where(visible, rates, 0.0) @ self.model.spacing, most)
 
     def _across(self, rates: NDArray[np.float64], most: bool) -> float:
-        """Return the cycles of rates at the samples of a line across a sheet, [points, samples]."""
+        """Return the integral of rates, [points, samples], over a line across a sheet."""
         line = self.model.track.line_across(0.5)
         weights = np.where(line.on_track, trapezoidal_weights(line.samples), 0.0)
         return over_points(rates @ weights, most)

@@ -1,4 +1,4 @@
-"""How a beam sweeps over a grid: what of it an image needs, and whether a factorization follows."""
+"""How a beam sweeps over a grid: the part an image needs, and whether it can be factorized."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from clsas.sonar.visibility import sines
 
 _SAMPLED_POINTS = np.linspace(0, 1, 17)  # fractions of rows and columns; their sines are smooth
 _BINS = 512  # of power by aspect angle; half or twice as many change nothing
-# Largest change of direction from one channel to the next, over the beam's width. At a kink a beam
-# swings past pixels between two channels, which no virtual channel can follow.
+# Largest change of direction from one channel to the next, over the beam's width. At a kink of the
+# track, the beam swings past pixels between two channels, which virtual channels cannot follow.
 _MOST_TURNED = 1 / 16
 _CELLS = 8, 3  # along and across a sheet: smooth directions are cubic across it at most
-_LEAST_HELD = 0.9  # of these cells that hold channels, where directions differ
+_LEAST_FILLED = 0.9  # share of these cells that contain channels, where directions differ
 _EVERY_DIRECTION = (-2.0, 2.0)  # sines of the aspect angle, beyond any
-# Of the best pixel's sum of weights: normalising amplifies errors by its inverse.
+# Share of the best pixel's sum of weights: normalising amplifies errors by its inverse.
 _LEAST_COVERED = 0.25
-_LEAST_SHARE_COVERED = 0.1  # of an image: less gives little gain, and few samples of errors
-_LEAST_PARTIAL = 0.25  # of an image: a step of the beam that few pixels see costs these more
+_LEAST_SHARE_COVERED = 0.1  # of an image; below, little time is saved and errors scatter
+_LEAST_PARTIAL = 0.25  # of an image; below, a step of the beam makes larger errors than predicted
 
 
 def trimmed(model: VisibilityModel, share: float) -> VisibilityModel:
-    """Return a model without the channels that subimages hardly receive from.
+    """Return a model without the outermost edges of the beam, where its weights are small.
 
-    Where the beam sweeps over the grid these are its outermost edges: an image of noise loses
-    `share` of its power. Elsewhere every channel is used for every subimage, and weights count in
-    the leaves only.
+    The edges are left out where the beam sweeps evenly over the grid: an image of noise then loses
+    `share` of its power. Elsewhere every channel is used for every subimage, and weights are
+    applied in the leaves only.
     """
     if model.beam is None or model.limits is None:
         return model
@@ -39,9 +39,9 @@ def trimmed(model: VisibilityModel, share: float) -> VisibilityModel:
         return model.with_limits(*_EVERY_DIRECTION)
     low, high = np.clip(model.limits, -1, 1)
     on_track, bounds = model.on_track, []
-    of_track = sines(_points_m(model), model.track_m[on_track], model.along[on_track])
-    # The channels alone do not suffice: the track may have gaps, into which filters extend. Neither
-    # does one point: a pixel sees but a small part of the beam from a short aperture.
+    of_track = sines(_points_m(model), model.track_m[on_track], _along(model)[on_track])
+    # The channels alone do not suffice, because filters extend into gaps of the track. Neither does
+    # one point: from a short aperture, a pixel receives only from a small part of the beam.
     for sine in (_sines_of_channels(model), of_track):
         sine = sine[(sine > low) & (sine < high)]
         power = model.beam.weights(sine, wavelength_m(model.lines)) ** 2
@@ -61,28 +61,29 @@ def obstacle(model: VisibilityModel) -> str:
     if beam is None:
         return ""
     if model.track.is_sheet and _directions_unknown(model):
-        return "the heading turns, and large parts of the smooth aperture hold no channel"
+        return "the heading turns, and large parts of the smooth aperture have no channel"
     if not model.track.is_sheet and _turns_between_channels(model):
         return "the heading changes from channel to channel by more than 1/16 of the beam's width"
-    # Normalising divides by a small sum at the beam's edge, and amplifies errors there.
+    # Normalising divides by a small sum at the beam's edge, which amplifies errors there.
     if beam.normalise and coverage(model, 1).min() < _LEAST_COVERED:
-        return "the beam normalises, and some pixels are hardly covered"
-    # If few pixels see a step of the beam, their error exceeds the prediction for all.
+        return "the beam normalises, and weights of some pixels sum to less than 1/4 of the most"
+    # If a step of the beam crosses few pixels, their error exceeds the mean that is predicted.
     if beam.jumps and 0 < partly_visible_share(model) < _LEAST_PARTIAL:
-        return "only few pixels see the step at the beam's edge"
-    # If hardly any pixel is visible there is little to gain, and errors are not predictable.
+        return "the step at the beam's edge crosses only few pixels"
+    # If few pixels are visible, little time can be saved, and their errors cannot be predicted.
     if float(coverage(model, 2).mean()) < _LEAST_SHARE_COVERED:
-        return "the beam covers hardly any of the image"
+        return "the beam covers less than a tenth of the image"
     return ""
 
 
 def _directions_unknown(model: VisibilityModel) -> bool:
-    """Return whether directions differ over a sheet, but parts of it hold no channel.
+    """Return whether directions differ over a sheet of which parts have no channel.
 
-    The smooth directions are then those of no channel, and may be anything.
+    Smooth directions are then extrapolated, and may be arbitrary.
     """
-    assert model.directions is not None
     track, (columns, rows) = model.track, _CELLS
+    assert model.directions is not None
+    assert track.across is not None
     at = model.directions.at(track.coordinate, track.across)
     if np.linalg.norm(at - at.mean(axis=0), axis=1).max() <= _MOST_TURNED * _width(model):
         return False
@@ -90,8 +91,8 @@ def _directions_unknown(model: VisibilityModel) -> bool:
         np.clip((each * count).astype(np.int64), 0, count - 1)
         for each, count in ((track.coordinate, columns), (track.across, rows))
     ]
-    held = len(np.unique(cell[0] * rows + cell[1]))
-    return held < _LEAST_HELD * columns * rows
+    filled = len(np.unique(cell[0] * rows + cell[1]))
+    return filled < _LEAST_FILLED * columns * rows
 
 
 def _width(model: VisibilityModel) -> float:
@@ -101,11 +102,12 @@ def _width(model: VisibilityModel) -> float:
 
 
 def _turns_between_channels(model: VisibilityModel) -> bool:
-    """Return whether neighbours on the track look in different directions.
+    """Return whether neighbours on the track have different directions.
 
-    At a kink the beam may swing past a point within a few channels, and a track may lead back
-    beside itself.
+    They do at a kink of the track, where the beam may swing past a point within a few channels, and
+    where a track leads back beside itself.
     """
+    assert model.channels_along is not None
     order = np.argsort(model.track.coordinate, kind="stable")
     strip = model.track.strip_of(model.track.coordinate[order])
     turned = np.linalg.norm(np.diff(model.channels_along[order], axis=0), axis=1)
@@ -116,9 +118,9 @@ def _turns_between_channels(model: VisibilityModel) -> bool:
 def sweeps_once(model: VisibilityModel) -> bool:
     """Return whether the beam sweeps once, at an even rate, over every sample point.
 
-    A subimage then needs the channels of one stretch of each strip. Seen from a point, the sine of
-    the aspect angle changes along a straight track by (1 - sine^2)/distance. Rates between half and
-    one and a half times the mean count as even.
+    A subimage then needs a single interval of channels of each strip. Along a straight track, the
+    sine of a point's aspect angle changes by (1 - sine^2)/distance per metre. Rates relative to
+    that count as even if they vary by no more than their mean.
     """
     if model.beam is None:
         return True
@@ -132,7 +134,7 @@ def _sweeps_once(model: VisibilityModel, of_strip: NDArray[np.bool_]) -> bool:
     on_track = model.on_track & of_strip
     position = model.track_m[on_track]
     along_m = np.concatenate([[0], np.linalg.norm(np.diff(position, axis=0), axis=1).cumsum()])
-    sine = np.einsum("psi,si->ps", model.sight[:, on_track], model.along[on_track])
+    sine = np.einsum("psi,si->ps", model.sight[:, on_track], _along(model)[on_track])
     along_m += 1e-9 * np.arange(len(along_m))  # a track may stand still
     rate = -np.gradient(sine, along_m, axis=1)
     rate *= model.distance_m[:, on_track] / np.maximum(1 - sine**2, 1e-3)
@@ -146,9 +148,9 @@ def _sweeps_once(model: VisibilityModel, of_strip: NDArray[np.bool_]) -> bool:
 
 
 def coverage(model: VisibilityModel, power: int) -> NDArray[np.float64]:
-    """Return sums over channels of a power of the beam's weights, over the largest, [points].
+    """Return sums over channels of a power of the beam's weights, over the largest sum, [points].
 
-    At points all over the grid; 0 if the beam touches none of them.
+    They are those of points all over the grid, and 0 if the beam touches none of them.
     """
     assert model.beam is not None
     weights = model.beam.weights(_sines_of_channels(model), wavelength_m(model.lines))
@@ -157,7 +159,7 @@ def coverage(model: VisibilityModel, power: int) -> NDArray[np.float64]:
 
 
 def partly_visible_share(model: VisibilityModel) -> float:
-    """Fraction of the image's points that some channels receive from, and others do not."""
+    """Return the fraction of points in the beam of some channels, but not of others."""
     assert model.beam is not None
     low, high = model.beam.limits
     sine = _sines_of_channels(model)
@@ -165,15 +167,21 @@ def partly_visible_share(model: VisibilityModel) -> float:
     return float(((visible > 0) & (visible < 1)).mean())
 
 
+def _along(model: VisibilityModel) -> NDArray[np.float64]:
+    """Return the beam's unit directions at the track's samples, [samples, 3]; only with a beam."""
+    assert model.along is not None
+    return model.along
+
+
+@shared
 def _points_m(model: VisibilityModel) -> NDArray[np.float64]:
-    found: NDArray[np.float64] = model.from_cache(
-        "points of beam coverage", lambda: points_at_m(model.surface, _SAMPLED_POINTS)
-    )
-    return found
+    """Return points all over the grid, [points, 3]."""
+    return points_at_m(model.surface, _SAMPLED_POINTS)
 
 
 @shared
 def _sines_of_channels(model: VisibilityModel) -> NDArray[np.float64]:
-    """Sines of the aspect angle at points all over the grid, [channels, points]."""
+    """Return sines of the aspect angle at points all over the grid, [channels, points]."""
+    assert model.channels_along is not None
     some = some_channels(model.lines.channels)
     return sines(_points_m(model), model.lines.phase_centres_m[some], model.channels_along[some])

@@ -1,4 +1,4 @@
-"""Measurement of the costs of imaging on a device, from the times of some images."""
+"""Measurement of the costs of imaging on a device, from the times of a few images."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ _SIZES = ((500, 768), (1500, 512))
 _SMALL_SIZES = ((100, 128), (400, 256))
 """The same of images that are formed exactly only."""
 _TOLERANCES_DB = (-25.0, -45.0, -60.0)
-# With these costs the planner chooses shallow trees, and deep ones: their times differ enough to
-# tell the costs apart.
+# With these costs the planner chooses shallow trees and deep ones, whose times differ enough to
+# determine all costs.
 _PLANNED_WITH = (Costs(pixel_ns=1e3, point_ns=1e3), Costs(pixel_ns=1e3, leaf_ns=10.0))
 _WIDE = BeamWindow(120.0, "hann")  # touches every pixel from every channel
 
@@ -64,7 +64,7 @@ def calibrate(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> Costs:
-    """Measure the costs of imaging on a device, and store them for `clsas.plan`.
+    """Return the measured costs of imaging on a device, and store them for `clsas.plan`.
 
     Parameters
     ----------
@@ -76,14 +76,15 @@ def calibrate(
     Returns
     -------
     Costs
-        Non-negative least-squares fit to the times of images of a built-in scene, in relative
-        terms. Images take turns, and the fastest run of each counts. Costs that these times cannot
-        tell apart keep the proportions of `clsas.planning.costs.defaults`.
+        Costs per unit of each kind of work: a non-negative least-squares fit to relative times of
+        images of a built-in scene. The images are formed in turns, and the fastest run of each
+        counts. Costs that these times do not determine keep the proportions of
+        `clsas.planning.costs.defaults`.
 
     Raises
     ------
     DeviceError
-        If there is no such device.
+        If the device does not exist.
     OSError
         If the user's cache directory cannot be written.
 
@@ -91,7 +92,7 @@ def calibrate(
     -----
     ClsasWarning
         If times scatter from run to run, or differ from those that the costs predict. The costs are
-        then returned but not stored, and those stored before stay.
+        then returned but not stored, and previously stored costs remain.
     """
     validate.progress(progress)
     device = open_device(device)
@@ -117,8 +118,8 @@ def calibrate(
         wrong.append(f"the costs miss the times measured by {math.expm1(misfit):.0%}")
     if wrong:
         validate.warn(
-            f"what was measured is not stored: {' and '.join(wrong)}; calibrate again when the "
-            f"machine has nothing else to do"
+            f"measured costs are not stored: {' and '.join(wrong)}; calibrate again when the "
+            "machine is idle"
         )
     else:
         stored.save(device, costs)
@@ -126,7 +127,7 @@ def calibrate(
 
 
 def _images(device: Device) -> list[TimedImage]:
-    """Return the images that are timed."""
+    """Return the images to be timed."""
     images = []
 
     def factorized(lines: RangeLines, grid: Grid, tolerance_db: float, planned_with: Costs) -> None:
@@ -148,7 +149,7 @@ def _images(device: Device) -> list[TimedImage]:
 
 
 def _fitted(images: list[TimedImage], usual: Costs) -> Costs:
-    """Fit costs to the best times of some images, close to `usual` proportions."""
+    """Return costs fitted to the best times of images, with a prior of `usual` proportions."""
     plans = [image for image in images if isinstance(image.expected, Plan)]
     exact = [image for image in images if isinstance(image.expected, Exact)]
     tiled = [image for image in plans if image.tiled]
@@ -162,7 +163,7 @@ def _fitted(images: list[TimedImage], usual: Costs) -> Costs:
         [image.work(("leaf_channel_ns", "leaf_ns")) for image in tiled],
         [image.in_pixels for image in tiled],
     )
-    # Lines of points take as long as those of tiles.
+    # Lines of leaves off a plane take as long as those on a plane.
     of_points = [image for image in plans if not image.tiled]
     channel_s = 1e-9 * leaves["leaf_channel_ns"]
     points = least_squares(
@@ -192,18 +193,17 @@ def _fitted(images: list[TimedImage], usual: Costs) -> Costs:
 
 
 def _pixel_work(image: TimedImage) -> float:
-    """Return pixels times channels of an exact image, in units of the time with 4 taps."""
+    """Return pixels times channels of an exact image, weighted by the time relative to 4 taps."""
     return sum(image.work(_PIXELS))
 
 
 def _least_squares(
     usual: Costs, names: tuple[str, ...], work: list[list[float]], seconds: list[float]
 ) -> dict[str, float]:
-    """Return the costs in nanoseconds for which work times costs is nearest to `seconds`."""
+    """Return the costs in nanoseconds whose predictions are closest to `seconds`."""
     usual_ns = np.array([getattr(usual, name) for name in names])
     rows = 1e-9 * np.array(work) * usual_ns / np.maximum(seconds, 1e-6)[:, None]
-    # The device's speed relative to the usual costs. Single costs deviate from it only if the times
-    # say so.
+    # The device's speed relative to the usual costs is the prior of every single cost.
     faster = 1 / np.exp(np.mean(np.log(rows.sum(axis=1))))
     rows = np.concatenate([rows * faster, _PRIOR * np.eye(len(names))])
     wanted = np.concatenate([np.ones(len(seconds)), np.full(len(names), _PRIOR)])

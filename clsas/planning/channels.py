@@ -20,9 +20,9 @@ from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
 
 _NEIGHBOURS = 64  # channels over which density is measured; half or twice: no change
-_SHEET_REFERENCES = 2.0  # that each channel of a sheet counts as, measured with 54 000 channels
-_WORST_CHANNELS = 32  # of those sampled: loud, or far from the mean track
-_LEAST_FREQUENCY = 1e-3  # of the highest: virtual channels sample a phase that hardly turns
+_SHEET_REFERENCES = 2.0  # references per channel of a sheet, measured with 54 000 channels
+_WORST_CHANNELS = 32  # of the sampled channels: the loudest, or farthest from the mean track
+_LEAST_FREQUENCY = 1e-3  # of the highest; below, phases are constant to virtual channels
 
 
 def frequencies(model: VisibilityModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -38,7 +38,7 @@ def frequencies(model: VisibilityModel) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def carriers(model: VisibilityModel, count: int) -> NDArray[np.float64]:
-    """Return some of these frequencies, each of which stands for the same power."""
+    """Return `count` of these frequencies, each of which represents the same power."""
     cycles_per_m, share = frequencies(model)
     index = np.interp((np.arange(count) + 0.5) / count, np.cumsum(share), np.arange(len(share)))
     return np.interp(index, np.arange(len(share)), cycles_per_m)
@@ -46,9 +46,9 @@ def carriers(model: VisibilityModel, count: int) -> NDArray[np.float64]:
 
 @shared
 def track_error_m(model: VisibilityModel) -> NDArray[np.float64]:
-    """Distances of the channels from the mean track, [channels].
+    """Return the distances of the channels from the mean track, [channels].
 
-    The motion of receivers that differs from the mean is added, as it acts at the median range.
+    Receiver motion that differs from the mean is added, with its effect at the median range.
     """
     error_m = np.linalg.norm(model.track.offsets_m(model.lines.phase_centres_m), axis=1)
     drift = own_drift(model)
@@ -59,38 +59,38 @@ def track_error_m(model: VisibilityModel) -> NDArray[np.float64]:
 
 @shared
 def own_drift(model: VisibilityModel) -> NDArray[np.float64] | None:
-    """See `clsas.aperture.phase_rates.own_drift`."""
+    """Return `clsas.aperture.phase_rates.own_drift` of the lines."""
     return phase_rates.own_drift(model.lines)
 
 
 @shared
 def peak_density(model: VisibilityModel) -> float:
-    """Peak channel density along the aperture, relative to the mean.
+    """Return the peak channel density along the aperture, relative to the mean.
 
-    Many channels of a sheet may lie at the same place along it, one in each of its rows.
+    Many channels of a sheet may have the same coordinate along it, one in each of its rows.
     """
-    place = np.sort(model.track.coordinate)
-    rows = math.ceil(2 * math.sqrt(len(place))) if model.track.is_sheet else 1
-    some = min(max(_NEIGHBOURS, rows), len(place) - 1)
-    closest = float((place[some:] - place[:-some]).min())
-    length = model.track.strips if model.track.strips > 1 else float(place[-1] - place[0])
-    average = length * some / (len(place) - 1)
+    at = np.sort(model.track.coordinate)
+    rows = math.ceil(2 * math.sqrt(len(at))) if model.track.is_sheet else 1
+    some = min(max(_NEIGHBOURS, rows), len(at) - 1)
+    closest = float((at[some:] - at[:-some]).min())
+    length = model.track.strips if model.track.strips > 1 else float(at[-1] - at[0])
+    average = length * some / (len(at) - 1)
     return average / closest if closest > 0 else np.inf
 
 
 @dataclass(frozen=True, eq=False)
 class SampledChannels:
-    """Sampled channels whose beam touches subimages of a size at some sample points.
+    """Sampled channels whose beam touches subimages of a size at some of the sample points.
 
     Attributes
     ----------
     model : VisibilityModel
     points : int64 [points]
-        The sample points that any channel touches.
+        Sample points whose subimage the beam of any channel touches.
     index : int64 [n]
-        The channels.
+        Indices of the channels.
     weight : float64 [points, n]
-        Power of all the channels that each stands for; 0 where its beam misses the subimage.
+        Power of all channels that each one represents; 0 where its beam misses the subimage.
     part : MeanTrack
         The mean track with these channels.
     """
@@ -112,7 +112,7 @@ class SampledChannels:
         return antennas_of(self.model.lines, self.index)
 
     def virtual_m(self, centres_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where the channels appear on the track, from some points: [points, n, 3]."""
+        """Return the positions on the track at which points see the channels, [points, n, 3]."""
         drifts = own_drift(self.model)
         own = drifts if drifts is None else drifts[self.index]
         coordinates = self.part.apparent_coordinates(centres_m, self.phase_centres_m, own)
@@ -121,24 +121,24 @@ class SampledChannels:
 
 @cached
 def sampled_channels(model: VisibilityModel, side: Side) -> SampledChannels:
-    """Sample channels that touch subimages of a size at the `SPREAD_POINTS`."""
+    """Return sampled channels whose beam touches subimages of a size at the `SPREAD_POINTS`."""
     track, points = model.track, np.array(SPREAD_POINTS)
     visible = model.visible(side)[points]
     candidates = np.flatnonzero(np.interp(track.coordinate, track.samples, visible.any(axis=0)))
     index, weight = _some_of(model, candidates)
     part = track.some(index)
-    seen = np.stack([np.interp(part.coordinate, track.samples, each) for each in visible]) > 0
-    touched = seen.any(axis=1)
-    return SampledChannels(model, points[touched], index, weight * seen[touched], part)
+    sees = np.stack([np.interp(part.coordinate, track.samples, each) for each in visible]) > 0
+    touched = sees.any(axis=1)
+    return SampledChannels(model, points[touched], index, weight * sees[touched], part)
 
 
 def _some_of(
     model: VisibilityModel, candidates: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Sample channels, with the power that each stands for.
+    """Return sampled channels, with the power that each represents.
 
-    Those whose distance from the mean track and power are large are among them: a loud channel, or
-    a few where a track turns sharply, may err more than all others together.
+    The loudest and those farthest from the mean track are always among them: a single loud channel,
+    or a few where the track turns sharply, may cause a larger error than all others together.
     """
     power = model.channel_power
     if len(candidates) <= SAMPLED_CHANNELS:
@@ -153,10 +153,10 @@ def _some_of(
 
 
 def range_window_m(model: VisibilityModel, root: Side) -> tuple[float, float]:
-    """Return the least and the largest range of any part of roots, from lines' first samples.
+    """Return the smallest and largest range of any pixel of roots, from the lines' first samples.
 
-    Ranges to a pixel and to the middle of the grid differ by their distance at most, or by a little
-    more for receivers that move: see `clsas.core.lines.steepest`.
+    Ranges to a pixel and to the middle of the grid differ at most by their distance, or by slightly
+    more for moving receivers: see `clsas.core.lines.steepest`.
     """
     plane, lines = model.surface.plane, model.lines
     whole = -(-plane.shape[0] // root[0]) * root[0], -(-plane.shape[1] // root[1]) * root[1]
@@ -179,5 +179,8 @@ def range_window_m(model: VisibilityModel, root: Side) -> tuple[float, float]:
 
 
 def references(model: VisibilityModel) -> float:
-    """Return the references of a root, a channel each; on a sheet channels are sorted by rows."""
+    """Return the number of references of a root: one per channel, or more on a sheet.
+
+    The host sorts the channels of a sheet by rows.
+    """
     return model.lines.channels * (_SHEET_REFERENCES if model.track.is_sheet else 1.0)

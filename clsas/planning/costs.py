@@ -1,4 +1,4 @@
-"""Costs of each kind of work on a device: measured once, stored in the user's cache folder."""
+"""Costs of each kind of work on a device, measured once and stored in the user's cache folder."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _MOST_NS = 1e15  # arbitrary: eleven days for one unit; times of any image stay 
 
 @dataclass(frozen=True)
 class Costs:
-    """Time of each kind of work, nanoseconds per unit of the field of that name in `Work`.
+    """Time of each kind of work, in nanoseconds per unit of the field of `Work` with that name.
 
-    The defaults are fitted to kernels' and hosts' times of `scripts/bench predictions` with PoCL on
-    2 AVX-512 cores; `defaults` returns those for a device.
+    The defaults are fitted to times of kernels and host that `scripts/bench predictions` measured
+    with PoCL on 2 AVX-512 cores. `defaults` returns those for a device.
     """
 
     call_ns: float = 1.35e7
@@ -56,11 +56,11 @@ class Costs:
             validate.number(field.name, getattr(self, field.name), "ns", least=0.0, most=_MOST_NS)
 
     def times(self, factors: Mapping[str, float]) -> Costs:
-        """Return these costs with some of them multiplied by factors, by name."""
+        """Return these costs, with those named multiplied by their factors."""
         return replace(self, **{name: each * getattr(self, name) for name, each in factors.items()})
 
     def seconds(self, work: Work) -> Any:
-        """Return the time of some work, the sum of amounts times costs: an array if these are."""
+        """Return the time of work: sum of amounts times costs, an array if amounts are arrays."""
         total_ns: Any = 0.0
         for name, amount in vars(work).items():
             if isinstance(amount, np.ndarray) or amount:
@@ -90,8 +90,8 @@ _AVX2 = Costs(
     point_ns=1.7,
     beam_ns=0.4,
 )
-"""Fitted to processor times of kernels and host, over 2 cores of Zen 4 with PoCL 3.0, of images
-of the benchmarks at several tolerances. Other work on the machine hardly matters."""
+"""Fitted to processor times of kernels and host for images of the benchmarks at several tolerances,
+on 2 cores of Zen 4 with PoCL 3.0. Processor times depend little on other work on the machine."""
 
 
 @dataclass(frozen=True)
@@ -120,16 +120,16 @@ class KnownCosts:
 
 
 def defaults(device: Device | DeviceInfo) -> Costs:
-    """Return the costs of a device without a measurement of its own.
+    """Return the costs that are assumed for a device that was not measured.
 
-    For 8 lanes these are the costs of 2 AVX2 cores with PoCL.
+    For a device of 8 lanes, they are those of 2 AVX2 cores with PoCL.
     """
     info = device.info if isinstance(device, Device) else device
     return _AVX2 if info.width == 8 else Costs()
 
 
 def path() -> Path:
-    """Return the file that holds the measured costs."""
+    """Return the path of the file of measured costs."""
     return cache_folder() / "costs.json"
 
 
@@ -139,8 +139,8 @@ def load(device: Device | DeviceInfo) -> KnownCosts:
     Warns
     -----
     ClsasWarning
-        If the file of costs cannot be read or holds something else, or others can write to the
-        cache folder.
+        If the file of costs cannot be read or does not contain costs, or other users can write to
+        the cache folder.
     """
     info = device.info if isinstance(device, Device) else device
     default = KnownCosts(defaults(info), "default")
@@ -153,14 +153,14 @@ def load(device: Device | DeviceInfo) -> KnownCosts:
 
 
 def save(device: Device, costs: Costs, source: CostSource = "calibrated") -> Path:
-    """Store the measured costs of a device; return the file.
+    """Store the measured costs of a device, and return the path of the file.
 
-    The file is replaced as a whole, so that another process reads the old one or the new one.
+    The file is replaced as a whole, so that another process reads either the old or the new one.
 
     Raises
     ------
     OSError
-        If the user's cache folder cannot be written, or others can write to it.
+        If the user's cache folder cannot be written, or other users can write to it.
     """
     file = private_folder() / path().name
     try:
@@ -175,7 +175,7 @@ def save(device: Device, costs: Costs, source: CostSource = "calibrated") -> Pat
 
 
 def key(info: DeviceInfo) -> str:
-    """Return what costs depend on: device, driver, cores, how kernels are built, and version."""
+    """Return the key of stored costs: device, driver, cores, how kernels are built, and version."""
     lookup = ", permuting" if info.permute else ""
     return (
         f"{info.label}, {info.driver}, {info.compute_units} compute units, {info.width} lanes"
@@ -184,7 +184,7 @@ def key(info: DeviceInfo) -> str:
 
 
 def _tables() -> dict[str, Any]:
-    """Return the stored tables by key; raises OSError or ValueError if the file has none."""
+    """Return the stored tables by key; raise OSError or ValueError if the file has none."""
     try:
         stored = reading.parse_json(reading.read_bytes(trusted_cache() / path().name))
     except (FileNotFoundError, NotADirectoryError):
@@ -195,7 +195,7 @@ def _tables() -> dict[str, Any]:
 
 
 def _known(table: dict[str, Any]) -> KnownCosts:
-    """Return costs from their stored table; raises an error if it is not one of `save`."""
+    """Return costs from their stored table; raise an error if `save` did not write it."""
     names = [field.name for field in fields(Costs)]
     costs = {name: validate.number(name, table["costs"][name], "ns") for name in names}
     if table["source"] not in ("scaled", "calibrated") or not table["measured"]:

@@ -1,4 +1,4 @@
-"""Errors of a factorized image besides those of its filters: roots, spacing and leaves."""
+"""Errors of a factorized image other than those of its range filters."""
 
 from __future__ import annotations
 
@@ -32,23 +32,24 @@ from clsas.planning.stretches import stretch_of
 from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator
+from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
-# Rms error of a phase in the stages over the phase across a root, from float32: measured. With half
-# of it images at -60 dB are up to 3 % faster; with twice of it measured errors fall by 0.1 dB.
+# Rms error of a phase in the stages, from float32, over the phase across a root: measured. With
+# half of it, images at -60 dB are up to 3 % faster; with twice, measured errors fall by 0.1 dB.
 _FLOAT32 = 4.5e-8
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Error powers of a tree besides those of its range filters.
+    """Error powers of a tree other than those of its range filters.
 
     Attributes
     ----------
     aperture : float
-        The aperture's filter, in all stages.
+        The filter along the aperture, in all stages.
     roots : float
-        Rounding, and channels that are replaced by places on the mean track.
+        Rounding, and channels that are replaced by positions on the mean track.
     spacing : tuple of float
         Uneven spacing of virtual channels, and beam weights that change between them, by stage.
     leaves : float
@@ -70,7 +71,7 @@ def other_errors(
     beam_cycles: float,
     device: Device,
 ) -> Errors:
-    """Return the errors of a tree; `model` is that within its roots, whose error is known."""
+    """Return the errors of a tree. `model` must have its root size; `roots` is its root error."""
     stages = spaced_stages(sides, aperture, oversampling, beam_cycles)
     each_stage = [stages[: level + 1] for level in range(len(stages))]
     filters = sum(filter_error(model, to) for to in each_stage)
@@ -88,7 +89,7 @@ def spaced_stages(
     oversampling: tuple[float, ...],
     beam_cycles: float | None,
 ) -> Stages:
-    """Return the stages of a tree; only the last one's virtual channels follow the beam."""
+    """Return the stages of a tree. Only the virtual channels of the last stage follow the beam."""
     last = len(sides) - 1
     return tuple(
         SpacedStage(side, aperture, denser, beam_cycles if level == last else 0.0)
@@ -99,10 +100,10 @@ def spaced_stages(
 def leaf_error(
     model: VisibilityModel, sides: NDArray[np.int64], device: Device
 ) -> NDArray[np.float64]:
-    """Return the error power that expanding a leaf adds, per size.
+    """Return the error power of expanding ranges and weights in leaves, [sizes].
 
     As in `clsas.exact.tiles.lay_out`, the remainder is of fourth order; in long leaves its rms is
-    0.35 of its maximum. Off a plane nothing is expanded, and float32 rounds.
+    0.35 of its maximum. Off a plane nothing is expanded, and the error is float32's rounding.
     """
     if not model.surface.is_plane:
         radius_m = np.array([model.surface.radius_m(tuple(side)) for side in sides.tolist()])
@@ -143,26 +144,54 @@ def _mean_track_error(model: VisibilityModel, side: Side, extents: NDArray[np.fl
     offsets_m = np.stack([pixels_m(model, extents, point)[0] for point in channels.points])
     points_m = model.points_m[channels.points, None] + offsets_m
     virtual_m = channels.virtual_m(points_m[:, 0])
-    wrong = _phase_error(model, channels, points_m, virtual_m)
-    weights = np.ones_like(wrong)
-    if model.beam is not None and model.directions is not None:
-        weights, of_virtual = _weights(model, channels, points_m, virtual_m)
-        wrong = weights**2 * wrong + (weights - of_virtual) ** 2
-    counts = channels.weight[:, None]
-    return float(np.sum(counts * wrong) / max(np.sum(counts * weights**2), 1e-30))
+    error = phase_error(model, channels, points_m, virtual_m)
+    if model.beam is None:
+        return relative_error(channels.weight, error, np.ones_like(error))
+    weights, of_virtual = beam_weights(model, model.beam, channels, points_m, virtual_m)
+    return relative_error(
+        channels.weight, weights**2 * error + (weights - of_virtual) ** 2, weights
+    )
 
 
-def _phase_error(
+def relative_error(
+    channel_power: NDArray[np.float64], error: NDArray[np.float64], weights: NDArray[np.float64]
+) -> float:
+    """Return the power of errors over that of the contributions to an image.
+
+    Parameters
+    ----------
+    channel_power : float64 [points, channels]
+    error : float64 [points, pixels, channels]
+        Error power of each contribution, for channels of unit power.
+    weights : float64 [points, pixels, channels]
+        Weights of the contributions; 1 without a beam.
+    """
+    channel_power = channel_power[:, None]
+    image_power = max(np.sum(channel_power * weights**2), 1e-30)
+    return float(np.sum(channel_power * error) / image_power)
+
+
+def phase_error(
     model: VisibilityModel,
     channels: SampledChannels,
     points_m: NDArray[np.float64],
     virtual_m: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the error power of pixels' phases and envelopes, [points, pixels - 1, channels].
+    """Return the error power of phases and envelopes, float64 [points, pixels - 1, channels].
 
-    The range from a channel changes between the centre of a root, the first pixel, and another
-    pixel. The error is what that change differs by from the one for the virtual position, stretched
-    as the first stage does.
+    Channels are replaced by positions on the mean track that have the same range to the centre of a
+    root. Their phase is wrong by the difference between the changes of both ranges from the centre
+    to a pixel. The first stage makes up for a part of it by stretching the range from the virtual
+    position.
+
+    Parameters
+    ----------
+    model : VisibilityModel
+    channels : SampledChannels
+    points_m : float64 [points, pixels, 3]
+        The centre of a root at each sample point, and then pixels of the root.
+    virtual_m : float64 [points, channels, 3]
+        Positions on the mean track that replace the channels.
     """
     along, stretch = drift(model.lines), stretch_of(model)
     range_m = pairwise_range_m(points_m.reshape(-1, 3), *channels.antennas)
@@ -176,26 +205,30 @@ def _phase_error(
     residual_m = change_m - virtual_change_m * (1 + of_channels)
     # A line's phase follows its channel's stretch, its envelope the mean of all.
     envelope_m = virtual_change_m * (of_channels - stretch.mean)
-    wrong = (2 * np.pi * model.highest_cycles_per_m * residual_m) ** 2
-    wrong += (2 * np.pi * model.rms_cycles_per_m * envelope_m) ** 2
-    return wrong
+    error = (2 * np.pi * model.highest_cycles_per_m * residual_m) ** 2
+    error += (2 * np.pi * model.rms_cycles_per_m * envelope_m) ** 2
+    return error
 
 
-def _weights(
+def beam_weights(
     model: VisibilityModel,
+    beam: BeamWindow,
     channels: SampledChannels,
     points_m: NDArray[np.float64],
     virtual_m: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the beam's weights of channels and of their virtual positions, as `_phase_error`."""
-    assert model.beam is not None
+    """Return a beam's weights of channels and of the positions that replace them.
+
+    Arguments and shapes are those of `phase_error`.
+    """
     assert model.directions is not None
+    assert model.channels_along is not None
     part, along = channels.part, model.channels_along[channels.index]
     directions = model.directions.at(part.coordinate, part.across)
     virtual = [sines(*each, directions) for each in zip(points_m, virtual_m, strict=True)]
     real = [sines(each, channels.phase_centres_m, along) for each in points_m]
     weights, of_virtual = (
-        model.beam.weights(np.stack(each).swapaxes(1, 2)[:, 1:], wavelength_m(model.lines))
+        beam.weights(np.stack(each).swapaxes(1, 2)[:, 1:], wavelength_m(model.lines))
         for each in (real, virtual)
     )
     return weights, of_virtual
@@ -204,9 +237,10 @@ def _weights(
 def nearest_errors(
     model: VisibilityModel, stages: Sequence[tuple[int, int]]
 ) -> tuple[float, list[float]]:
-    """Return the error power of nearest beams, THESIS [45], and that of each stage.
+    """Return the error power of nearest beams, and that of each stage.
 
-    Range errors are taken as spread evenly up to the bound. Those of stages add, not their powers.
+    Range errors are assumed to be spread evenly up to the bound of Ødegaard (2004), eq. [45]. The
+    errors of stages add, not their powers.
     """
     centres_m = model.lines.phase_centres_m[np.argsort(model.track.coordinate)]
     spacing_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1).mean()

@@ -13,29 +13,29 @@ from clsas.exact.groups import Groups, GroupsEstimate
 from clsas.exact.tiles import STACK, Tiles
 from clsas.opencl.buffers import beam_buffers, pixel_buffers, total_bytes
 from clsas.opencl.device import Device
-from clsas.planning.visibility_model import VisibilityModel
+from clsas.planning.visibility_model import LinesModel, VisibilityModel
 from clsas.planning.work import backprojecting, upsampling
 from clsas.plans.predictions import Work
 
-_LARGE = (64, 64)  # rows and columns of a subimage that holds any part of an exact image
+_LARGE = (64, 64)  # rows and columns of a subimage as large as any part of an exact image
 
 
 @dataclass(frozen=True)
 class Exact:
-    """An exact image, as `clsas.backproject` forms it.
+    """Prediction of an exact image, as `clsas.backproject` forms it.
 
     Attributes
     ----------
     accuracy_db : float
-        Its relative rms error.
+        Relative rms error.
     tiled, weighted : bool
-        True where pixels lie in tiles of a plane, not in groups; where a beam weighs them.
+        True if pixels lie in tiles of a plane, not in groups; true if a beam weights them.
     parts, part_pixels : int
         Number of tiles or groups, and of pixels in each.
     channels, visible_channels : int, float
-        Number of channels, and mean number whose beam touches a part.
+        Number of channels, and mean number of those whose beam touches a part.
     taps, samples : int
-        Of the interpolator, and of an upsampled line.
+        Taps of the interpolator, and samples of an upsampled line.
     memory_bytes : int
         Largest amount of device memory needed.
     """
@@ -66,8 +66,8 @@ class Exact:
         return Work(call=1.0) + lines + pixels
 
 
-def expect(model: VisibilityModel, accuracy_db: float, device: Device) -> Exact:
-    """Predict an exact image, by the same decision that forms it."""
+def expect(model: LinesModel, accuracy_db: float, device: Device) -> Exact:
+    """Return the prediction of an exact image, by the same decision that forms it."""
     lines, beam = model.lines, model.beam
     decided = partial(
         decide,
@@ -86,11 +86,11 @@ def expect(model: VisibilityModel, accuracy_db: float, device: Device) -> Exact:
     tiled = isinstance(layout, Tiles)
     largest = decision
     if not tiled and model.grid.points_m is not None:
-        # Points may lie far apart: samples are then looked up more slowly, in lines upsampled more.
+        # Points may lie far apart: samples are then looked up more slowly, in longer lines.
         others = [decided(windows=each) for each in (STACK, 0)]
         largest = max((decision, *others), key=lambda each: each.resampling.length)
     share = most = 1.0
-    if beam is not None and model.track is not None:
+    if beam is not None and isinstance(model, VisibilityModel):
         share, most = model.visible_share(model.small), model.visible_share(_LARGE, most=True)
     blocks = blocks_of(
         device,
@@ -117,16 +117,16 @@ def expect(model: VisibilityModel, accuracy_db: float, device: Device) -> Exact:
 
 
 def _memory_bytes(
-    model: VisibilityModel,
+    model: LinesModel,
     device: Device,
     blocks: Blocks,
     layout: Tiles | Groups | GroupsEstimate,
     most: float,
 ) -> int:
-    """Return the device memory that `clsas.exact.run.execute` takes.
+    """Return the device memory that `clsas.exact.run.execute` needs.
 
-    Buffers of parts, blocks and bands come in two sets if there are two jobs. `most` is the largest
-    fraction of the channels whose beam touches a part.
+    There are two sets of the buffers of parts, blocks and bands if there are two jobs. `most` is
+    the largest fraction of the channels whose beam touches a part.
     """
     lines, beam = model.lines, model.beam
     parts, part_pixels = layout.parts, layout.part_pixels
@@ -134,7 +134,7 @@ def _memory_bytes(
     of_band = min(band_parts(device, part_pixels, layout.across, normalise), parts)
     of_job = min(blocks.parts_at_once, of_band)
     bands, jobs_of_set = -(-parts // of_band), -(-of_band // of_job)
-    # Channels of the first set, and of the second one, which holds what is left.
+    # Channels of the first set of buffers, and the remaining channels of the second set.
     first = min(blocks.channels_at_once, lines.channels)
     rest = lines.channels - first if bands == 1 else first
     sets = [n for n in (first, min(first, rest)) if n]

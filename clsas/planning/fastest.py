@@ -1,9 +1,10 @@
-"""The fastest factorization that keeps a tolerance and a memory limit.
+"""The fastest factorization within a tolerance and a memory limit.
 
-The search proposes the fastest tree for the error that is left to its filters. Its estimate then
-says what else errs, such as unevenly spaced virtual channels. As long as the sum is too much, the
-next candidate gets denser virtual channels, or leaves less to its filters; if it needs too much
-memory, it gets smaller roots. Candidates therefore come in the order of their times.
+The search proposes the fastest tree for the error that is left to its filters. The prediction then
+adds all other errors, such as those of unevenly spaced virtual channels. If their sum exceeds the
+tolerance, the next candidate has denser virtual channels, or more accurate filters; if it needs too
+much memory, the next one has smaller roots. The candidates are therefore tried in the order of
+their times, and the first that meets both limits is accepted.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from clsas.aperture.mean_track import MeanTrack
 from clsas.core.decibels import in_db, power
 from clsas.opencl import phases
 from clsas.planning.beam_coverage import trimmed
+from clsas.planning.candidate import Candidate
 from clsas.planning.channels import frequencies
 from clsas.planning.errors import Errors, other_errors, root_error, spaced_stages
 from clsas.planning.prediction import (
-    Candidate,
     Conditions,
     margin_db,
     predicted_plan,
@@ -34,29 +35,30 @@ from clsas.plans.plan import Plan
 from clsas.plans.predictions import ErrorBudget
 from clsas.signal.spectrum import OUTSIDE, occupied_band
 
-# Shares of the allowed error power. `scripts/bench sensitivity` measured what half and twice do.
+# Shares of the allowed error power, with the effect of half and twice the value, as measured by
+# `scripts/bench sensitivity`.
 _ROOTS_SHARE = 0.25  # for roots; twice: up to 5 % slower
-_SPACING_SHARE = 0.2  # for uneven spacing of all stages; chooses which remedy is tried first
+_SPACING_SHARE = 0.2  # for uneven spacing of all stages; decides which refinement is tried first
 _EDGES_SHARE = 0.03  # for edges of the beam that are left out; half: 0.5 % slower
-_RESERVED_SHARE = 0.08  # for leaves, upsampling, rounding; half: 3 % faster after one more trial
-_MOST_SPENT = 0.9  # before filters; 1 would ask for filters without any error
+_RESERVED_SHARE = 0.08  # for leaves, upsampling, rounding; half: 3 % faster, with one more trial
+_MOST_SPENT = 0.9  # by everything but filters; 1 would require filters without any error
 _LEAST_DENSER = 1.05  # factor of one step; half the step: planning takes 10 % longer
 _MOST_OVERSAMPLING = 2.0  # of virtual channels; twice: planning takes 30 % longer for nothing
 _DENSITY_POWER = 0.08  # of a relative excess; half or twice: planning up to 20 % longer
 _LEAST_STEP = 0.02  # share added to the reserve at least; half or twice: errors move by 0.1 dB
-_OVERSHOOT = 1.3  # of the excess, added to the reserve; twice: errors 0.2 dB less than asked
-_LEAST_BEAM_CYCLES = 0.5  # of an edge of the beam at first; half: 2 % faster, twice: 3 % slower
-_MOST_BEAM_CYCLES = 64.0  # beyond, virtual channels take the weights for a step
+_OVERSHOOT = 1.3  # of the excess, added to the reserve; twice: errors 0.2 dB below the tolerance
+_LEAST_BEAM_CYCLES = 0.5  # of an edge of the beam, at first; half: 2 % faster, twice: 3 % slower
+_MOST_BEAM_CYCLES = 64.0  # beyond, the weights are a step, which virtual channels cannot follow
 
 _NOT_SMOOTH = (
-    "channels are too far from a smooth aperture, by their place, motion or heading, for the "
-    "smallest subimages"
+    "channels deviate too much from a smooth aperture, in position, motion or heading, even for "
+    "the smallest subimages"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Conditions that all candidates share.
+    """Requirements that all candidates share.
 
     Attributes
     ----------
@@ -64,7 +66,7 @@ class _Problem:
         Without the edges of the beam, if there is one.
     conditions : Conditions
     designs : dict
-        Filters designed before.
+        Filters that were designed for earlier candidates.
     """
 
     model: VisibilityModel
@@ -73,7 +75,7 @@ class _Problem:
 
     @property
     def tolerance_db(self) -> float:
-        """Relative rms error asked for."""
+        """Tolerated relative rms error, dB."""
         tolerance_db = self.conditions.tolerance_db
         assert tolerance_db is not None  # with given stages there is nothing to search
         return tolerance_db
@@ -90,13 +92,13 @@ class _Problem:
 
     @property
     def reserved(self) -> float:
-        """Error power that is kept for what neither filters nor roots add, at least."""
+        """Least error power that is reserved for everything but filters and roots."""
         terms = phases.terms_within(self.tolerance_db, phases.FACTORIZED_SHARE)
         of_phases = phases.error(terms) ** 2
         return self.beam_edges + _RESERVED_SHARE * self.allowed + of_phases
 
     def filters_db(self, reserved: float, root: tuple[int, int]) -> float | None:
-        """Return what is left to filters beside roots of a size, None if next to nothing."""
+        """Return the error that is left to filters with roots of a size; None if almost nothing."""
         spent = reserved + root_error(self.model, root)
         if spent >= _MOST_SPENT * self.allowed:
             return None
@@ -105,23 +107,23 @@ class _Problem:
 
 @dataclass(frozen=True)
 class _Trial:
-    """Limits that the next candidate keeps to.
+    """Limits of the next candidate.
 
     Attributes
     ----------
     choices : Allowed
         Taps and numbers of stages to choose from.
     most_root : (rows, columns)
-        The largest roots.
+        Size of the largest roots.
     beam_cycles : float
         See `InterpolatedAperture`.
     reserved : float
-        Error power that is kept for what neither filters nor roots add.
+        Error power that is reserved for everything but filters and roots.
     least_leaf_pixels : int
     tree : Tree or None
-        The tree, once it was searched for.
+        The fastest tree within the limits; None if it must be searched for.
     oversampling : tuple of float
-        How much denser than the filter needs its virtual channels are, stage by stage.
+        Density of virtual channels over that which the filter requires, stage by stage.
     """
 
     choices: Allowed
@@ -140,11 +142,11 @@ class Outcome:
     Attributes
     ----------
     plan : Plan or None
-        The fastest factorization; None if there is none, or none as fast as asked for.
+        The fastest factorization; None if there is none, or none as fast as required.
     track : MeanTrack or None
         The plan's mean track.
     least_bytes : float
-        Without a plan, the least memory of those that did not fit.
+        Without a plan, the least memory of the candidates that did not fit.
     obstacle : str
         Why an image cannot be factorized at all, in words; "" if it can.
     """
@@ -158,7 +160,7 @@ class Outcome:
 def fastest(
     model: VisibilityModel, conditions: Conditions, seconds: float, choices: Allowed
 ) -> Outcome:
-    """Return the fastest plan within a tolerance, if it takes less than some seconds."""
+    """Return the fastest plan within a tolerance, if it takes less than `seconds`."""
     problem = _Problem(model, conditions)
     problem = replace(problem, model=trimmed(model, _EDGES_SHARE * problem.allowed))
     most_root = root_limits(problem.model, _ROOTS_SHARE * problem.allowed)
@@ -166,7 +168,7 @@ def fastest(
         return Outcome(obstacle=_NOT_SMOOTH)
     beam_cycles = 0.0 if model.beam is None else _LEAST_BEAM_CYCLES
     trial: _Trial | None = _Trial(choices, most_root, beam_cycles, problem.reserved)
-    needed = math.inf
+    least_bytes = math.inf
     while trial is not None:
         tree = trial.tree
         if tree is None:
@@ -176,19 +178,17 @@ def fastest(
         if filters is None:
             trial = _with_fewer_stages(problem, trial, tree)
             continue
-        errors, found = _estimated(problem, trial, tree, filters)
+        errors, found = _predicted(problem, trial, tree, filters)
         if found.predicted_seconds >= seconds:
             break
         if found.predicted_error_db > problem.tolerance_db:
             trial = _more_accurate(problem, trial, errors, found)
         elif found.memory_bytes > conditions.memory_bytes:
-            needed = min(needed, found.memory_bytes)
-            rows, columns = found.sides[0]
-            smaller = (rows // 2, columns) if rows > columns else (rows, columns // 2)
-            trial = replace(trial, most_root=smaller, tree=None)
+            least_bytes = min(least_bytes, found.memory_bytes)
+            trial = _with_smaller_roots(trial, found)
         else:
             return Outcome(found, model.track)
-    return Outcome(least_bytes=needed)
+    return Outcome(least_bytes=least_bytes)
 
 
 def off_track(model: VisibilityModel, conditions: Conditions) -> bool:
@@ -198,7 +198,7 @@ def off_track(model: VisibilityModel, conditions: Conditions) -> bool:
 
 
 def _searched(problem: _Problem, trial: _Trial) -> _Trial | None:
-    """Return the trial with the fastest tree, None without any."""
+    """Return the trial with the fastest tree; None if there is no tree."""
     filters_db = problem.filters_db(trial.reserved, trial.most_root)
     if filters_db is None:
         return None
@@ -219,7 +219,7 @@ def _searched(problem: _Problem, trial: _Trial) -> _Trial | None:
 
 def _filters(problem: _Problem, trial: _Trial, tree: Tree) -> Filters | None:
     """Return the filters of a trial's tree; None if none are accurate enough."""
-    # Roots are often smaller than they might be, and leave more to filters.
+    # Roots are often smaller than the largest allowed, which leaves more to filters.
     filters_db = problem.filters_db(trial.reserved, tree.sides[0])
     if filters_db is None:
         return None
@@ -236,10 +236,10 @@ def _filters(problem: _Problem, trial: _Trial, tree: Tree) -> Filters | None:
     return problem.designs[key]
 
 
-def _estimated(
+def _predicted(
     problem: _Problem, trial: _Trial, tree: Tree, filters: Filters
 ) -> tuple[Errors, Plan]:
-    """Return the errors of a candidate besides those of its range filters, and its plan."""
+    """Return the errors of a candidate other than those of its range filters, and its plan."""
     sides, roots = tree.sides, root_error(problem.model, tree.sides[0])
     within = problem.model.within(sides[0])
     conditions = problem.conditions
@@ -277,10 +277,18 @@ def _estimated(
     return errors, predicted_plan(within, candidate, budget, conditions)
 
 
-def _with_fewer_stages(problem: _Problem, trial: _Trial, tree: Tree) -> _Trial | None:
-    """Return a trial of fewer stages: their subimages are larger, with more virtual channels.
+def _with_smaller_roots(trial: _Trial, found: Plan) -> _Trial:
+    """Return a trial whose roots have at most half as many pixels, which need less memory."""
+    rows, columns = found.sides[0]
+    smaller = (rows // 2, columns) if rows > columns else (rows, columns // 2)
+    return replace(trial, most_root=smaller, tree=None)
 
-    That helps where virtual channels are as dense as they may be; else there is nothing left.
+
+def _with_fewer_stages(problem: _Problem, trial: _Trial, tree: Tree) -> _Trial | None:
+    """Return a trial of fewer stages, whose larger subimages have more virtual channels.
+
+    This helps if the virtual channels are as dense as allowed. Otherwise return None: no other
+    refinement is left.
     """
     fewer = tuple(n for n in trial.choices.stages if n < len(tree.sides))
     if not fewer or _MOST_OVERSAMPLING not in trial.oversampling[:-1]:
@@ -290,10 +298,10 @@ def _with_fewer_stages(problem: _Problem, trial: _Trial, tree: Tree) -> _Trial |
 
 
 def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan) -> _Trial | None:
-    """Return a trial that errs by less than a candidate that missed the tolerance.
+    """Return a trial with a smaller error than a candidate that missed the tolerance.
 
-    Denser virtual channels reduce the errors of uneven spacing and of a beam. Filters make up for
-    the rest.
+    Denser virtual channels reduce the errors of uneven spacing and of a beam. More accurate filters
+    make up for other errors.
     """
     allowed, last = problem.allowed, found.sides[-1]
     share = _SPACING_SHARE * allowed / len(found.sides)
@@ -304,9 +312,9 @@ def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan
         aperture = found.factorization.aperture.filter
         stages = spaced_stages(found.sides, aperture, trial.oversampling, None)
         without_beam = spacing_error(within, stages)
-        if 2 * without_beam < errors.spacing[-1]:  # most of it is the beam's
+        if 2 * without_beam < errors.spacing[-1]:  # the beam causes most of it
             if beam_cycles >= _MOST_BEAM_CYCLES:
-                return None  # no virtual channels follow a step
+                return None  # virtual channels cannot follow a step
             beam_cycles, excess[-1] = 2 * beam_cycles, 0.0
             return replace(
                 trial,
@@ -319,7 +327,7 @@ def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan
     if any(excess) and max(trial.oversampling) < _MOST_OVERSAMPLING:
         return replace(trial, oversampling=_denser(trial.oversampling, excess, share))
     too_much = power(-margin_db(problem.model)) * (power(found.predicted_error_db) - allowed)
-    # Some errors fall together with those of filters, which keep half of what they have at least.
+    # Other errors fall together with those of filters, which keep at least half of their share.
     left = _MOST_SPENT * allowed - trial.reserved - errors.roots
     step = min(_OVERSHOOT * too_much, left / 2)
     return replace(trial, reserved=trial.reserved + step + _LEAST_STEP * allowed)
@@ -328,7 +336,7 @@ def _more_accurate(problem: _Problem, trial: _Trial, errors: Errors, found: Plan
 def _denser(
     oversampling: tuple[float, ...], excess: list[float], share: float
 ) -> tuple[float, ...]:
-    """Return the next oversampling of virtual channels: more where errors exceed their share."""
+    """Return the next oversampling of virtual channels: higher where errors exceed their share."""
     return tuple(
         min(each * max((1 + over / share) ** _DENSITY_POWER, _LEAST_DENSER), _MOST_OVERSAMPLING)
         if over

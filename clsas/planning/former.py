@@ -1,4 +1,4 @@
-"""What forms images by a plan, whichever method it chose."""
+"""Formers of images by a plan, exact or factorized."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from clsas.plans.factorization import ExactImage
 from clsas.plans.plan import Plan
 
 Former = ExactImager | FactorizedImager
-"""Forms images of any samples of one geometry, without checks."""
+"""Object that forms images of any samples of one geometry, without checks."""
 
 
 def former(
@@ -27,16 +27,16 @@ def former(
     surface: Surface | None = None,
     warned: bool = False,
 ) -> Former:
-    """Return what forms images by a plan, without checks and without warnings of ambiguous lines.
+    """Return the former of images by a plan. It neither checks lines nor warns of ambiguous ones.
 
     Parameters
     ----------
     lines, grid, plan, device
-        The plan may have been made for lines whose channels lie a little beside these.
+        The plan may have been made for lines whose channels lie slightly beside these.
     track, surface : optional
         Results of planning: see `clsas.planning.planner.Planned`.
     warned : bool
-        True if the user has been warned already that no line adds anything to the image.
+        True if the user has already been warned that no line adds anything to the image.
     """
     if isinstance(plan.method, ExactImage):
         accuracy_db = plan.method.accuracy_db

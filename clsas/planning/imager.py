@@ -1,4 +1,4 @@
-"""The imager: any number of images of one geometry, exact or by a plan."""
+"""Imager of any number of images of the same geometry, exact or by a plan."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from clsas.exact.run import ExactImager
 from clsas.opencl.device import Device, open_device
 from clsas.planning.former import Former, former
 from clsas.planning.planner import planned
+from clsas.planning.request import Request
 from clsas.plans.plan import Plan
 from clsas.signal.spectrum import FEW_CHANNELS, MEASURED_CHANNELS, power_outside
 from clsas.sonar.beam import BeamWindow
@@ -26,27 +27,29 @@ Progress = Callable[[int, int], None]
 
 
 class Imager:
-    """Images of one geometry: everything that does not depend on samples is done once.
+    """Former of any number of images of the same geometry, exact or factorized.
 
-    Exactly one of `plan`, `tolerance_db` and `accuracy_db` must be given.
+    Everything that does not depend on the samples is computed once. Exactly one of `plan`,
+    `tolerance_db` and `accuracy_db` must be given.
 
     Parameters
     ----------
     lines : RangeLines
-        Lines to image. Later ones may have other samples, but must have the same antennas, ranges
-        and carrier, and samples of about the same band.
+        Lines to image. Lines that are imaged later may have other samples of about the same band,
+        but must have the same antennas, ranges and carrier.
     grid : Grid
         Pixels of the images.
     plan : Plan, optional
-        A plan made by `clsas.plan` for these lines and this grid.
+        A plan that `clsas.plan` made for these lines and this grid.
     tolerance_db : float, optional
-        Relative rms error allowed against the exact image, dB, from -75 to -10: the fastest way to
-        form the images is then planned, as `clsas.plan` does.
+        Largest relative rms error against the exact image, dB, from -75 to -10. The fastest images
+        within it are then planned, as by `clsas.plan`.
     accuracy_db : float, optional
-        Relative rms error allowed against the ideal sum, dB, from -85 to below 0: the images are
-        exact, as those of `clsas.backproject`.
+        Largest relative rms error against the ideal sum, dB, from -85 to below 0. The images are
+        then exact, as those of `clsas.backproject`.
     beam : BeamWindow, optional
-        Weights of the channels; a plan holds its own.
+        Weights of the channels by aspect angle. Must be left out with a plan, which contains its
+        own.
     device : Device, str or int, optional
         See `clsas.opencl.device.choose`.
 
@@ -61,43 +64,48 @@ class Imager:
     Raises
     ------
     TypeError, ValueError
-        If an argument is not what is allowed, the plan was made for other lines or another grid, or
-        `beam` is given beside a plan.
+        If an argument is not allowed, the plan was made for other lines or another grid, or `beam`
+        is given with a plan.
     DeviceError
-        If there is no such device.
+        If the device does not exist.
 
     Warns
     -----
     ClsasWarning
-        As `clsas.plan` or `clsas.backproject` does; once, however many images are formed.
+        For the reasons of `clsas.plan` or `clsas.backproject`, once for all images.
 
     See Also
     --------
-    clsas.factorize, clsas.backproject : one image.
+    factorize : Form a single image by a plan or to a tolerance.
+    backproject : Form a single exact image.
 
     Notes
     -----
-    Between images the imager keeps the geometry of a factorization, or the references of an exact
-    image, up to 256 MiB of host memory, and the lines that it was made from. They are freed with
-    the imager, or at the end of a `with` block. An imager must not be shared by threads.
+    Between images, the imager keeps the geometry of a factorization, or the references of an exact
+    image, in up to 256 MiB of host memory, and the lines that it was made from. `close`, or the
+    end of a ``with`` block, frees both.
+    Threads must not share an imager.
 
     Examples
     --------
-    Two images of the same geometry, for example of two looks or two polarisations:
+    Two images of the same geometry, of a point that echoes half as much the second time:
 
-    >>> import numpy as np, clsas
-    >>> track_m = np.c_[np.linspace(-2, 2, 64), np.zeros((64, 2))]
-    >>> noise = np.random.default_rng(0).normal(size=(2, 64, 200)) + 0j
-    >>> noise *= np.hanning(200)
-    >>> looks = [
-    ...     clsas.RangeLines(samples, 18.0, 0.02, track_m, track_m, 100e3, 1500.0)
-    ...     for samples in noise
-    ... ]
-    >>> grid = clsas.Grid.plane((-0.5, 0.5, 32), (19.5, 20.5, 32))
-    >>> with clsas.Imager(looks[0], grid, accuracy_db=-40) as imager:
-    ...     images = [imager(look) for look in looks]
-    >>> [image.shape for image in images]
-    [(32, 32), (32, 32)]
+    >>> import clsas
+    >>> import numpy as np
+    >>> tx_m = np.outer(np.arange(64), [0.02, 0, 0])
+    >>> first, second = (
+    ...     clsas.simulate_lines(
+    ...         tx_m, tx_m, clsas.PointTargets([[0.6, 20.0, 0.0]], [amplitude]),
+    ...         carrier_hz=100e3, bandwidth_hz=20e3,
+    ...     )
+    ...     for amplitude in (1.0, 0.5)
+    ... )
+    >>> grid = clsas.Grid.plane((0.4, 0.8, 32), (19.8, 20.2, 32))
+    >>> with clsas.Imager(first, grid, accuracy_db=-40) as imager:
+    ...     images = [imager(first), imager(second)]
+    >>> peaks = [abs(image.pixels).max() for image in images]
+    >>> bool(np.isclose(peaks[1], 0.5 * peaks[0]))
+    True
     """
 
     def __init__(
@@ -130,7 +138,8 @@ class Imager:
             preparation.warn_of_ambiguity()
             self._former = ExactImager(preparation)
         elif plan is None:
-            found = planned(lines, grid, tolerance_db=tolerance_db, beam=beam, device=self.device)
+            request = Request(lines, grid, tolerance_db=tolerance_db, beam=beam, device=self.device)
+            found = planned(request)
             self.plan = found.plan
             self._former = former(
                 lines,
@@ -144,7 +153,7 @@ class Imager:
         else:
             validate.instance("plan", plan, Plan)
             if beam is not None:
-                raise ValueError("beam must be left out with a plan, which holds its own")
+                raise ValueError("beam must be left out with a plan, which contains its own")
             plan.check(lines, grid)
             self.beam = plan.beam
             self._former = former(lines, grid, plan, self.device)
@@ -161,7 +170,7 @@ class Imager:
         accumulate: Image | None = None,
         progress: Progress | None = None,
     ) -> Image:
-        """Form the image of lines of the imager's geometry.
+        """Return the image of lines of the imager's geometry.
 
         Parameters
         ----------
@@ -179,8 +188,8 @@ class Imager:
         Raises
         ------
         TypeError, ValueError
-            If an argument is not what is allowed, the lines have another geometry, or the imager
-            was closed.
+            If an argument is not allowed, the lines have another geometry, or the imager was
+            closed.
 
         Warns
         -----
@@ -208,7 +217,7 @@ class Imager:
         return Image(image.pixels + accumulate.pixels, self.grid)
 
     def _check_band(self, lines: RangeLines) -> None:
-        """Warn once of lines with power outside the band that the images are made for."""
+        """Warn once if lines have power outside the band that the imager was made for."""
         band: tuple[float, float] | None
         allowed_db: float | None
         if isinstance(self._former, ExactImager):
@@ -234,7 +243,7 @@ class Imager:
             self._warned_of_band = True
 
     def close(self) -> None:
-        """Free what is kept between images; no image can be formed afterwards."""
+        """Free the memory that is kept between images. No image can be formed afterwards."""
         self._former = None
 
     def __enter__(self) -> Imager:
@@ -247,7 +256,7 @@ class Imager:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Free what is kept between images."""
+        """Close the imager."""
         self.close()
 
     def __repr__(self) -> str:

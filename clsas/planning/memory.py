@@ -1,6 +1,6 @@
-"""Device memory of a candidate, and how many roots are formed together within it.
+"""Device memory of a candidate, and the number of roots that are formed together within it.
 
-Predicted sizes go into the same lists of buffers from which a run allocates.
+Predicted sizes go into the same lists of buffers that a run allocates.
 """
 
 from __future__ import annotations
@@ -30,9 +30,8 @@ from clsas.opencl.device import Device
 from clsas.opencl.upsampling import upsampling_buffers
 from clsas.planning.visibility_model import VisibilityModel
 
-_CACHED_BYTES = (
-    16 << 20
-)  # of a batch on CPUs: a last-level cache; half: 2 % slower, twice: 3 % faster
+# Size of a batch on CPUs: a last-level cache. Half: 2 % slower, twice: 3 % faster.
+_CACHED_BYTES = 16 << 20
 _BATCH_BYTES = 256 << 20  # of a batch elsewhere; not measured
 _MOST_TABLE_BYTES = 64 << 20
 _ROOTS_PREPARED = 16  # together, so that arrays are few and large; half or twice: the same
@@ -50,18 +49,19 @@ class BufferSizes:
     sides, tile
         As those of `Factorization`.
     pitches : tuple of int
-        Samples of a line with zeros around it, stage by stage.
+        Samples of a line including the zeros around it, stage by stage.
     root_channels : tuple of int
-        Virtual channels of a root along the whole aperture, at most, stage by stage.
+        Largest number of virtual channels of a root along the whole aperture, stage by stage.
     most_channels : tuple of int
-        Virtual channels of a subimage, at most, stage by stage.
+        Largest number of virtual channels of a subimage, stage by stage.
     bands : tuple of int
         Bands of channels, stage by stage: see `clsas.aperture.virtual_channels.Bands`.
     line_pitch : int
-        Samples of an upsampled line with zeros around it.
+        Samples of an upsampled line including the zeros around it.
     filtered : bool
-        True if a device upsamples the lines.
+        True if the device upsamples the lines by filters.
     half_precision : bool
+        True if stages store lines in half precision.
     """
 
     model: VisibilityModel
@@ -87,7 +87,7 @@ class BufferSizes:
         return buffers | beam_buffers(self.model.beam)
 
     def tables(self, roots: int) -> Buffers:
-        """Return the tables of some roots."""
+        """Return the tables of `roots` roots."""
         channels, tables = self.model.lines.channels, Buffers()
         for level, side in enumerate(self.sides):
             subimages = self._divided(side)
@@ -106,7 +106,7 @@ class BufferSizes:
         return tables | leaf_tables(roots * channels, roots * parts, points, self.model.beam)
 
     def work(self, roots: int) -> Buffers:
-        """Return the buffers in which some roots are formed together."""
+        """Return the buffers in which `roots` roots are formed together."""
         buffers, beam = Buffers(), self.model.beam
         for level, side in enumerate(self.sides):
             subimages, pitch = roots * self._divided(side), self.pitches[level]
@@ -120,11 +120,11 @@ class BufferSizes:
         return buffers | pixel_buffers(roots * pixels, beam)
 
     def _divided(self, side: tuple[int, int]) -> int:
-        """Return the subimages of a size in a root."""
+        """Return the number of subimages of a size in a root."""
         return math.prod(a // b for a, b in zip(self.sides[0], side, strict=True))
 
     def _parts(self) -> tuple[int, int]:
-        """Return the tiles or groups of a root, and its pixels, at most."""
+        """Return the largest numbers of tiles or groups of a root, and of its pixels."""
         if self.model.surface.is_plane:
             return self._divided(self.tile), math.prod(self.sides[0])
         pixels = self.model.subimages.most_padded_pixels(self.sides[-1], self.sides[0], self.width)
@@ -133,13 +133,14 @@ class BufferSizes:
 
 @dataclass(frozen=True)
 class Batches:
-    """Roots that are formed together, and whose geometry is prepared together.
+    """Numbers of roots that are processed together.
 
     Attributes
     ----------
     at_once, prepared : int
+        Roots that are formed together, and roots whose geometry is prepared together.
     memory_bytes : int
-        Device memory that the image takes.
+        Device memory that the image needs.
     """
 
     at_once: int
@@ -148,7 +149,7 @@ class Batches:
 
 
 def batches_within(sizes: BufferSizes, roots: int, device: Device, memory_bytes: int) -> Batches:
-    """Return batches that fill the cache or the memory, whichever is less; at least one root."""
+    """Return batches that fill the smaller of cache and memory, with at least one root each."""
     constant = total_bytes(sizes.constant())
     of_root, of_tables = total_bytes(sizes.work(1)), total_bytes(sizes.tables(1))
     room = memory_bytes - constant

@@ -18,16 +18,17 @@ _SEARCH_STEP = 8  # the search uses every eighth sample of the track; a fourth c
 
 @cached
 def along(model: VisibilityModel) -> NDArray[np.float64]:
-    """Return cycles per row, column and metre of relief, and per unit of the track's parameter.
+    """Return phase rates along the track, float64 [axes, points, samples].
 
-    float64 [axes, points, samples]; the largest within roots of the model's size, if it has any.
+    They are in cycles per row, column and metre of relief of a subimage, and per unit aperture
+    coordinate. If the model has a root size, they are the largest within such roots.
     """
     return _along(model, _root_extents(model), model.points_m)
 
 
 @cached
 def across(model: VisibilityModel) -> NDArray[np.float64]:
-    """Return the same per unit of the coordinate across a sheet, at samples of a line across."""
+    """Return the same per unit coordinate across a sheet, at the samples of a line across it."""
     return _of_sheet(model, _root_extents(model), model.points_m).across
 
 
@@ -35,9 +36,9 @@ def across(model: VisibilityModel) -> NDArray[np.float64]:
 def of_beam_along(model: VisibilityModel) -> NDArray[np.float64]:
     """Return the change of the beam's weights along the track as a phase rate, [points, samples].
 
-    The largest within roots of the model's size, if it has any: see `beam_rate`.
+    If the model has a root size, it is the largest within such roots: see `beam_rate`.
     """
-    if model.beam is None:
+    if model.beam is None or model.along is None:
         return np.zeros(model.distance_m.shape)
     if model.track.is_sheet:
         return _of_beam_on_sheet(model).along
@@ -47,24 +48,27 @@ def of_beam_along(model: VisibilityModel) -> NDArray[np.float64]:
 
 @cached
 def of_beam_across(model: VisibilityModel) -> NDArray[np.float64]:
-    """Return the same across a sheet, at the samples of a line across."""
+    """Return the same across a sheet, at the samples of a line across it; 0 without a beam."""
+    if model.beam is None:
+        return np.zeros((len(model.points_m), len(model.track.line_across(0.5).samples)))
     return _of_beam_on_sheet(model).across
 
 
 def cycles_in_root(
     model: VisibilityModel, root: Side, sides: tuple[Side, ...]
 ) -> NDArray[np.float64]:
-    """Estimate the phase per row, column and metre of relief in a root, cycles [sizes, axes].
+    """Return an estimate of the phase in a root, float64 [sizes, axes].
 
-    Accumulated along the part of the aperture where a subimage of each size is visible; the mean
-    over the inner sample points. With a root of 0 rows, at the points themselves.
+    It is in cycles per row, column and metre of relief, accumulated along the part of the aperture
+    where a subimage of each size is visible, and averaged over the inner sample points. With a root
+    of 0 rows, it is that at the points themselves.
     """
     rates = _along(model, _extents_of(model, root), model.points_m[INNER_POINTS], _SEARCH_STEP)
     return _visible_spacing(model, sides) @ rates.reshape(len(rates), -1).T
 
 
 def cycles_across_root(model: VisibilityModel, root: Side) -> NDArray[np.float64] | None:
-    """Estimate the phase across a sheet as `cycles_in_root`, [axes]; None without one."""
+    """Return the same across a sheet, float64 [axes]; None without a sheet."""
     if not model.track.is_sheet:
         return None
     points_m = model.points_m[INNER_POINTS]
@@ -77,7 +81,7 @@ def cycles_across_root(model: VisibilityModel, root: Side) -> NDArray[np.float64
 
 @cached
 def _visible_spacing(model: VisibilityModel, sides: tuple[Side, ...]) -> NDArray[np.float64]:
-    """Weights of track samples at inner points, 0 where a size is invisible, [sizes, n]."""
+    """Return weights of track samples at inner points, 0 where a size is invisible, [sizes, n]."""
     visible = model.visible_by_size(sides)[:, INNER_POINTS, ::_SEARCH_STEP]
     spacing = trapezoidal_weights(model.track.samples[::_SEARCH_STEP]) / len(INNER_POINTS)
     return (visible * spacing).reshape(len(sides), -1)
@@ -113,8 +117,7 @@ def _of_sheet(
         return sheet_rates(model.track, _boxes(model, extents, centres_m), every)
 
     key = "sheet rates", tuple(extents), centres_m.tobytes(), every
-    found: SheetRates = model.from_cache(key, find)
-    return found
+    return model.from_cache(key, find)
 
 
 def _boxes(

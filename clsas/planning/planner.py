@@ -6,14 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from clsas.aperture.dense_tracks import shapes_after
-from clsas.aperture.filters import ALIGN_TAPS
 from clsas.aperture.mean_track import MeanTrack
-from clsas.aperture.nearest import NearestBeams
-from clsas.core import validate
-from clsas.core.decibels import in_db, power
+from clsas.core.decibels import power
 from clsas.core.digests import grid_digest, lines_digest
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
@@ -24,36 +19,25 @@ from clsas.planning import costs as stored_costs
 from clsas.planning import scaling
 from clsas.planning.beam_coverage import obstacle
 from clsas.planning.costs import Costs, KnownCosts
-from clsas.planning.errors import leaf_error, nearest_errors
 from clsas.planning.exact_image import Exact, expect
 from clsas.planning.fastest import Outcome, fastest, off_track
-from clsas.planning.prediction import (
-    MARGIN_DB,
-    Candidate,
-    Conditions,
-    exact_plan,
-    predicted_plan,
-)
-from clsas.planning.search import MOST_STAGES, Allowed
-from clsas.planning.visibility_model import VisibilityModel
+from clsas.planning.nearest_beams import nearest_plan
+from clsas.planning.prediction import MARGIN_DB, Conditions, exact_plan
+from clsas.planning.request import BEST_TOLERANCE_DB as BEST_TOLERANCE_DB
+from clsas.planning.request import TOLERANCE_DB as TOLERANCE_DB
+from clsas.planning.request import WORST_TOLERANCE_DB as WORST_TOLERANCE_DB
+from clsas.planning.request import Request
+from clsas.planning.request import checked_pairs as checked_pairs
+from clsas.planning.request import tolerance_in_db as tolerance_in_db
+from clsas.planning.request import wavelengths as wavelengths
+from clsas.planning.search import Allowed
+from clsas.planning.visibility_model import LinesModel, VisibilityModel, model_of
 from clsas.plans.factorization import UNREACHED
 from clsas.plans.plan import Plan
-from clsas.plans.predictions import ErrorBudget
-from clsas.signal import interpolation
 from clsas.signal.spectrum import OUTSIDE
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches, warn_unreached
 from clsas.sonar.simplify import Model, simplify
-
-BEST_TOLERANCE_DB = -75.0
-"""The tightest tolerance that may be asked for: what float32 leaves of a factorized image."""
-WORST_TOLERANCE_DB = -10.0
-
-TOLERANCE_DB = -50.0
-"""Tolerance of images for which none is asked."""
-
-NEAREST_UPSAMPLING = 8.0
-"""Upsampling of lines before the linear interpolation of given stages."""
 
 # `scripts/bench sensitivity` halves and doubles these; without a remark nothing changes.
 _WORTH = 0.95  # of the time of an exact image, at most: less gain is within predictions' scatter
@@ -77,65 +61,118 @@ def plan(
     depth: int | None = None,
     full_model: bool = False,
 ) -> Plan:
-    """Plan the fastest image whose error keeps a tolerance.
+    """Return the plan of the fastest image within a tolerance.
 
     Exactly one of `tolerance_db`, `tolerance_wavelengths` and `stages` must be given.
 
     Parameters
     ----------
     lines : RangeLines
-        Lines to image. Of their samples only the spectrum and the fading at the ends matter.
+        Lines to image. Only the spectrum of their samples, and how far they fade towards the ends
+        of the lines, influence the plan.
     grid : Grid
         Pixels of the image.
-    tolerance_db : float
-        Requested relative rms error against the exact image, dB, from -75 to -10.
-    tolerance_wavelengths : float
-        The same as a range error in wavelengths of the carrier. Errors that are spread evenly
-        between minus and plus this value make 4 pi/sqrt(3) radians rms per wavelength.
-    stages : sequence of (QR, QI)
-        Form the image as THESIS chapter 4 does. Every stage sums QR neighbouring lines and divides
-        subimages by QI along either side; then the last subimages are backprojected. An empty
-        sequence is plain backprojection. Range is interpolated linearly.
+    tolerance_db : float, optional
+        Largest relative rms error against the exact image, dB, from -75 to -10.
+    tolerance_wavelengths : float, optional
+        The same tolerance as a range error, in wavelengths of the carrier; see Notes.
+    stages : sequence of (QR, QI), optional
+        Form the image by the thesis's method, with nearest beams and linear interpolation in range
+        [2]_. Every stage sums QR neighbouring lines and divides subimages by QI along either side;
+        the last subimages are backprojected. An empty sequence is plain backprojection.
     beam : BeamWindow, optional
-        Weights of the channels.
+        Weights of the channels by aspect angle.
     device : Device, str or int, optional
         Device that forms the image; see `clsas.opencl.device.choose`.
     memory_bytes : int, optional
-        Device memory that may be used. By default half of the device's, or as much as plain
-        backprojection takes.
+        Device memory that may be used. The default is half of the device's memory, or as much as
+        plain backprojection needs.
     costs : Costs, optional
-        Costs in place of those stored for the device. Where none are stored, a measurement of 0.3
-        to 0.6 s scales the defaults, and is stored, before the first search for a factorization.
+        Costs of each kind of work, instead of those stored for the device. If none are stored, the
+        first search for a factorization measures how fast the device is, for 0.3 to 0.6 s, scales
+        the default costs and stores them.
     taps : (range, aperture), optional
-        For study, with a tolerance: numbers of taps, 4, 6 or 8, in place of the fastest.
+        For studies, with a tolerance: number of taps of the filters in range and along the
+        aperture, 4, 6 or 8 each, instead of the fastest.
     depth : int, optional
-        For study, with a tolerance: number of stages, 1 to 5, in place of the fastest.
+        For studies, with a tolerance: number of stages, 1 to 5, instead of the fastest.
     full_model : bool
-        For study: model every effect, also those whose error lies far below the tolerance.
+        For studies: model every effect, including those whose error lies far below the tolerance.
 
     Returns
     -------
     Plan
-        An exact image if nothing is faster: near the aperture, with few channels or pixels, or much
-        relief.
+        How the image is formed, with its predicted error, time and memory. The plan is that of an
+        exact image if no factorization is faster: close to the aperture, with few channels or
+        pixels, or with much relief.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not allowed, or no plan fits the memory: the message names what the least
-        demanding one needs.
+        If an argument is not allowed, or no plan fits the memory. In the latter case the message
+        states how much memory is needed.
     DeviceError
-        If there is no such device.
+        If the device does not exist.
 
     Warns
     -----
     ClsasWarning
-        If the tolerance may be missed because lines do not fade towards ends that the grid
-        reaches, or because the lines' band fills all that is sampled; or if no pixel lies within
-        any line's range, or the beam, so that the image will be zero; or if costs stored for the
-        device cannot be read, or those measured cannot be stored.
+        If the image may miss the tolerance, because the grid reaches ends of lines that do not
+        fade, or because the lines' band fills the whole sampled band; if no pixel lies within the
+        range of any line and the beam, so that the image will be zero; or if the costs stored for
+        the device cannot be read, or measured ones cannot be stored.
+
+    See Also
+    --------
+    factorize : Form the image by a plan.
+    Imager : Form several images by a plan.
+    backproject : Form the exact image.
+
+    Notes
+    -----
+    A factorized image divides the grid into subimages within subimages, and combines the channels
+    of each into fewer, virtual ones, stage by stage [1]_. The search tries numbers of stages, sizes
+    of subimages and taps of filters. It predicts the time of each factorization from counts of its
+    operations, and the error from the sum of the powers of independent contributions
+    (`Plan.errors`). The plan is the fastest factorization whose predicted error, with a margin for
+    the scatter of measured ones, is within the tolerance.
+
+    Range errors that are spread evenly between minus and plus w wavelengths turn phases by up to
+    4 pi w. The relative rms error is therefore 4 pi w/sqrt(3), and ::
+
+        tolerance_db = 20 log10(4 pi tolerance_wavelengths/sqrt(3))
+
+    References
+    ----------
+    .. [1] Ulander, Hellsten, Stenström, "Synthetic-aperture radar processing using fast factorized
+       back-projection", IEEE Transactions on Aerospace and Electronic Systems 39(3), 2003.
+    .. [2] Ødegaard, "Fast time domain beamforming for synthetic aperture sonar", thesis,
+       University of Oslo, 2004, chapter 4.
+
+    Examples
+    --------
+    The planner decides whether a factorization is faster than the exact image. A small image is
+    exact:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> tx_m = np.outer(np.arange(64), [0.02, 0, 0])
+    >>> point = clsas.PointTargets([[0.6, 20.0, 0.0]], [1.0])
+    >>> lines = clsas.simulate_lines(tx_m, tx_m, point, carrier_hz=100e3, bandwidth_hz=20e3)
+    >>> grid = clsas.Grid.plane((0.4, 0.8, 32), (19.8, 20.2, 32))
+    >>> plan = clsas.plan(lines, grid, tolerance_db=-40)
+    >>> plan.is_exact
+    True
+
+    Given a number of stages, it returns the fastest factorization that has them:
+
+    >>> plan = clsas.plan(lines, grid, tolerance_db=-40, depth=1)
+    >>> plan.is_exact, len(plan.sides)
+    (False, 1)
+    >>> plan.predicted_error_db <= -40
+    True
     """
-    return planned(
+    request = Request(
         lines,
         grid,
         tolerance_db=tolerance_db,
@@ -148,12 +185,13 @@ def plan(
         taps=taps,
         depth=depth,
         full_model=full_model,
-    ).plan
+    )
+    return planned(request).plan
 
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """A plan, and what planning found on the way that its image needs again.
+    """A plan, with results of planning that forming its image needs again.
 
     Attributes
     ----------
@@ -169,144 +207,153 @@ class Planned:
     surface: Surface | None = None
 
 
-def planned(
-    lines: RangeLines,
-    grid: Grid,
-    *,
-    tolerance_db: float | None = None,
-    tolerance_wavelengths: float | None = None,
-    stages: Sequence[tuple[int, int]] | None = None,
-    beam: BeamWindow | None = None,
-    device: Device | str | int | None = None,
-    memory_bytes: int | None = None,
-    costs: Costs | None = None,
-    taps: tuple[int, int] | None = None,
-    depth: int | None = None,
-    full_model: bool = False,
-) -> Planned:
-    """Return what `plan` does, with what its image needs again."""
-    validate.instance("lines", lines, RangeLines)
-    validate.instance("grid", grid, Grid)
-    if beam is not None:
-        validate.instance("beam", beam, BeamWindow)
-    given = [tolerance_db, tolerance_wavelengths, stages]
-    if sum(value is not None for value in given) != 1:
-        raise ValueError(
-            "exactly one of tolerance_db, tolerance_wavelengths and stages must be given, "
-            f"got {tolerance_db}, {tolerance_wavelengths} and {stages}"
-        )
-    validate.memory("grid", 8 * grid.size)
-    tolerance_db = tolerance_in_db(tolerance_db, tolerance_wavelengths)
-    if stages is not None:
-        stages = _checked_stages(stages, lines, grid)
-    allowed = _allowed(taps, depth)
-    if allowed is not None and stages is not None:
-        raise ValueError("taps and depth go with a tolerance, not with stages")
-    if costs is not None:
-        validate.instance("costs", costs, Costs)
-    validate.flag("full_model", full_model)
-    device = open_device(device)
-    known = stored_costs.load(device) if costs is None else KnownCosts(costs, "given")
-    if memory_bytes is not None:
-        memory_bytes = validate.count("memory_bytes", memory_bytes)
-    scene = Model(lines, grid, beam) if full_model else simplify(lines, grid, beam, tolerance_db)
-    model = VisibilityModel.of(
-        scene.lines, scene.grid, scene.beam, OUTSIDE * power(tolerance_db or 0.0)
+def planned(request: Request) -> Planned:
+    """Return the plan of a request, with what its image needs again."""
+    device = open_device(request.device)
+    scene = _simplified(request)
+    model = model_of(
+        scene.lines, scene.grid, scene.beam, OUTSIDE * power(request.tolerance_db or 0.0)
     )
-    rest_db = of_passed_db = tolerance_db
-    if tolerance_db is not None:
-        model.ambiguity.warn("tolerance_db", tolerance_db)
-        rest_db = model.ambiguity.rest_db(tolerance_db, scene.error)
-        of_passed_db = model.ambiguity.of_passed_db(rest_db)
-    exact = expect(model, ACCURACY_DB if rest_db is None else rest_db - MARGIN_DB, device)
-    # Exact imaging divides itself to fit a device.
-    exact_fits = memory_bytes is None or exact.memory_bytes <= memory_bytes
-    is_reached = reaches(lines, grid, beam, model.channels_along)
-    searched = (
-        is_reached and stages is None and _worth_a_search(exact, known.costs, exact_fits, allowed)
-    )
-    if searched and known.source == "default":
-        known = scaling.scaled(device)
-    room = device.info.memory_bytes // 2 if memory_bytes is None else memory_bytes
-    conditions = Conditions(of_passed_db, exact, device.for_stages(), known.costs, room)
+    exact_db, factorized_db = _left_to_methods_db(request.tolerance_db, model, scene.error)
+    exact = expect(model, exact_db, device)
+    is_reached = reaches(request.lines, request.grid, request.beam, model.channels_along)
+    costs = _known_costs(request, exact, device, is_reached)
+    room = request.memory_bytes or device.info.memory_bytes // 2
+    conditions = Conditions(factorized_db, exact, device.for_stages(), costs.costs, room)
     if is_reached:
-        found, track = _chosen(model, stages, conditions, exact_fits, allowed)
+        found, track = _chosen(request, model, conditions)
     else:  # an image of zeros needs no search, nor memory
         found, track = exact_plan(model, conditions, UNREACHED), None
-    errors = found.errors
+        warn_unreached(request.lines, request.grid, request.beam, model.channels_along)
+    chosen = _completed(found, request, scene, model, costs)
+    if chosen.is_exact or not isinstance(model, VisibilityModel):
+        return Planned(chosen)
+    return Planned(chosen, track, model.surface)
+
+
+def _simplified(request: Request) -> Model:
+    """Return the scene without effects whose errors lie far below the tolerance."""
+    given = request.lines, request.grid, request.beam
+    return Model(*given) if request.full_model else simplify(*given, request.tolerance_db)
+
+
+def _left_to_methods_db(
+    tolerance_db: float | None, model: LinesModel, left_out: float
+) -> tuple[float, float | None]:
+    """Return the error that is left to an exact image, and to a factorized one, dB.
+
+    Errors that the lines themselves cause, of which this warns, and effects that are left out
+    already use up a part of the tolerance.
+    """
+    if tolerance_db is None:
+        return ACCURACY_DB, None
+    model.ambiguity.warn("tolerance_db", tolerance_db)
+    rest_db = model.ambiguity.rest_db(tolerance_db, left_out)
+    return rest_db - MARGIN_DB, model.ambiguity.of_passed_db(rest_db)
+
+
+def _known_costs(request: Request, exact: Exact, device: Device, is_reached: bool) -> KnownCosts:
+    """Return the given costs, or those of the device; measure these before its first search."""
+    if request.costs is not None:
+        return KnownCosts(request.costs, "given")
+    known = stored_costs.load(device)
+    searches = is_reached and _worth_a_search(request, exact, known.costs)
+    return scaling.scaled(device) if searches and known.source == "default" else known
+
+
+def _chosen(
+    request: Request, model: LinesModel, conditions: Conditions
+) -> tuple[Plan, MeanTrack | None]:
+    """Return the plan that is chosen, and the mean track if it is a factorization."""
+    exact, room = conditions.exact, conditions.memory_bytes
+    if request.stages:
+        return _with_given_stages(request.stages, model, conditions)
+    exact_fits, outcome = _exact_fits(request, exact), Outcome()
+    if _worth_a_search(request, exact, conditions.costs):
+        is_free = exact_fits and request.allowed is None
+        to_beat_s = _WORTH * conditions.costs.seconds(exact.work) if is_free else math.inf
+        outcome = _fastest_of_shapes(model, conditions, to_beat_s, request.allowed or Allowed())
+        if outcome.plan is not None:
+            return outcome.plan, outcome.track
+    if not exact_fits:
+        raise _too_little_memory(min(exact.memory_bytes, outcome.least_bytes), room)
+    return exact_plan(model, conditions, outcome.obstacle), None
+
+
+def _with_given_stages(
+    stages: Sequence[tuple[int, int]], model: LinesModel, conditions: Conditions
+) -> tuple[Plan, MeanTrack]:
+    """Return the plan of given stages, and its mean track."""
+    if not isinstance(model, VisibilityModel):
+        raise ValueError("lines must have channels at more than one place for stages")
+    if model.beam is not None and model.beam.normalise:
+        raise ValueError("beam must not normalise with stages; clsas.backproject does")
+    found = nearest_plan(model, stages, conditions)
+    if found.memory_bytes > conditions.memory_bytes:
+        raise _too_little_memory(found.memory_bytes, conditions.memory_bytes)
+    return found, model.track
+
+
+def _too_little_memory(least_bytes: float, room_bytes: int) -> ValueError:
+    return ValueError(
+        f"memory_bytes must be at least {math.ceil(10 * least_bytes / 2**20) / 10:.1f} MiB for "
+        f"this image, got {room_bytes / 2**20:.3g} MiB"
+    )
+
+
+def _exact_fits(request: Request, exact: Exact) -> bool:
+    """Return whether an exact image fits the memory; without a limit it divides itself to fit."""
+    return request.memory_bytes is None or exact.memory_bytes <= request.memory_bytes
+
+
+def _worth_a_search(request: Request, exact: Exact, costs: Costs) -> bool:
+    """Return whether a search may pay, or is needed because the exact image does not fit."""
+    if request.stages is not None:
+        return False
+    is_needed = not _exact_fits(request, exact) or request.allowed is not None
+    return is_needed or bool(costs.seconds(exact.work) > _SEARCH_S)
+
+
+def _completed(
+    found: Plan, request: Request, scene: Model, model: LinesModel, costs: KnownCosts
+) -> Plan:
+    """Return a plan of the simplified scene as one of the request: with all errors, and origins."""
+    ambiguity, errors = model.ambiguity, found.errors
     if not found.is_exact:
-        errors = errors.times(1 / model.ambiguity.least_brightness)
+        errors = errors.times(1 / ambiguity.least_brightness)
     errors = replace(
-        errors,
-        line_ends=model.ambiguity.ends,
-        aliasing=model.ambiguity.aliasing,
-        left_out=scene.error,
+        errors, line_ends=ambiguity.ends, aliasing=ambiguity.aliasing, left_out=scene.error
     )
     prediction = replace(
         found.prediction,
         error_db=errors.total_db,
         errors=errors,
-        cost_source=known.source,
-        costs_measured=known.measured,
+        cost_source=costs.source,
+        costs_measured=costs.measured,
     )
     found = replace(
         found,
-        tolerance_db=tolerance_db,
+        tolerance_db=request.tolerance_db,
         prediction=prediction,
         left_out=scene.left_out,
-        beam=beam,
-        lines_digest=lines_digest(lines) if scene.left_out else found.lines_digest,
-        grid_digest=grid_digest(grid) if scene.left_out else found.grid_digest,
+        beam=request.beam,
     )
-    if not is_reached:
-        warn_unreached(lines, grid, beam, model.channels_along)
-    return Planned(found, track, None if found.is_exact else model.surface)
-
-
-def _chosen(
-    model: VisibilityModel,
-    stages: list[tuple[int, int]] | None,
-    conditions: Conditions,
-    exact_fits: bool,
-    allowed: Allowed | None,
-) -> tuple[Plan, MeanTrack | None]:
-    """Return the plan of checked arguments, and the mean track of a factorization."""
-    beam, exact, room = model.beam, conditions.exact, conditions.memory_bytes
-    least: float = exact.memory_bytes
-    reason = ""
-    if stages:
-        if model.track is None:
-            raise ValueError("lines must have channels at more than one place for stages")
-        if beam is not None and beam.normalise:
-            raise ValueError("beam must not normalise with stages; clsas.backproject does")
-        found = _nearest(model, stages, conditions)
-        if found.memory_bytes <= room:
-            return found, model.track
-        exact_fits, least = False, found.memory_bytes
-    elif stages is None and _worth_a_search(exact, conditions.costs, exact_fits, allowed):
-        is_free = exact_fits and allowed is None
-        to_beat = _WORTH * conditions.costs.seconds(exact.work) if is_free else math.inf
-        outcome = _fastest_of_shapes(model, conditions, to_beat, allowed or Allowed())
-        if outcome.plan is not None:
-            return outcome.plan, outcome.track
-        least, reason = min(least, outcome.least_bytes), outcome.obstacle
-    if not exact_fits:
-        raise ValueError(
-            f"memory_bytes must be at least {math.ceil(10 * least / 2**20) / 10:.1f} MiB for this "
-            f"image, got {room / 2**20:.3g} MiB"
-        )
-    return exact_plan(model, conditions, reason), None
+    if not scene.left_out:
+        return found
+    return replace(
+        found, lines_digest=lines_digest(request.lines), grid_digest=grid_digest(request.grid)
+    )
 
 
 def _fastest_of_shapes(
-    model: VisibilityModel, conditions: Conditions, seconds: float, choices: Allowed
+    model: LinesModel, conditions: Conditions, seconds: float, choices: Allowed
 ) -> Outcome:
     """Return the fastest plan with a mean track of any shape: see `fastest`.
 
     Strips and sheets are tried where channels lie too far from one curve for roots as large as
     the image.
     """
-    if model.track is None or model.grid.size == 1:
+    if not isinstance(model, VisibilityModel) or model.grid.size == 1:
         return Outcome(obstacle=_NO_EXTENT)
     others = shapes_after(model.shape)
     best = _fastest_unless(obstacle(model), model, conditions, seconds, choices)
@@ -337,131 +384,3 @@ def _fastest_unless(
     if hindrance:
         return Outcome(obstacle=hindrance)
     return fastest(model, conditions, seconds, choices)
-
-
-def tolerance_in_db(
-    tolerance_db: float | None, tolerance_wavelengths: float | None
-) -> float | None:
-    """Return the tolerance asked for, or None, after checking it."""
-    if tolerance_db is not None:
-        return validate.number(
-            "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
-        )
-    if tolerance_wavelengths is None:
-        return None
-    least, most = (wavelengths(each) for each in (BEST_TOLERANCE_DB, WORST_TOLERANCE_DB))
-    return decibels(
-        validate.number(
-            "tolerance_wavelengths", tolerance_wavelengths, "wavelengths", least=least, most=most
-        )
-    )
-
-
-def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
-    """Return the requested filters and stages, None if the search is free."""
-    if taps is None and depth is None:
-        return None
-    fields = {}
-    if taps is not None:
-        meaning = "two, in range and along the aperture"
-        given = validate.entries("taps", taps, meaning)
-        if len(given) != 2:
-            raise TypeError(f"taps must be {meaning}, got {validate.shown(taps)}")
-        align, aperture = (
-            validate.one_of("taps", validate.count("every entry of taps", each), ALIGN_TAPS)
-            for each in given
-        )
-        fields = {"align_taps": (align,), "aperture_taps": (aperture,)}
-    if depth is not None:
-        depths = range(1, MOST_STAGES + 1)
-        fields["stages"] = (validate.one_of("depth", validate.count("depth", depth), depths),)
-    return Allowed(**fields)
-
-
-def _worth_a_search(exact: Exact, costs: Costs, exact_fits: bool, allowed: Allowed | None) -> bool:
-    """Return whether a search may pay, or is needed because the exact image does not fit."""
-    return not exact_fits or allowed is not None or costs.seconds(exact.work) > _SEARCH_S
-
-
-def decibels(wavelengths: float) -> float:
-    """Return the relative rms error of range errors spread evenly up to some wavelengths, dB."""
-    return 20 * math.log10(4 * math.pi * wavelengths / math.sqrt(3))
-
-
-def wavelengths(decibels: float) -> float:
-    """Return the range error, in wavelengths, that makes an error in decibels."""
-    return 10 ** (decibels / 20) * math.sqrt(3) / (4 * math.pi)
-
-
-def _nearest(
-    model: VisibilityModel, stages: Sequence[tuple[int, int]], conditions: Conditions
-) -> Plan:
-    """Return the plan of THESIS chapter 4: nearest beams, linear interpolation in range."""
-    rows, columns = model.grid.shape
-    division = math.prod(divisions for _, divisions in stages)
-    # Whole work-items: 16 rows by 4 columns.
-    leaf = 16 * math.ceil(rows / division / 16), 4 * math.ceil(columns / division / 4)
-    sides = []
-    for _, divisions in reversed(stages):
-        sides.append(leaf)
-        leaf = leaf[0] * divisions, leaf[1] * divisions
-    linear = interpolation.design(2, NEAREST_UPSAMPLING, model.spectrum)
-    candidate = Candidate(
-        sides=tuple(sides[::-1]),
-        tile=_tile(model, sides[0], conditions.device),
-        align=linear,
-        final=linear,
-        aperture=NearestBeams(factors=tuple(beams for beams, _ in stages)),
-    )
-    error, by_stage = nearest_errors(model, stages)
-    found = predicted_plan(model, candidate, ErrorBudget(nearest_beams=error), conditions)
-    *divided, last = found.stages
-    divided = [
-        replace(stage, error_db=in_db(power(stage.error_db) + of_beams))
-        for stage, of_beams in zip(divided, by_stage, strict=True)
-    ]
-    return replace(found, prediction=replace(found.prediction, stages=(*divided, last)))
-
-
-def _tile(model: VisibilityModel, leaf: tuple[int, int], device: Device) -> tuple[int, int]:
-    """Return the largest tiles of a leaf that may be expanded about their centres."""
-    parts = [
-        (rows, columns)
-        for rows in range(16, min(leaf[0], 64) + 1, 16)
-        for columns in range(4, min(leaf[1], 64) + 1, 4)
-        if leaf[0] % rows == 0 and leaf[1] % columns == 0
-    ]
-    fit = [part for part in parts if leaf_error(model, np.array([part]), device)[0] < 1e-8]
-    return max(fit or parts[:1], key=math.prod)
-
-
-def checked_pairs(stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return (QR, QI) of every stage; raises TypeError or ValueError if one is wrong."""
-    meaning = "a sequence of (QR, QI)"
-    pairs = [
-        validate.entries("stages", stage, meaning)
-        for stage in validate.entries("stages", stages, meaning)
-    ]
-    if any(len(pair) != 2 for pair in pairs):
-        raise TypeError(f"stages must be {meaning}, got {validate.shown(stages)}")
-    return [
-        (validate.count("QR of stages", beams), validate.count("QI of stages", divisions))
-        for beams, divisions in pairs
-    ]
-
-
-def _checked_stages(stages: Sequence[tuple[int, int]], lines: RangeLines, grid: Grid) -> list:
-    """Return (QR, QI) of every stage; raises ValueError if lines or grid do not allow them."""
-    pairs = checked_pairs(stages)
-    if not pairs:
-        return pairs
-    if not grid.is_planar:
-        raise ValueError("grid must be a plane for stages")
-    most_beams, most_divisions = lines.channels, max(min(grid.shape), 1)
-    beams, divisions = (math.prod(numbers) for numbers in zip(*pairs, strict=True))
-    if beams > most_beams or divisions > most_divisions:
-        raise ValueError(
-            f"stages must leave a line and a pixel: they sum {beams} of {lines.channels} lines and "
-            f"divide {grid.shape[0]} x {grid.shape[1]} pixels by {divisions} along either side"
-        )
-    return pairs

@@ -1,4 +1,4 @@
-"""Extents of subimages in range: how much of a line their pixels need."""
+"""Extents of subimages in range, which decide the length of their lines."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from clsas.signal.interpolation import Interpolator, Resampling
 
 
 def half_range_extents_m(model: VisibilityModel, sides: Sequence[Side]) -> NDArray[np.float64]:
-    """Return the largest differences in range between pixels and subimages' centres, [sizes].
+    """Return the largest difference in range between a pixel and its subimage's centre, [sizes].
 
-    The sides of subimages project onto the line of sight; within near subimages ranges bend.
+    It is the projection of the sides onto the line of sight, plus the curvature of the wavefront in
+    subimages close to the track.
     """
     steps_m = model.surface.steps_m
     boxes = np.stack([model.subimages.extents(side, side, most=True) for side in sides])
@@ -31,7 +32,7 @@ def half_range_extents_m(model: VisibilityModel, sides: Sequence[Side]) -> NDArr
 
 @cached
 def _range_slopes(model: VisibilityModel) -> NDArray[np.float64]:
-    """Largest change of range per row, column and metre of relief, [axes]."""
+    """Return the largest change of range per row, column and metre of relief, [axes]."""
     visible = model.visible(model.small)
     slopes = np.abs(model.sight @ model.surface.steps_m.T)
     if model.track.is_sheet:
@@ -51,7 +52,7 @@ def half_line_lengths(
     final: Interpolator,
     to: Resampling,
 ) -> tuple[int, ...]:
-    """Return the samples that the lines of each stage hold on either side of a centre.
+    """Return the number of samples on either side of a subimage's centre, stage by stage.
 
     `to` is the resampling of the lines before the first stage.
     """

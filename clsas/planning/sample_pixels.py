@@ -1,4 +1,4 @@
-"""Sampled pixels of subimages, for errors that are averaged over them."""
+"""Sampled pixels of subimages, over which errors are averaged."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ SPREAD_POINTS = (0, 7, 14, 16, 23)
 def pixels_m(
     model: VisibilityModel, extents: NDArray[np.float64], point: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return sampled pixels of a subimage, from its centre, [n + 1, 3]; the centre is first.
+    """Return the centre of a subimage and sampled pixels, relative to the centre, [n + 1, 3].
 
-    The second array holds one more number from 0 to 1 for each pixel. All numbers come from a
-    Kronecker sequence (multiples of powers of an irrational number), which spreads evenly; every
-    sample point has its own stretch of it.
+    The second array, [n], contains a further number from 0 to 1 for each pixel, for example to
+    choose its frequency. All numbers come from a Kronecker sequence (multiples of powers of an
+    irrational number), which fills the subimage evenly. Every sample point has an interval of it.
     """
     dimensions = len(extents) + 1
     ratio = 1.0
@@ -41,8 +41,8 @@ def mean_over_relief(
 ) -> float:
     """Return the mean over the grid of an error that depends on the extents of subimages.
 
-    It is evaluated without relief and at the largest relief. Errors grow at least with the square
-    of the relief, so that subimages with less of it are interpolated by its square.
+    The error is evaluated without relief and at the largest relief. It grows at least with the
+    square of the relief, so that subimages of less relief are interpolated by the square.
     """
     surface = model.surface
     flat = error(surface.extents(side))

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from clsas.factorized.surface import LEAST_SIDE, Surface
 
 _FRACTIONS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of the rows and columns
-_WEIGHTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # of these in means over the grid
+_WEIGHTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # of these fractions in means over the grid
 _POINT_WEIGHTS = np.outer(_WEIGHTS, _WEIGHTS).ravel() / _WEIGHTS.sum() ** 2
 
 INNER_POINTS = np.arange(len(_FRACTIONS) ** 2).reshape(len(_FRACTIONS), -1)[1:-1, 1:-1].ravel()
-"""Numbers of the sample points that do not lie at the grid's edges."""
+"""Indices of the sample points that do not lie at the grid's edges."""
 
 
 def sample_points_m(surface: Surface) -> NDArray[np.float64]:
@@ -33,7 +33,7 @@ def points_at_m(
     plane_m = origin_m + index @ surface.steps_m[:2]
     if surface.is_plane:
         return plane_m
-    # As far off the plane as the pixels around.
+    # Points lie as far off the plane as the pixels around them.
     around = (index // LEAST_SIDE * LEAST_SIDE).astype(np.int64)
     middle = around + (np.array(LEAST_SIDE) - 1) / 2
     off_m = surface.middles_m(LEAST_SIDE, around) - origin_m

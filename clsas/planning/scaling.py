@@ -1,8 +1,8 @@
-"""Costs of a device that nobody calibrated: defaults, scaled by a measurement of 0.3 to 0.6 s.
+"""Costs of a device that was not calibrated: defaults, scaled by a measurement of 0.3 to 0.6 s.
 
-Devices differ mostly in how fast they run each of the kernels, and hosts in how fast they are.
-Costs of one kernel keep the proportions that they have by default. So three small images, formed
-exactly on a plane, exactly off it, and factorized, tell a factor for each group of costs.
+Devices differ mostly in the speed of each kernel, and hosts in their speed as a whole. Costs of the
+same kernel keep their default proportions. Three small images are therefore enough to determine a
+factor for each group of costs: an exact one on a plane, an exact one off it, and a factorized one.
 """
 
 from __future__ import annotations
@@ -56,15 +56,16 @@ GROUPS = {
     "pixels": ("pixel_ns", "beam_ns"),
     "points": ("point_ns", "leaf_point_ns", "leaf_gathered_ns"),
 }
-"""Costs that are scaled by the same factor, by the field of `Scale`."""
+"""Costs that are scaled by the same factor, by field of `Scale`."""
 
 _BUDGET_S = 0.3
-"""Time of the measurement, without building kernels; twice as much if times do not repeat."""
-_KERNEL_S = 0.01  # of the exact image's kernel; half of it is too short for a device to settle,
-_LEAST_KERNEL_S = 0.003  # and with less than this images are made larger
-_LARGER = 3  # the factorized image's sides: its kernels take as long as the exact one's
-_ROOTS = 2  # of a batch of it
-_LEAST_S = 1e-6  # shortest time of anything, so that factors are positive
+"""Time of the measurement without building kernels; up to twice this if times do not repeat."""
+# Time of the exact image's kernel: half of it is too short for a device to settle. Images are made
+# larger if the kernel takes less than the second time.
+_KERNEL_S, _LEAST_KERNEL_S = 0.01, 0.003
+_LARGER = 3  # sides of the factorized image over those of the exact one: kernels take as long
+_ROOTS = 2  # of a batch of the factorized image
+_LEAST_S = 1e-6  # lower limit of times, so that factors are positive
 _CHANNELS = 192
 _LEAST_PIXELS, _MOST_PIXELS = 192, 1024  # along either side of the exact images
 _TOLERANCE_DB = -45.0
@@ -75,15 +76,15 @@ _measuring = threading.Lock()
 
 @dataclass(frozen=True)
 class Scale:
-    """Factors by which a device and its host are slower than the default costs have it.
+    """Factors by which a device and its host are slower than the default costs.
 
     Attributes
     ----------
     host, transforms : float
-        Work of the host: everything but FFTs, and these.
+        Work of the host: everything but FFTs, and FFTs.
     filters, stages, leaves, pixels, points : float
-        Kernels that upsample lines, combine them in stages, backproject leaves on a plane, and
-        backproject exact images on a plane, and any image off it.
+        Kernels that upsample lines, that combine them in stages, that backproject leaves on a
+        plane, exact images on a plane, and any image off a plane.
     """
 
     host: float
@@ -123,9 +124,10 @@ between that and the kernels' processor times."""
 
 
 def scaled(device: Device) -> KnownCosts:
-    """Scale the default costs to a device, and store them.
+    """Return the default costs scaled to a device, and store them.
 
-    A process measures a device once, even if the costs cannot be stored. Threads wait for it.
+    A process measures a device once, even if the costs cannot be stored. Other threads wait for the
+    measurement.
 
     Warns
     -----
@@ -138,32 +140,33 @@ def scaled(device: Device) -> KnownCosts:
 
 @functools.cache
 def _scaled_once(device: Device, path: Path) -> KnownCosts:
-    """Scale the default costs to a device, and store them in the file `path`."""
+    """Return the default costs scaled to a device, and store them in the file `path`."""
     costs = measure(device).of(stored.defaults(device))
     try:
         stored.save(device, costs, "scaled")
     except OSError as error:
         validate.warn(
             f"costs measured on {device.info.label} cannot be stored, so that every process "
-            f"measures them anew, for {_BUDGET_S:g} to {2 * _BUDGET_S:g} s: {error}"
+            f"measures them again, which takes {_BUDGET_S:g} to {2 * _BUDGET_S:g} s: {error}"
         )
         return KnownCosts(costs, "scaled")
     return stored.load(device)
 
 
 def measure(device: Device) -> Scale:
-    """Measure how fast a device and its host are, in 0.3 to 0.6 s and the time to build kernels.
+    """Return the measured speed of a device and its host relative to the default costs.
 
-    Images are larger on fast devices. They take turns, and the fastest run of each counts. Those
-    whose two fastest runs differ have as much time again: a scheduler that keeps the threads of a
-    short kernel on one core makes it take twice as long.
+    The measurement takes 0.3 to 0.6 s, and the time to build kernels. Images are larger on fast
+    devices. They are formed in turns, and the fastest run of each counts. Images whose two fastest
+    runs differ are timed for as long again, because a scheduler that keeps the threads of a short
+    kernel on one core makes it take twice as long.
     """
-    # Events of its own: whoever profiles the device sees nothing of the measurement.
+    # The measurement has events of its own, so that profiles of the device do not include it.
     device = replace(device, _events=None)
     start = time.perf_counter()
     side = _LEAST_PIXELS
     images, building_s = _built(device, side)
-    images.exact.run(device)  # the first run was of buffers that nothing had touched
+    images.exact.run(device)  # in the first run, buffers had not been touched before
     if images.exact.in_pixels < _LEAST_KERNEL_S:
         larger = side * math.sqrt(_KERNEL_S / max(images.exact.in_pixels, _LEAST_S))
         images, again_s = _built(device, 64 * round(min(larger, _MOST_PIXELS) / 64))
@@ -179,7 +182,7 @@ def measure(device: Device) -> Scale:
 
 
 def _take_turns(images: Sequence[TimedImage], device: Device, end_s: float) -> None:
-    """Time images in turns: each twice in all, and again unless a run would end after `end_s`."""
+    """Time images in turns, each at least twice, until the next run would end after `end_s`."""
     for image in cycle(images):
         everyone_twice = all(len(each.seconds) > 1 for each in images)
         if everyone_twice and time.perf_counter() + image.seconds[-1] > end_s:
@@ -194,7 +197,7 @@ class _Images:
     Attributes
     ----------
     exact, points, factorized : TimedImage
-        On a plane, off it, and on a plane of three times the sides.
+        Exact images on a plane and off it, and a factorized one of three times the sides.
     lines : RangeLines
     resampling : Resampling
         How the exact images upsample the lines.
@@ -212,7 +215,7 @@ class _Images:
         return self.factorized, self.exact, self.points
 
     def transform_s(self, width: int) -> float:
-        """Return the time in which the host upsamples the lines, seconds per sample."""
+        """Return the time that the host needs to upsample the lines, seconds per sample."""
         samples, pitch = self.lines.samples, padded_length(self.resampling)
         seconds = min(
             _seconds(lambda: upsampled_lines(samples, self.resampling, width, 0, pitch))
@@ -223,7 +226,7 @@ class _Images:
     def scale(self, usual: Costs, sample_s: float) -> Scale:
         """Return the factors by which times differ from those of the usual costs.
 
-        `sample_s` is the time of a sample that the host upsamples.
+        `sample_s` is the time that the host needs per upsampled sample.
         """
         factorized, exact, points = self.timed
         transformed = sum(sum(image.work(GROUPS["transforms"])) for image in self.timed)
@@ -245,7 +248,7 @@ class _Images:
 
 
 def _built(device: Device, side: int) -> tuple[_Images, float]:
-    """Return images of some pixels along a side, formed once, and the time that this took."""
+    """Return images of `side` pixels along a side, formed once, and the time that this took."""
     lines, grid = scene(_CHANNELS, _LARGER * side)
     exact = exact_image(device, lines, square(side))
     points = exact_image(device, lines, with_relief(square(3 * side // 4)))
@@ -255,19 +258,20 @@ def _built(device: Device, side: int) -> tuple[_Images, float]:
     conditions = Conditions(_TOLERANCE_DB, competing, device.for_stages(), _PLANNED_WITH, room)
     found = fastest(model, conditions, math.inf, _ALLOWED).plan
     assert found is not None  # the scene is made so
-    # Kernels that touch a buffer first take twice as long. Large images have many batches.
+    # A kernel takes twice as long if it is the first to touch a buffer, which matters less in large
+    # images, of many batches.
     method = replace(found.factorization, roots_at_once=_ROOTS, roots_prepared=8 * _ROOTS)
     found = replace(found, method=method)
     factorized = planned_image(device, lines, grid, found)
     resampling = interpolation.resampling(lines.length, found.factorization.final, model.spectrum)
     images = _Images(exact, points, factorized, lines, resampling)
     for image in images.timed:
-        image.run(device)  # the first run builds the kernels, and their times leave that out
+        image.run(device)  # builds the kernels, which their own times do not include
     return images, sum(image.seconds[0] for image in images.timed)
 
 
 def _seconds(act: Callable[[], object]) -> float:
-    """Return the time that something takes."""
+    """Return the time that a call takes."""
     start = time.perf_counter()
     act()
     return time.perf_counter() - start

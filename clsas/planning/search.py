@@ -1,8 +1,8 @@
-"""The fastest tree of subimages whose filters err by no more than allowed.
+"""Search for the fastest tree of subimages whose filters are accurate enough.
 
-For every root, number of stages and choice of filters, the fastest division down to the leaves is a
-shortest path over the sizes of subimages (dynamic programming). Roots are tried in the order of a
-lower bound of their time, until none of the others can be faster.
+For every size of roots, number of stages and choice of filters, the fastest division down to the
+leaves is a shortest path over the sizes of subimages (dynamic programming). Roots are tried in the
+order of a lower bound of their time, until none of the others can be faster.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from clsas.signal.interpolation import PHASES, upsampler
 from clsas.signal.spectrum import Spectrum
 
 OVERHANG = 1.5
-"""Factor of a filter's taps that extend past an aperture's ends after several stages: those of the
-stage before count half, where subimages are half as long."""
+"""Factor of the taps that extend past an aperture's ends in trees of several stages. The taps of
+the previous stage count half, because subimages are half as long."""
 MOST_STAGES = 5
-"""Most stages of a tree. More add errors without saving work."""
-# Share of the filters' error power that expanding a leaf may add. Half of it leaves some near grids
-# without a leaf, so that they are imaged exactly; twice gains 3 % of time.
+"""Largest number of stages of a tree. More stages add errors without saving work."""
+# Share of the filters' error power that the expansion of ranges in leaves may add. With half of it,
+# some grids close to the track have no leaf and are imaged exactly; with twice, times fall by 3 %.
 _LEAF_SHARE = 0.25
-_SPARE_SAMPLES = 16  # of a line, for filters and padding; twice moves times by 3 % at most
+_SPARE_SAMPLES = 16  # of a line, for filters and padding; twice changes times by 3 % at most
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Tree:
     dimensions: int = 1
 
     def filters(self, spectrum: Spectrum, filters_db: float) -> FilterRates | None:
-        """Return filters whose errors together are no more than `filters_db`; None without any."""
+        """Return filters whose errors add up to at most `filters_db`; None if there are none."""
         stages = len(self.sides)
         return choose(
             spectrum, self.align_taps, self.aperture_taps, stages, filters_db, self.dimensions
@@ -76,31 +76,33 @@ class Tree:
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """Choices of filters and numbers of stages, and the time that things take with each.
+    """Choices of filters and numbers of stages, and the times of operations with each.
 
     Attributes
     ----------
     choices : list of FilterRates, [options]
     stages : int64 [options]
-        Never increasing.
+        Numbers of stages, never increasing.
     density, ends : float64 [options, 1, 1]
-        Virtual channels per cycle, and those besides; see `AperturePhases.virtual_channels`.
+        Virtual channels per cycle of phase, and their number without any phase: see
+        `AperturePhases.virtual_channels`.
     channel_s : float64 [options, sizes]
-        Each channel of all subimages of a size, in stages after the first.
+        Time per channel of all subimages of a size, in stages after the first.
     subimages_s : float64 [sizes]
-        These subimages themselves.
+        Time of these subimages that does not depend on channels.
     leaves_s : float64 [options, sizes]
-        Each virtual channel of all leaves of a size; infinite where leaves may not have it.
+        Time per virtual channel of all leaves of a size; infinite if leaves cannot have this size.
     roots_s : float64 [options, sizes]
-        The first stage with roots of a size, and all that does not depend on the division.
+        Time of the first stage with roots of a size, and of all work that does not depend on the
+        division.
     leaf_beam_cycles : float64 [sizes]
         Phase cycles that the beam's weights add to those of a leaf.
     rows : float64 [options, 1]
-        Rows of virtual channels besides those for the phase across a sheet.
+        Rows of virtual channels of a sheet without any phase across it.
     leaf_beam_rows : float
         Phase cycles across a sheet that the beam's weights add to those of a leaf.
     row_lines_s : float64 [options, sizes]
-        Each virtual channel of a sheet, for all subimages of a size: see `adding_in_rows`.
+        Time per virtual channel of a sheet, for all subimages of a size: see `adding_in_rows`.
     """
 
     choices: list[FilterRates]
@@ -116,57 +118,121 @@ class Options:
     leaf_beam_rows: float
     row_lines_s: NDArray[np.float64]
 
-    def onward_s(
-        self, division: Division, some: NDArray[np.int64]
-    ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
-        """Least time from subimages of every size to their pixels, with some options [m].
+    def times(self, division: Division, some: NDArray[np.int64]) -> Times:
+        """Return the times of trees of some of the options, [m], in a root."""
+        if division.across is None:
+            return self._times_on_curve(division, some)
+        return self._times_on_sheet(division, division.across, some)
 
-        Returns
-        -------
-        list of float64 [m, n]
-            Seconds with 1, 2, ... stages left; the last is that of the roots.
-        float64 [m, n, n]
-            Seconds of a step to children of size i from parents of size j.
-        """
-        index = division.index
+    def _times_on_curve(self, division: Division, some: NDArray[np.int64]) -> Times:
+        """Return the times where virtual channels lie on a curve, or on strips."""
         density, ends = self.density[some], self.ends[some]
-        # A child uses those of its parent's channels whose beam touches it.
-        step_s = density * division.cycles
-        step_s += ends
-        rows = None
-        if division.across is not None:
-            rows = density[..., 0] * division.across + self.rows[some]
-            step_s *= rows[:, None]
-        step_s *= self.channel_s[some][:, index, None]
-        step_s += self.subimages_s[index, None]
-        step_s += division.divisible_s
-        leaf_cycles = np.diag(division.cycles) + self.leaf_beam_cycles[index]
-        of_leaf = density[..., 0] * leaf_cycles + ends[..., 0]
-        if rows is not None:
-            of_leaf = of_leaf * (rows + density[..., 0] * self.leaf_beam_rows)
-        onward_s = of_leaf * self.leaves_s[some][:, index]
-        formed_s = np.zeros(1)
-        if rows is not None:
-            columns = density[..., 0] * np.diag(division.cycles) + ends[..., 0]
-            formed_s = columns * rows * self.row_lines_s[some][:, index]
-            onward_s = onward_s + formed_s
-        by_stages = [onward_s]
-        for left in range(2, int(self.stages[some].max()) + 1):
-            more = int(np.count_nonzero(self.stages[some] >= left))
-            onward_s = onward_s.copy()
-            onward_s[:more] = (step_s[:more] + onward_s[:more, :, None]).min(axis=1)
-            if rows is not None:
-                onward_s[:more] += formed_s[:more]
-            by_stages.append(onward_s)
-        return by_stages, step_s
+        # A child uses the channels of its parent whose beam touches it.
+        used = density * division.cycles
+        used += ends
+        columns = density[..., 0] * self._leaf_cycles(division) + ends[..., 0]
+        return Times(
+            stages=self.stages[some],
+            step_s=self._step_s(division, some, used),
+            forming_s=np.zeros((len(some), 1)),
+            leaves_s=columns * self.leaves_s[some][:, division.index],
+        )
+
+    def _times_on_sheet(
+        self, division: Division, across: NDArray[np.float64], some: NDArray[np.int64]
+    ) -> Times:
+        """Return the times where virtual channels lie in columns and rows of a sheet."""
+        density, ends = self.density[some], self.ends[some]
+        rows = density[..., 0] * across + self.rows[some]
+        used = density * division.cycles
+        used += ends
+        used *= rows[:, None]
+        leaf_columns = density[..., 0] * self._leaf_cycles(division) + ends[..., 0]
+        leaf_rows = rows + density[..., 0] * self.leaf_beam_rows
+        columns = density[..., 0] * np.diag(division.cycles) + ends[..., 0]
+        forming_s = columns * rows * self.row_lines_s[some][:, division.index]
+        leaves_s = leaf_columns * leaf_rows * self.leaves_s[some][:, division.index]
+        return Times(
+            stages=self.stages[some],
+            step_s=self._step_s(division, some, used),
+            forming_s=forming_s,
+            leaves_s=leaves_s + forming_s,
+        )
+
+    def _leaf_cycles(self, division: Division) -> NDArray[np.float64]:
+        """Return the phase of leaves along the aperture, with that of the beam's weights."""
+        return np.diag(division.cycles) + self.leaf_beam_cycles[division.index]
+
+    def _step_s(
+        self, division: Division, some: NDArray[np.int64], used: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return `Times.step_s`, in place of the channels that children use, [m, n, n]."""
+        used *= self.channel_s[some][:, division.index, None]
+        used += self.subimages_s[division.index, None]
+        used += division.divisible_s
+        return used
 
     def path(self, division: Division, option: int, root: int) -> list[int]:
         """Return the sizes of the fastest tree from a root, as indices into `Sizes`."""
-        by_stages, step_s = self.onward_s(division, np.array([option]))
+        times = self.times(division, np.array([option]))
         path = [int(np.searchsorted(division.index, root))]
-        for onward_s in by_stages[-2::-1]:
-            path.append(int((step_s[0, :, path[-1]] + onward_s[0]).argmin()))
+        for onward_s in times.onward_s()[-2::-1]:
+            path.append(int((times.step_s[0, :, path[-1]] + onward_s[0]).argmin()))
         return [int(division.index[each]) for each in path]
+
+
+@dataclass(frozen=True, eq=False)
+class Times:
+    """Times of trees within a root of some options, [m], and subimages of some sizes, [n].
+
+    Attributes
+    ----------
+    stages : int64 [m]
+        Never increasing.
+    step_s : float64 [m, n, n]
+        Combining the channels of all parents of size j for their children of size i; infinite
+        where these do not divide those.
+    forming_s : float64 [m, n] or [m, 1]
+        Adding to the virtual channels of all subimages of a size row by row; 0 on a curve.
+    leaves_s : float64 [m, n]
+        `forming_s` and the backprojection of all leaves of a size; infinite where subimages of this
+        size cannot be leaves.
+    """
+
+    stages: NDArray[np.int64]
+    step_s: NDArray[np.float64]
+    forming_s: NDArray[np.float64]
+    leaves_s: NDArray[np.float64]
+
+    def onward_s(self) -> list[NDArray[np.float64]]:
+        """Return the least time from subimages of every size to their pixels, float64 [m, n] each.
+
+        The first array is for one stage left, in which the subimages are leaves; the last is for
+        the roots, with all the stages of each option.
+
+        Notes
+        -----
+        With n stages left, subimages of size j take at least ::
+
+            T_1(j) = forming_s(j) + backprojection(j) = leaves_s(j)
+            T_n(j) = forming_s(j) + min over i of [step_s(i, j) + T_(n-1)(i)],  n = 2, 3, ...
+
+        where i are the sizes into which they may divide (dynamic programming: Bellman, 1957). An
+        option of fewer than n stages keeps its last value.
+
+        References
+        ----------
+        R. Bellman, "Dynamic Programming", Princeton University Press, 1957.
+        """
+        onward_s = self.leaves_s
+        by_stages = [onward_s]
+        for left in range(2, int(self.stages.max()) + 1):
+            more = int(np.count_nonzero(self.stages >= left))
+            onward_s = onward_s.copy()
+            onward_s[:more] = (self.step_s[:more] + onward_s[:more, :, None]).min(axis=1)
+            onward_s[:more] += self.forming_s[:more]
+            by_stages.append(onward_s)
+        return by_stages
 
 
 def all_options(
@@ -177,7 +243,7 @@ def all_options(
     costs: Costs,
     allowed: Allowed,
 ) -> Options | None:
-    """Return all choices of filters that err by no more than `filters_db`; None without any."""
+    """Return all options whose filters are as accurate as `filters_db`; None if there are none."""
     model, counts, channels = sizes.model, sizes.counts, sizes.model.lines.channels
     choices, stages, dimensions = [], [], 1 + model.track.is_sheet
     aligned = aligned_spectrum(model)
@@ -208,7 +274,7 @@ def all_options(
     leaf = sizes.leaf_error <= _LEAF_SHARE * power(filters_db)
     leaf &= np.prod(sizes.sides, axis=1) >= leaf_pixels
     density = np.array([2 * choice.oversampling for choice in choices])
-    # Past the ends filters extend as if they had more taps, but in the first stage.
+    # In trees of several stages, filters extend past the ends as if they had more taps.
     further = np.where(np.array(stages) > 1, OVERHANG, 1.0)
     aperture_taps = further * [choice.aperture_taps for choice in choices]
     return Options(
@@ -239,18 +305,18 @@ def search(
     costs: Costs,
     allowed: Allowed,
 ) -> Tree | None:
-    """Return the fastest tree whose filters err by no more than `filters_db` together.
+    """Return the fastest tree whose filters are, together, as accurate as `filters_db`.
 
-    None where there is none with roots of `most` rows and columns and leaves of `leaf_pixels` at
-    least.
+    Return None if there is no such tree whose roots have at most `most` rows and columns, and whose
+    leaves have at least `leaf_pixels` pixels.
     """
     sizes = all_sizes(model, most, device)
     options = all_options(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed)
     if options is None or not sizes.pairs:
         return None
-    # The phase rate is lowest at a root's centre, so these are lower bounds.
+    # The phase rate is lowest at a root's centre, so that these are lower bounds.
     every = np.arange(len(options.choices))
-    bound_s = options.roots_s + options.onward_s(sizes.anywhere, every)[0][-1]
+    bound_s = options.roots_s + options.times(sizes.anywhere, every).onward_s()[-1]
     least_s = bound_s.min(axis=0)
     best_s, best = math.inf, (0, 0)
     for root in map(int, np.argsort(least_s, kind="stable")):
@@ -259,7 +325,8 @@ def search(
         division = sizes.in_root(root)
         some = np.flatnonzero(bound_s[:, root] < best_s)
         size = int(np.searchsorted(division.index, root))
-        cost_s = options.roots_s[some, root] + options.onward_s(division, some)[0][-1][:, size]
+        onward_s = options.times(division, some).onward_s()[-1][:, size]
+        cost_s = options.roots_s[some, root] + onward_s
         fastest = int(cost_s.argmin())
         if cost_s[fastest] < best_s:
             best_s, best = float(cost_s[fastest]), (int(some[fastest]), root)

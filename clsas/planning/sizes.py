@@ -1,4 +1,4 @@
-"""Sizes of subimages that the search chooses from, and the phases of each within each root."""
+"""Sizes of subimages that the search chooses from, and their phases within roots."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from clsas.planning.sample_points import mean_over_points
 from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
 
-_ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages, from whole work-items on
+_ROWS = (16, 32, 64, 128, 256, 512, 1024, 2048)  # of subimages, in whole work-items
 _COLUMNS = (4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)
-_MOST_OVERHANG = 1.1  # of roots that fit an image, over its rows or columns
+_MOST_OVERHANG = 1.1  # rows or columns of roots over those of the image that they fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,17 +35,17 @@ class Sizes:
     sides : int64 [sizes, 2]
         Rows and columns.
     counts : float64
-        Number that hold a pixel.
+        Number of subimages that contain a pixel.
     padded_pixels : float64
-        Mean pixel count, padded to whole work-items.
+        Mean pixel count of a subimage, padded to whole work-items.
     visible_share : float64
-        Mean fraction of the channels whose beam touches one.
+        Mean fraction of the channels whose beam touches a subimage.
     half_range_extent_m : float64
         Largest difference in range between a pixel and the centre.
     beam_cycles : float64
-        Phase cycles of a beam's weights along the visible aperture; see `beam_rate`.
+        Phase cycles that the beam's weights add along the visible aperture: see `beam_rate`.
     beam_cycles_across : float
-        The same across a sheet.
+        Phase cycles that they add across a sheet.
     leaf_error : float64
         Error power that expanding a leaf of this size adds.
     """
@@ -84,7 +84,7 @@ class Sizes:
         return self._in_roots[root]
 
     def _division(self, root: Side, index: NDArray[np.int64]) -> Division:
-        """Return some sizes with their phases in a root, whose rows are 0 for sample points."""
+        """Return sizes with their phases in a root; a root of 0 rows is a sample point."""
         if self.model.surface.is_plane:
             extents = self.sides[index].astype(np.float64)
         else:
@@ -101,18 +101,18 @@ class Sizes:
 
 @dataclass(frozen=True, eq=False)
 class Division:
-    """Sizes that subimages in a root may have.
+    """Sizes of the subimages into which a root may be divided, with their phases.
 
     Attributes
     ----------
     index : int64 [n]
-        Which of the `Sizes`.
+        Indices into `Sizes`.
     cycles : float64 [n, n]
-        Phase of a parent of size j, accumulated where a child of size i is visible.
+        Phase cycles of a parent of size j, accumulated where a child of size i is visible.
     divisible_s : float64 [n, n]
         0 where a parent of size j may divide into children of size i, else infinite.
     across : float64 [n] or None
-        Phase of subimages across a sheet; None without one.
+        Phase cycles of subimages across a sheet; None without a sheet.
     """
 
     index: NDArray[np.int64]
@@ -122,9 +122,10 @@ class Division:
 
 
 def _lengths(model: VisibilityModel) -> tuple[tuple[int, ...], ...]:
-    """Return rows and columns that subimages may have.
+    """Return the numbers of rows and columns that subimages may have.
 
-    Every channel of a dense aperture is aligned for every root, so there roots fit the image too.
+    Every channel of a dense aperture is aligned for every root. There, sizes include those whose
+    roots fit the image.
     """
     if not model.track.is_dense:
         return _ROWS, _COLUMNS
@@ -182,9 +183,9 @@ def largest_root(model: VisibilityModel) -> Side:
 
 
 def root_limits(model: VisibilityModel, allowed: float) -> Side | None:
-    """Return the largest rows and columns of roots that keep their errors within a power.
+    """Return the largest rows and columns of roots whose error power is within `allowed`.
 
-    None where there are none.
+    Return None if even the smallest roots exceed it.
     """
     rows, columns = largest_root(model)
     if root_error(model, (rows, columns)) <= allowed:

@@ -1,8 +1,8 @@
 """Error of virtual channels whose spacing changes, and of beam weights that change between them.
 
-The aperture's filter takes virtual channels as equally spaced and weights as constant. Here the
-steering functions of sampled pixels are interpolated between the virtual channels of a candidate,
-and compared with the exact ones.
+The filter along the aperture is designed for equally spaced virtual channels and constant weights.
+Here the steering functions of sampled pixels are interpolated between the virtual channels of a
+candidate and compared with the exact ones.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +17,10 @@ from scipy.sparse import csr_array
 
 from clsas.aperture.beam_directions import interpolated_directions
 from clsas.aperture.dense_channels import strip_channels
-from clsas.aperture.mean_track import MeanTrack
 from clsas.aperture.virtual_channels import VirtualChannels, interpolated_channels
 from clsas.core.decibels import power
 from clsas.core.wavelengths import wavelength_m
-from clsas.planning import phase_rates
+from clsas.planning.aperture_lines import Line, SampledLine, sampled_line, visible_channels
 from clsas.planning.caching import cached
 from clsas.planning.channels import carriers
 from clsas.planning.sample_pixels import SAMPLED_PIXELS, SPREAD_POINTS, mean_over_relief, pixels_m
@@ -30,13 +28,11 @@ from clsas.planning.subimages import Side
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator
 
-_Pixels = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
-
-_PLACES_OF_STRIP = 16  # more, for each strip after the first
 # Corners of roots in which subimages are sampled, by row and column of the sample points: at the
 # edges of the grid those that lie inside.
 _CORNERS = np.stack(np.meshgrid((1, -1, 1, 1, -1), (1, -1, -1, 1, -1), indexing="ij"), axis=-1)
-_SAMPLED_PLACES = 96  # along the visible aperture; half as many move the error by 3 dB at most
+_SAMPLED_CHANNELS = 96  # of the visible aperture; half as many move the error by 3 dB at most
+_CHANNELS_OF_STRIP = 16  # more of them, for each strip after the first
 
 
 @dataclass(frozen=True)
@@ -66,24 +62,29 @@ Stages = tuple[SpacedStage, ...]
 """A stage, the last, and those before it."""
 
 
+_TRACK = (Line("track"),)
+_ALONG = (Line("along", 0.5),)
+_ACROSS = (Line("across", 0.2), Line("across", 0.5))
+
+
 @cached
 def spacing_error(model: VisibilityModel, stages: Stages) -> float:
-    """Error power that uneven spacing adds to that of the aperture's filter, in the last stage.
+    """Return the error power that uneven spacing adds to that of the filter, in the last stage.
 
-    `model` is that within roots of the candidate's size.
+    `model` must have the root size of the candidate.
     """
 
     def excess(error: float) -> float:
         return max(error - power(stages[-1].aperture.error_db), 0.0)
 
-    return _over_places(model, stages, excess)
+    return _sum_over_dimensions(model, stages, excess)
 
 
 def filter_error(model: VisibilityModel, stages: Stages) -> float:
-    """Error power of the aperture's filter itself, in the last stage: see `spacing_error`.
+    """Return the error power of the filter along the aperture, in the last stage.
 
-    On a sheet virtual channels are as dense everywhere as the largest phase rate of any line along
-    it and across it asks for. Elsewhere the filter errs by less than at its worst.
+    On a sheet, virtual channels are everywhere as dense as the largest phase rate of any line along
+    it and across it requires. Where phases turn more slowly, the error is below the filter's worst.
     """
     worst = power(stages[-1].aperture.error_db)
     if not model.track.is_sheet:
@@ -92,162 +93,107 @@ def filter_error(model: VisibilityModel, stages: Stages) -> float:
     def least(error: float) -> float:
         return min(error, worst)
 
-    return _over_places(model, stages, least)
+    return _sum_over_dimensions(model, stages, least)
 
 
 def bias_error(model: VisibilityModel, stages: Stages) -> float:
-    """Error power by which biases of interpolations on a sheet add up beyond their own powers.
+    """Return the extra error power because filter biases on a sheet add coherently.
 
-    Filters of few taps attenuate steering functions by a mean that all interpolations, along and
-    across and in every stage, have in common. Their amplitudes add, not their powers.
+    Filters of few taps attenuate steering functions. The mean attenuation is common to all
+    interpolations, along and across and in every stage, so that its amplitudes add, not its powers.
     """
     if not model.track.is_sheet:
         return 0.0
     each_stage = [stages[: level + 1] for level in range(len(stages))]
-    biases = np.array([_bias(model, places, to) for to in each_stage for places in _DIMENSIONS])
+    biases = np.array([_bias(model, lines, to) for to in each_stage for lines in (_ALONG, _ACROSS)])
     return float(max(biases.sum() ** 2 - biases @ biases, 0.0))
 
 
-def _bias(model: VisibilityModel, places: tuple[_Place, ...], stages: Stages) -> float:
+def _bias(model: VisibilityModel, lines: tuple[Line, ...], stages: Stages) -> float:
+    """Return the mean relative error of amplitudes over some lines, in the last stage."""
     extents = tuple(model.surface.extents(stages[-1].side))
-    return float(np.mean([_interpolated(model, each, stages, extents).bias for each in places]))
+    errors = [_interpolation_error(model, each, stages, extents) for each in lines]
+    return float(np.mean([each.bias for each in errors]))
 
 
-def _over_places(model: VisibilityModel, stages: Stages, part: Callable[[float], float]) -> float:
+def _sum_over_dimensions(
+    model: VisibilityModel, stages: Stages, part: Callable[[float], float]
+) -> float:
     """Return a part of the error of interpolating along the track, or along and across a sheet."""
 
-    def error(place: _Place, extents: NDArray[np.float64]) -> float:
-        return part(_interpolated(model, place, stages, tuple(extents)).error)
+    def error(line: Line, extents: NDArray[np.float64]) -> float:
+        return part(_interpolation_error(model, line, stages, tuple(extents)).power)
 
-    def mean(places: tuple[_Place, ...]) -> float:
+    def mean(lines: tuple[Line, ...]) -> float:
         side = stages[-1].side
-        found = [mean_over_relief(model, side, functools.partial(error, each)) for each in places]
+        found = [mean_over_relief(model, side, functools.partial(error, each)) for each in lines]
         return sum(found) / len(found)
 
     if not model.track.is_sheet:
-        return mean((_TRACK,))
-    return sum(mean(places) for places in _DIMENSIONS)
+        return mean(_TRACK)
+    return sum(mean(lines) for lines in (_ALONG, _ACROSS))
 
 
-_Place = tuple[Literal["track", "along", "across"], float]
-"""A curve: the track, or a line along or across a sheet at some coordinate."""
-_TRACK: _Place = ("track", 0.0)
-_LINES_ALONG: tuple[_Place, ...] = (("along", 0.5),)
-_LINES_ACROSS: tuple[_Place, ...] = (("across", 0.2), ("across", 0.5))
-_DIMENSIONS = (_LINES_ALONG, _LINES_ACROSS)
-
-
-class _Interpolated(NamedTuple):
-    """Steering functions between virtual channels: their error power, and their mean error."""
-
-    error: float
-    bias: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Line:
-    """A curve along which steering functions are interpolated.
+@dataclass(frozen=True)
+class _InterpolationError:
+    """Error of steering functions that are interpolated between virtual channels.
 
     Attributes
     ----------
-    track : MeanTrack
-    rates : float64 [axes, points, samples]
-        See `clsas.planning.phase_rates`.
-    channels : float64 [channels]
-        Aperture coordinates of channels, ascending.
-    along : float64 [samples, 3] or None
-        Unit directions of the beam at `track.samples`.
-    beam_rates : float64 [points, samples]
-        The beam's: see there.
+    power : float
+        Relative error power.
+    bias : float
+        Mean error in the direction of the exact functions, over their power.
     """
 
-    track: MeanTrack
-    rates: NDArray[np.float64]
-    channels: NDArray[np.float64]
-    along: NDArray[np.float64] | None
-    beam_rates: Any
-
-    def past_ends(self, coordinate: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which aperture coordinates lie past the ends of the curve, or of their strip."""
-        strip = self.track.strip_of(self.channels)
-        first, last = (
-            np.searchsorted(strip, np.arange(self.track.strips), side) for side in ("left", "right")
-        )
-        of_strip = self.track.strip_of(coordinate)
-        past: NDArray[np.bool_] = coordinate < self.channels[first][of_strip]
-        return past | (coordinate > self.channels[last - 1][of_strip])
+    power: float
+    bias: float
 
 
 @cached
-def _line(model: VisibilityModel, place: _Place) -> _Line:
-    kind, at = place
-    directions = model.directions
-    if kind == "track":
-        channels = np.sort(model.track.coordinate)
-        return _Line(
-            model.track,
-            phase_rates.along(model),
-            channels,
-            model.along,
-            phase_rates.of_beam_along(model),
-        )
-    evenly = np.linspace(0, 1, 4 * _SAMPLED_PLACES)
-    if kind == "along":
-        line = model.track.line_along(at)
-        places = line.samples, np.full(line.samples.shape, at)
-        rates, beam_rates = phase_rates.along(model), phase_rates.of_beam_along(model)
-    else:
-        line = model.track.line_across(at)
-        places = np.full(line.samples.shape, at), line.samples
-        rates = phase_rates.across(model)
-        beam_rates = 0.0 if directions is None else phase_rates.of_beam_across(model)
-    along = None if directions is None else directions.at(*places)
-    return _Line(line, rates, evenly, along, beam_rates)
+def _interpolation_error(
+    model: VisibilityModel, line_at: Line, stages: Stages, extents: tuple[float, ...]
+) -> _InterpolationError:
+    """Return the error of steering functions in the last stage's subimages of some extents.
 
-
-@cached
-def _interpolated(
-    model: VisibilityModel, line_at: _Place, stages: Stages, extents: tuple[float, ...]
-) -> _Interpolated:
-    """Errors of interpolated steering functions of the last stage's subimages of some extents.
-
-    The error is 1, as large as the image, if no beam touches a subimage.
+    It is 1, as large as the image, if no beam touches a subimage.
     """
     weighted = model.beam is not None and stages[-1].beam_cycles is not None
-    line = _line(model, line_at)
+    line = sampled_line(model, line_at)
     samples = _samples(model, line_at, stages[-1].side, weighted, extents)
     if samples is None:
-        return _Interpolated(1.0, 0.0)
-    at = _with_ends(model, line, samples, stages[:-1])
-    nodes = _virtual_channels(line, samples.points, stages[-1], extents, at.coordinate)
-    of_nodes = _steering(model, line, samples.pixels, weighted, nodes.coordinate)
+        return _InterpolationError(power=1.0, bias=0.0)
+    sources = _with_ends(model, line, samples, stages[:-1])
+    virtual = _virtual_channels(line, samples.points, stages[-1], extents, sources.coordinate)
+    steering = _steering(model, line, samples.pixels, weighted, virtual.coordinate)
+    steering = steering.reshape(-1, steering.shape[-1])
     # One sparse matrix interpolates at all aperture coordinates of all subimages.
-    index = nodes.contributed
-    weights = nodes.weights.astype(np.float32).ravel()
-    rows = np.arange(0, weights.size + 1, nodes.taps)
-    of_nodes = of_nodes.reshape(-1, of_nodes.shape[-1])
-    interpolate = csr_array((weights, index.ravel(), rows), shape=(len(rows) - 1, len(of_nodes)))
+    weights = virtual.weights.astype(np.float32).ravel()
+    rows = np.arange(0, weights.size + 1, virtual.taps)
+    interpolate = csr_array(
+        (weights, virtual.contributed.ravel(), rows), shape=(len(rows) - 1, len(steering))
+    )
     exact = samples.exact
     if len(stages) > 1:
-        exact = _steering(model, line, samples.pixels, weighted, at.coordinate)
-    wrong = (interpolate @ of_nodes).reshape(exact.shape) - exact
+        exact = _steering(model, line, samples.pixels, weighted, sources.coordinate)
+    wrong = (interpolate @ steering).reshape(exact.shape) - exact
     error, bias = (
-        samples.count @ np.einsum("ns,nsp,nsp->n", at.share, *each, dtype=np.float64)
+        samples.count @ np.einsum("ns,nsp,nsp->n", sources.share, *each, dtype=np.float64)
         for each in ((wrong, wrong), (wrong, exact))
     )
     total = samples.count @ np.einsum("nsp,nsp->n", samples.exact, samples.exact, dtype=np.float64)
     total = max(total, 1e-30)
-    return _Interpolated(float(error / total), float(bias / total))
+    return _InterpolationError(power=float(error / total), bias=float(bias / total))
 
 
 def _virtual_channels(
-    line: _Line,
+    line: SampledLine,
     points: NDArray[np.int64],
     stage: SpacedStage,
     extents: Sequence[float],
     coordinate: NDArray[np.float64],
 ) -> VirtualChannels:
-    """Return a stage's virtual channels for channels at aperture coordinates, [n, places]."""
+    """Return a stage's virtual channels for channels at aperture coordinates, [n, channels]."""
     rates = stage.oversampling * np.tensordot(extents, line.rates[:, points], 1)
     if stage.beam_cycles:
         rates = rates + stage.beam_cycles * line.beam_rates[points]
@@ -256,8 +202,8 @@ def _virtual_channels(
 
 
 @dataclass(frozen=True, eq=False)
-class _Places:
-    """Places along the aperture from which a stage interpolates, [n, places] each.
+class _Sources:
+    """Channels, or virtual channels, that a stage interpolates for, [n, channels] each.
 
     Attributes
     ----------
@@ -271,44 +217,66 @@ class _Places:
     share: NDArray[np.float64]
 
 
-def _with_ends(model: VisibilityModel, line: _Line, samples: _Samples, before: Stages) -> _Places:
-    """Return sampled channels, and the virtual channels past the aperture's ends of stages before.
+def _with_ends(
+    model: VisibilityModel, line: SampledLine, samples: _Samples, before: Stages
+) -> _Sources:
+    """Return sampled channels, with the earlier stages' virtual channels past the aperture's ends.
 
-    Filters extend past the ends, farther with every stage. What virtual channels hold there must be
-    interpolated too, though it may lie where phases turn faster than they do on the track.
+    Filters extend past the ends, farther with every stage. The power of virtual channels there must
+    be interpolated too, although phases may turn faster there than on the track.
     """
     of_channels = samples.coordinate
-    at = _Places(of_channels, np.ones(of_channels.shape))
+    sources = _Sources(of_channels, np.ones(of_channels.shape))
     for stage in before:
-        extents = model.extents(stage.side)
-        nodes = _virtual_channels(line, samples.points, stage, tuple(extents), at.coordinate)
-        share = at.share[..., None] * nodes.weights**2
-        held = np.bincount(nodes.contributed.ravel(), share.ravel(), nodes.coordinate.size)
-        held = held.reshape(nodes.coordinate.shape) * line.past_ends(nodes.coordinate)
-        some = held.any(axis=0)
-        coordinate = np.concatenate([of_channels, nodes.coordinate[:, some]], axis=1)
-        share = np.concatenate([np.ones(of_channels.shape), held[:, some]], axis=1)
+        extents = tuple(model.extents(stage.side))
+        virtual = _virtual_channels(line, samples.points, stage, extents, sources.coordinate)
+        share = sources.share[..., None] * virtual.weights**2
+        size = virtual.coordinate.size
+        power_past = np.bincount(virtual.contributed.ravel(), share.ravel(), size)
+        power_past = power_past.reshape(virtual.coordinate.shape)
+        power_past = power_past * line.past_ends(virtual.coordinate)
+        some = power_past.any(axis=0)
+        coordinate = np.concatenate([of_channels, virtual.coordinate[:, some]], axis=1)
+        share = np.concatenate([np.ones(of_channels.shape), power_past[:, some]], axis=1)
         order = np.argsort(coordinate, axis=1, kind="stable")
-        at = _Places(*(np.take_along_axis(each, order, axis=1) for each in (coordinate, share)))
-    return at
+        sources = _Sources(*(np.take_along_axis(each, order, 1) for each in (coordinate, share)))
+    return sources
+
+
+@dataclass(frozen=True, eq=False)
+class _Pixels:
+    """Sampled pixels of n subimages.
+
+    Attributes
+    ----------
+    centres_m : float64 [n, 3]
+        Centres of the subimages.
+    offsets_m : float64 [n, pixels + 1, 3]
+        From these the reference point, and then the pixels.
+    cycles_per_m : float64 [n, pixels]
+        Phase per metre of range of each pixel.
+    """
+
+    centres_m: NDArray[np.float64]
+    offsets_m: NDArray[np.float64]
+    cycles_per_m: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Sampled subimages of a size, and the steering functions of sampled pixels in them.
+    """Sampled subimages of a size, with the steering functions of sampled pixels in them.
 
     Attributes
     ----------
     points : int64 [n]
-        The sample points that they lie at.
+        Sample points at which they lie.
     count : int64 [n]
         Number of channels whose beam touches each.
-    coordinate : float64 [n, places]
-        Aperture coordinates, ascending, distributed as those of the channels.
-    pixels : (centres_m, offsets_m, cycles_per_m)
-        See `_steering`.
-    exact : float32 [n, places, 2 pixels]
-        The steering functions.
+    coordinate : float64 [n, channels]
+        Aperture coordinates of sampled channels, ascending.
+    pixels : _Pixels
+    exact : float32 [n, channels, 2 pixels]
+        The steering functions: see `_steering`.
     """
 
     points: NDArray[np.int64]
@@ -321,18 +289,18 @@ class _Samples:
 @cached
 def _samples(
     model: VisibilityModel,
-    line_at: _Place,
+    line_at: Line,
     side: Side,
     weighted: bool,
     extents: tuple[float, ...],
 ) -> _Samples | None:
     """Return the samples for subimages of a size, None if no beam touches any."""
-    line = _line(model, line_at)
-    channels, first, count = _visible_channels(model, line, side)
+    line = sampled_line(model, line_at)
+    channels, first, count = visible_channels(model, line, side)
     if not count.any():
         return None
     points = np.flatnonzero(count)
-    # A step of the beam's weights crosses only some points: these may not be left out.
+    # A step of the beam's weights crosses only some points, which must all be kept.
     steps = weighted and model.beam is not None and model.beam.jumps
     if not steps and np.isin(points, SPREAD_POINTS).any():
         points = np.intersect1d(points, SPREAD_POINTS)
@@ -341,27 +309,28 @@ def _samples(
     number = np.linspace(
         first - 1,
         first + count,
-        _SAMPLED_PLACES + _PLACES_OF_STRIP * len(line.track.others),
+        _SAMPLED_CHANNELS + _CHANNELS_OF_STRIP * len(line.track.others),
         axis=1,
     )
     number = np.clip(number, 0, len(channels) - 1)
     if line.track.others:  # there is nothing between two strips
         number = np.rint(number)
-    place = np.interp(number, np.arange(len(channels)), channels)
+    coordinate = np.interp(number, np.arange(len(channels)), channels)
     cycles_per_m = carriers(model, SAMPLED_PIXELS)
     found = [pixels_m(model, np.array(extents), point) for point in points.tolist()]
     offsets_m = np.stack([each_m for each_m, _ in found])
     chosen = np.stack([cycles_per_m[(share * SAMPLED_PIXELS).astype(int)] for _, share in found])
     centres_m = model.points_m[points] + _within_roots_m(model, extents)[points]
-    pixels = centres_m, offsets_m, chosen
-    return _Samples(points, count, place, pixels, _steering(model, line, pixels, weighted, place))
+    pixels = _Pixels(centres_m, offsets_m, chosen)
+    exact = _steering(model, line, pixels, weighted, coordinate)
+    return _Samples(points, count, coordinate, pixels, exact)
 
 
 def _within_roots_m(model: VisibilityModel, extents: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return where in roots about the sample points subimages are sampled, [points, 3].
+    """Return the offsets of sampled subimages from the sample points, in roots there, [points, 3].
 
-    Phases turn fastest in a corner, for which the spacing is made. Where a beam selects channels
-    they are those of the sample point itself.
+    Virtual channels are spaced for the corner of a root, where phases turn fastest, and errors are
+    sampled there. Where a beam selects channels, they are those of the sample point itself.
     """
     if model.root is None or not (model.limits is None or model.track.is_dense):
         return np.zeros((len(model.points_m), 3))
@@ -369,51 +338,21 @@ def _within_roots_m(model: VisibilityModel, extents: tuple[float, ...]) -> NDArr
     return (_CORNERS.reshape(-1, 2) * spare / 2) @ model.surface.steps_m[:2]
 
 
-def _visible_channels(
-    model: VisibilityModel, line: _Line, side: Side
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return which channels' beams touch subimages of a size at the sample points.
-
-    The channels' aperture coordinates, ascending; then for each point the first channel, and the
-    number of channels, 0 where the track has a gap. The edges of visibility lie between samples of
-    the track, so the range is one sample wider on either side.
-    """
-    places, samples = line.channels, model.track.samples
-    if model.track.is_sheet:
-        none = np.zeros(len(model.points_m), np.int64)
-        return places, none, none + len(places)
-    visible = model.visible(side)
-    begin = samples[np.maximum(visible.argmax(axis=1) - 1, 0)]
-    last = visible.shape[1] - visible[:, ::-1].argmax(axis=1)
-    end = samples[np.minimum(last, len(samples) - 1)]
-    end[~visible.any(axis=1)] = -np.inf
-    first = np.searchsorted(places, begin)
-    return places, first, np.maximum(np.searchsorted(places, end, "right") - first, 0)
-
-
 def _steering(
     model: VisibilityModel,
-    line: _Line,
+    line: SampledLine,
     pixels: _Pixels,
     weighted: bool,
     at: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return steering functions at aperture coordinates, float32 [n, places, 2 pixels].
+    """Return steering functions at aperture coordinates `at`, float32 [n, channels, 2 pixels].
 
-    The real parts of all pixels come first, then the imaginary ones.
-
-    Parameters
-    ----------
-    pixels : (centres_m, offsets_m, cycles_per_m)
-        Centres of subimages, float64 [n, 3]; from these the reference point and then the pixels,
-        [n, pixels + 1, 3]; phase per metre of range of each pixel, [n, pixels].
-    weighted : bool
-        Multiply by the beam's weights.
-    at : float64 [n, places]
+    The real parts of all pixels come first, then the imaginary ones. If `weighted`, they are
+    multiplied by the beam's weights.
     """
-    centres_m, offsets_m, cycles_per_m = pixels
-    sight = centres_m[:, None] - line.track.positions_m(at)
-    offsets_m = offsets_m.swapaxes(1, 2)
+    cycles_per_m = pixels.cycles_per_m
+    sight = pixels.centres_m[:, None] - line.track.positions_m(at)
+    offsets_m = pixels.offsets_m.swapaxes(1, 2)
     square = np.einsum("nsi,nsi->ns", sight, sight)[..., None] + 2 * sight @ offsets_m
     square += np.einsum("nip,nip->np", offsets_m, offsets_m)[:, None]
     range_m = np.sqrt(np.maximum(square, 1e-18))

@@ -1,9 +1,10 @@
 """Stretch of lines: how much faster ranges grow for the channels than for the mean track.
 
 Where transmitter and receiver lie apart, or receivers move, the range of a channel grows along the
-line of sight by another factor than the range from the mean track. The mean of that factor is a
-constant of the image. The first stage makes up for deviations from it by turning the phase along
-each line. That shifts the band of the line, so later range filters must pass a wider band.
+line of sight by a slightly different factor than the range from the mean track. The mean of this
+factor is a constant of the image. The first stage corrects deviations from it by turning the phase
+along each line. This shifts the band of the line, so that later range filters must pass a wider
+band.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from numpy.typing import NDArray
 from clsas.aperture.filters import Gain
 from clsas.aperture.phase_rates import drift, stretches
 from clsas.core.wavelengths import cycles_per_m_at
-from clsas.planning.channels import SampledChannels, sampled_channels
+from clsas.planning.channels import sampled_channels
 from clsas.planning.subimages import SMALL
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal.interpolation import Interpolator
 from clsas.signal.spectrum import Spectrum, shares_of_bins
 
-_LEAST_BINS = 1 / 32  # of the lines' spectrum; arbitrary: so small a shift widens no band
-_MOST_CYCLES = 8.0  # per sample, far beyond what any filter passes
+_LEAST_BINS = 1 / 32  # of the lines' spectrum; a plain choice: smaller shifts widen no band
+_MOST_CYCLES = 8.0  # per sample; far outside the pass band of any filter
 _BOUNDS = -0.5, 1.0  # of the mean stretch
 
 
@@ -45,15 +46,14 @@ class Stretch:
 
 
 def stretch_of(model: VisibilityModel) -> Stretch:
-    """Return the stretch of lines as seen from the sample points, whatever the roots."""
-    found: Stretch = model.from_cache(("stretch", model.limits), lambda: _stretch_of(model))
-    return found
+    """Return the stretch of lines as seen from the sample points. It does not depend on roots."""
+    return model.from_cache(("stretch", model.limits), lambda: _stretch_of(model))
 
 
 def _stretch_of(model: VisibilityModel) -> Stretch:
-    channels: SampledChannels = sampled_channels(replace(model, root=None), SMALL)
+    channels = sampled_channels(replace(model, root=None), SMALL)
     power = float(channels.weight.sum())
-    if not power:  # no channel's beam touches the grid, or those are silent
+    if not power:  # no channel's beam touches the grid, or these channels are silent
         return Stretch()
     centres_m = model.points_m[channels.points]
     virtual_m = channels.virtual_m(centres_m)
@@ -83,9 +83,9 @@ def uncompensated(
     ratio: float,
     gain: Gain,
 ) -> float:
-    """Return the error power of a gain that is made for lines whose band is not shifted.
+    """Return the error power of a gain that is designed for lines whose band is not shifted.
 
-    The gain makes up for the mean response of all range filters; of these only the first comes
+    The gain corrects the mean response of all range filters. Only the first of them is applied
     before the shift.
 
     Parameters
@@ -96,7 +96,7 @@ def uncompensated(
     ratio : float
         Upsampled samples per sample.
     gain : callable
-        As of `clsas.aperture.filters.edges_gain`.
+        Result of `clsas.aperture.filters.edges_gain`.
     """
     shares, spectrum = stretch_of(model).shares, model.spectrum
     if shares is None:

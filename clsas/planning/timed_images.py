@@ -1,4 +1,4 @@
-"""Images that are timed to learn what work costs on a device."""
+"""Images that are timed to measure the costs of work on a device."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ from clsas.sonar.beam import BeamWindow
 
 _SOUND_M_S = 1500.0
 _CARRIER_HZ, _SAMPLE_RATE_HZ, _BAND = 120e3, 37.5e3, 0.8
-"""Carrier, sample rate, and the share of it that the lines' band fills."""
+"""Carrier, sample rate, and the share of the sampled band that the lines fill."""
 _NEAREST_M, _TRACK_M, _PIXEL_M = 40.0, 20.0, 0.02
-_MARGIN_M = 1.0  # of ranges, to either side
-_RELIEF_M = 0.5  # of dunes as long as a quarter of the grid: no accuracy lets it be left out
-_REPEATED = 0.1  # relative difference of times that are the same
+_MARGIN_M = 1.0  # of range, on either side of the grid
+_RELIEF_M = 0.5  # of dunes as long as a quarter of the grid; too large for any plan to leave out
+_REPEATED = 0.1  # largest relative difference of times that count as equal
 EXACT_DB = -50.0
 """Accuracy of the exact images."""
 
 
 @dataclass(frozen=True, eq=False)
 class TimedImage:
-    """An image that is timed: how to form it, its predicted work, and its times.
+    """An image to be timed, with its prediction and its times.
 
     Attributes
     ----------
     form : callable
         Forms the image.
     expected : Plan or Exact
-        The image as it is predicted.
+        Prediction of the image.
     tiled : bool
         True if pixels lie in tiles of a plane.
     seconds : list of float
-        Time of every run.
+        Times of the runs.
     kernels : list of dict
-        Time of every kernel, run by run.
+        Times of the kernels by name, run by run.
     """
 
     form: Callable[[], object]
@@ -58,7 +58,7 @@ class TimedImage:
     kernels: list[dict[str, float]] = field(default_factory=list)
 
     def run(self, device: Device) -> None:
-        """Form the image once more; time the whole and every kernel."""
+        """Form the image once more, and record the times of the run and of its kernels."""
         with device.profile() as times:
             start = time.perf_counter()
             self.form()
@@ -81,7 +81,7 @@ class TimedImage:
 
     @property
     def elsewhere(self) -> float:
-        """Least time without the kernels of stages and pixels, seconds: mostly the host's."""
+        """Least time outside the kernels of stages and pixels, seconds: mostly the host's."""
         return max(min(self.seconds) - self.in_stages - self.in_pixels, 1e-6)
 
     @property
@@ -92,27 +92,27 @@ class TimedImage:
 
     @property
     def scatter(self) -> float:
-        """Repeatability: log ratio of the best times of even and odd runs."""
+        """Log ratio of the best times of even and odd runs."""
         return math.log(min(self.seconds[::2]) / min(self.seconds[1::2]))
 
     @property
     def repeats(self) -> bool:
-        """True if the kernels together take the same time in the two shortest of several runs."""
+        """True if the kernels take the same time, in all, in the two shortest of several runs."""
         shortest_s, next_s = sorted(sum(each.values()) for each in self.kernels)[:2]
         return next_s < (1 + _REPEATED) * shortest_s
 
     @property
     def is_weighted(self) -> bool:
-        """True for an exact image that a beam weighs."""
+        """True for an exact image with a beam."""
         return isinstance(self.expected, Exact) and self.expected.weighted
 
     def work(self, names: Sequence[str]) -> list[float]:
-        """Return the amounts of work that some costs are for."""
+        """Return the amounts of work to which costs of some names apply."""
         work: Work = self.expected.work
         return [float(getattr(work, name.removesuffix("_ns"))) for name in names]
 
     def predicted_s(self, costs: Costs, names: Sequence[str]) -> float:
-        """Return the time that some costs predict for their work, seconds."""
+        """Return the time that costs of some names predict, seconds."""
         amounts = zip(names, self.work(names), strict=True)
         return 1e-9 * sum(getattr(costs, name) * amount for name, amount in amounts)
 
@@ -126,8 +126,8 @@ def square(pixels: int) -> Grid:
 def scene(channels: int, pixels: int) -> tuple[RangeLines, Grid]:
     """Return lines of noise from a straight track, and a square grid beside it.
 
-    Times do not depend on samples, and noise takes a hundredth of the time of a simulation. It
-    fades towards the ends of the lines.
+    Times do not depend on samples, and noise takes a hundredth of the time of a simulation. The
+    noise fades towards the ends of the lines.
     """
     random = np.random.default_rng(0)
     half_m = _PIXEL_M * pixels / 2
@@ -152,7 +152,7 @@ def scene(channels: int, pixels: int) -> tuple[RangeLines, Grid]:
 
 
 def with_relief(grid: Grid) -> Grid:
-    """Return a plane raised by dunes: its pixels are grouped, and not laid out in tiles."""
+    """Return a plane raised by dunes, whose pixels form groups instead of tiles."""
     rows, columns = (np.sin(np.linspace(0, 8 * np.pi, count)) for count in grid.shape)
     return grid.with_height(_RELIEF_M / 2 * rows[:, None] * columns)
 
@@ -160,14 +160,14 @@ def with_relief(grid: Grid) -> Grid:
 def exact_image(
     device: Device, lines: RangeLines, grid: Grid, beam: BeamWindow | None = None
 ) -> TimedImage:
-    """Return an exact image, to be timed."""
+    """Return an exact image to be timed."""
     expected = expect(VisibilityModel.of(lines, grid, beam), EXACT_DB, device)
     form = partial(form_exactly, lines, grid, device=device, accuracy_db=EXACT_DB, beam=beam)
     return TimedImage(form, expected, expected.tiled)
 
 
 def planned_image(device: Device, lines: RangeLines, grid: Grid, chosen: Plan) -> TimedImage:
-    """Return an image by a plan, to be timed as its first: nothing is kept from run to run."""
+    """Return an image by a plan to be timed as a first one: nothing is kept from run to run."""
     return TimedImage(
         lambda: former(lines, grid, chosen, device).form(lines), chosen, grid.is_planar
     )

@@ -1,11 +1,11 @@
-"""Geometry between track and grid, sampled: the cost and error models are evaluated on it."""
+"""Sampled geometry between track and grid, on which costs and errors are evaluated."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,45 +31,31 @@ from clsas.signal.spectrum import Spectrum, line_energy, measure_spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility
 
-_DENSE = 65  # points along either side, for the least distance of the grid; half: 0.05 dB
-_NEAREST_CHANNELS = 4096  # of a dense aperture, for that distance
+_DENSE = 65  # points along either side, for the least distance; half moves errors by 0.05 dB
+_NEAREST_CHANNELS = 4096  # of a dense aperture, for the least distance
 _MOST_OUTSIDE = 1e-6  # share of power above the highest frequency; half or twice: no change
-_AMBIGUITY = "ambiguity"  # key of what mean tracks of all shapes have in common
+_AMBIGUITY = "ambiguity"  # key of the cached value that does not depend on the mean track
+
+
+_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True, eq=False)
-class VisibilityModel:
-    """Geometry between track and grid, sampled at 25 grid points: what a beam touches.
-
-    Errors and costs of candidates are evaluated on these samples.
+class LinesModel:
+    """Lines, grid and beam of an image, with the properties of the lines that planning needs.
 
     Attributes
     ----------
     lines, grid, beam
         What is imaged.
     spectrum : Spectrum
-        Of the lines, with the weight that frequencies have in the image.
+        Spectrum of the lines, with the weight that frequencies have in the image.
     channel_power : float64 [channels]
         Energy of each line over the mean of all.
     highest_cycles_per_m, rms_cycles_per_m : float
         Phase per metre of range, cycles: at the band's edge, and rms about the band's centre.
     channels_along : float64 [channels, 3] or None
-        Unit directions of the track at the channels, with a beam.
-    limits : (low, high) or None
-        Sines of the aspect angle between which channels are used for a subimage.
-    shape : str
-        Shape of the mean track: see `clsas.aperture.dense_tracks`.
-    track : MeanTrack or None
-        None if all channels lie at one place. There is nothing of the following then.
-    subimages : Subimages
-        Of every size, on the grid's surface.
-    points_m : float64 [points, 3]
-        Sample points all over the grid, also near its corners.
-    nearest_m : float
-        Lower bound of the distance between pixels and channels.
-    root : (rows, columns) or None
-        Size of the roots in which reliefs and phase rates are the largest; None for the subimages
-        and the sample points alone.
+        Unit directions of the track at the channels; None without a beam.
     """
 
     lines: RangeLines
@@ -79,15 +65,57 @@ class VisibilityModel:
     channel_power: NDArray[np.float64]
     highest_cycles_per_m: float
     rms_cycles_per_m: float
-    channels_along: Any
+    channels_along: NDArray[np.float64] | None
+    _cache: dict[Hashable, Any] = field(default_factory=dict, kw_only=True)
+
+    def from_cache(self, key: Hashable, find: Callable[[], _Value]) -> _Value:
+        """Return the value cached under a key; `find` computes it the first time."""
+        if key not in self._cache:
+            self._cache[key] = find()
+        value: _Value = self._cache[key]
+        return value
+
+    @property
+    def ambiguity(self) -> Ambiguity:
+        """Errors that the lines themselves cause, whatever the method."""
+        given = self.lines, self.grid, self.spectrum, self.channel_power
+        beam = self.beam, self.channels_along
+        return self.from_cache(_AMBIGUITY, lambda: ambiguity(*given, *beam))
+
+
+@dataclass(frozen=True, eq=False)
+class VisibilityModel(LinesModel):
+    """Geometry between mean track and grid, sampled at 25 grid points: what a beam touches.
+
+    Errors and costs of candidates are evaluated on these samples. There is such a model only if
+    channels lie at more than one place.
+
+    Attributes
+    ----------
+    limits : (low, high) or None
+        Sines of the aspect angle between which channels are used for a subimage; None without a
+        beam.
+    shape : str
+        Shape of the mean track: see `clsas.aperture.dense_tracks`.
+    track : MeanTrack
+    subimages : Subimages
+        Subimages of every size, on the grid's surface.
+    points_m : float64 [points, 3]
+        Sample points all over the grid, also near its corners.
+    nearest_m : float
+        Lower bound of the distance between pixels and channels.
+    root : (rows, columns) or None
+        Size of the roots in which reliefs and phase rates are the largest; None for the subimages
+        and the sample points alone.
+    """
+
     limits: tuple[float, float] | None
     shape: Shape
-    track: Any
-    subimages: Any = None
-    points_m: Any = None
-    nearest_m: float = 0.0
+    track: MeanTrack
+    subimages: Subimages
+    points_m: NDArray[np.float64]
+    nearest_m: float
     root: Side | None = None
-    _cache: dict[Hashable, Any] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -97,47 +125,17 @@ class VisibilityModel:
         beam: BeamWindow | None,
         outside: float = _MOST_OUTSIDE,
     ) -> VisibilityModel:
-        """Return the model with the simplest mean track.
+        """Return the model with the simplest mean track: see `model_of`.
 
-        `outside` is the share of the lines' power that may lie above `highest_cycles_per_m`.
+        Raises
+        ------
+        ValueError
+            If all channels lie at one place.
         """
-        energy = line_energy(lines.samples)
-        spectrum = measure_spectrum(lines, grid, energy)
-        occupied = spectrum.frequency[np.cumsum(spectrum.share) < 1 - min(outside, _MOST_OUTSIDE)]
-        half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
-        centre = cycles_per_m_at(lines, spectrum.centre)
-        mean_square = spectrum.share @ spectrum.frequency**2
-        shape, track = simplest_track(lines, band_wavelength_m(lines, spectrum.centre))
-        model = cls(
-            lines,
-            grid,
-            beam,
-            spectrum,
-            highest_cycles_per_m=float(abs(centre) + half_band),
-            rms_cycles_per_m=float(np.sqrt(mean_square)) / lines.range_step_m,
-            channels_along=None if beam is None else beam.directions(lines),
-            limits=None if beam is None else beam.limits,
-            shape=shape,
-            track=track,
-            channel_power=energy / max(float(energy.mean()), 1e-300)
-            if energy.any()
-            else 1 + energy,
-        )
-        if track is None:  # nothing is sampled, so that an image of one channel costs no more
-            return model
-        surface = surface_of(grid)
-        return replace(
-            model,
-            subimages=Subimages(surface),
-            points_m=sample_points_m(surface),
-            nearest_m=_nearest_m(lines, surface, track),
-        )
-
-    def from_cache(self, key: Hashable, find: Callable[[], Any]) -> Any:
-        """Return the value cached under a key; `find` computes it the first time."""
-        if key not in self._cache:
-            self._cache[key] = find()
-        return self._cache[key]
+        model = model_of(lines, grid, beam, outside)
+        if not isinstance(model, cls):
+            raise ValueError("lines must have channels at more than one place")
+        return model
 
     def with_shape(self, shape: Shape) -> VisibilityModel | None:
         """Return this model with a mean track of another shape; None if channels have none."""
@@ -155,22 +153,13 @@ class VisibilityModel:
         return replace(self, limits=(low, high))
 
     def within(self, root: Side) -> VisibilityModel:
-        """Return this model with the phase rates of subimages in roots of a size."""
+        """Return this model with the largest phase rates in roots of a size."""
         return replace(self, root=root)
-
-    @property
-    def ambiguity(self) -> Ambiguity:
-        """Errors that the lines themselves leave open."""
-        given = self.lines, self.grid, self.spectrum, self.channel_power
-        beam = self.beam, self.channels_along
-        found: Ambiguity = self.from_cache(_AMBIGUITY, lambda: ambiguity(*given, *beam))
-        return found
 
     @property
     def surface(self) -> Surface:
         """Positions of the grid's pixels."""
-        found: Surface = self.subimages.surface
-        return found
+        return self.subimages.surface
 
     @property
     @shared
@@ -187,7 +176,7 @@ class VisibilityModel:
     @property
     @shared
     def spacing(self) -> NDArray[np.float64]:
-        """Weight of each sample in integrals over the track's parameter."""
+        """Weight of each sample in integrals over the aperture coordinate."""
         return trapezoidal_weights(self.track.samples)
 
     @property
@@ -206,29 +195,28 @@ class VisibilityModel:
     @shared
     def directions(self) -> BeamDirections | None:
         """Unit directions of the beam anywhere on the track; None without a beam."""
-        if self.beam is None:
+        if self.beam is None or self.channels_along is None:
             return None
         return directions_of(self.beam, self.channels_along, self.track)
 
     @property
     @shared
     def along(self) -> NDArray[np.float64] | None:
-        """Those at `track.samples`, [samples, 3]."""
+        """Unit directions of the beam at `track.samples`, [samples, 3]; None without a beam."""
         return None if self.directions is None else self.directions.at(self.track.samples)
 
     @property
     def small(self) -> Side:
-        """Rows and columns of subimages that stand for a pixel; they divide the model's roots."""
+        """Rows and columns of subimages that represent a pixel; they divide the model's roots."""
         rows, columns = self.root or SMALL
         return math.gcd(rows, SMALL[0]), math.gcd(columns, SMALL[1])
 
     def extents(self, side: Side, *, most: bool = False) -> NDArray[np.float64]:
-        """Return the extents of subimages of a size in roots of the model's: see `Subimages`.
+        """Return the extents of subimages of a size in roots: see `Subimages.extents`.
 
-        Without a size of roots every subimage is one.
+        If the model has no root size, every subimage is a root.
         """
-        found: NDArray[np.float64] = self.subimages.extents(side, self.root or side, most=most)
-        return found
+        return self.subimages.extents(side, self.root or side, most=most)
 
     @cached
     def visible(self, side: Side) -> NDArray[np.bool_]:
@@ -255,7 +243,8 @@ class VisibilityModel:
     @property
     @shared
     def _boxes(self) -> Visibility:
-        """Boxes of cells at the sample points, seen from the track."""
+        """Boxes of cells at the sample points, seen from the track; only with a beam."""
+        assert self.along is not None
         origin_m = self.points_m[0]
         return Visibility.of(
             self.points_m - origin_m, self.surface.steps_m, self.track_m - origin_m, self.along
@@ -276,10 +265,50 @@ class VisibilityModel:
         return float(self.visible(self.small)[:, ends].sum(axis=1).mean())
 
 
+def model_of(
+    lines: RangeLines, grid: Grid, beam: BeamWindow | None, outside: float = _MOST_OUTSIDE
+) -> LinesModel:
+    """Return a `VisibilityModel` with the simplest mean track.
+
+    If all channels lie at one place, return a plain `LinesModel`: nothing is sampled then, so that
+    an image of one channel costs no more. `outside` is the share of the lines' power that may lie
+    above `highest_cycles_per_m`.
+    """
+    energy = line_energy(lines.samples)
+    spectrum = measure_spectrum(lines, grid, energy)
+    occupied = spectrum.frequency[np.cumsum(spectrum.share) < 1 - min(outside, _MOST_OUTSIDE)]
+    half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
+    centre = cycles_per_m_at(lines, spectrum.centre)
+    mean_square = spectrum.share @ spectrum.frequency**2
+    shape, track = simplest_track(lines, band_wavelength_m(lines, spectrum.centre))
+    model = LinesModel(
+        lines,
+        grid,
+        beam,
+        spectrum,
+        channel_power=energy / max(float(energy.mean()), 1e-300) if energy.any() else 1 + energy,
+        highest_cycles_per_m=float(abs(centre) + half_band),
+        rms_cycles_per_m=float(np.sqrt(mean_square)) / lines.range_step_m,
+        channels_along=None if beam is None else beam.directions(lines),
+    )
+    if track is None:
+        return model
+    surface = surface_of(grid)
+    return VisibilityModel(
+        **vars(model),
+        limits=None if beam is None else beam.limits,
+        shape=shape,
+        track=track,
+        subimages=Subimages(surface),
+        points_m=sample_points_m(surface),
+        nearest_m=_nearest_m(lines, surface, track),
+    )
+
+
 def _nearest_m(lines: RangeLines, surface: Surface, track: MeanTrack) -> float:
-    """Lower bound of the distance between pixels and channels."""
+    """Return a lower bound of the distance between pixels and channels."""
     dense_m = points_at_m(surface, np.linspace(0, 1, _DENSE))
-    # Pixels between the dense points may be closer; half a step bounds by how much.
+    # Pixels between the dense points may be closer, by half a step at most.
     steps_m = np.linalg.norm(surface.steps_m[:2], axis=1)
     step_m = steps_m @ (np.array(surface.plane.shape) - 1) / (_DENSE - 1)
     between_m = (step_m + surface.relief_m(LEAST_SIDE).max()) / 2

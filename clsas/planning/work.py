@@ -1,4 +1,4 @@
-"""Counted work of the parts of an image, which the search, predictions and calibration share."""
+"""Counts of operations, which the search, predictions and the calibration share."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ from clsas.signal.interpolation import COST
 
 
 def upsampling(samples: Amount, *, filtered: bool) -> Work:
-    """Return the work of making so many samples of upsampled lines."""
+    """Return the work of upsampling lines to a number of samples, by filters or by FFT."""
     return Work(filtered_sample=samples) if filtered else Work(upsampled_sample=samples)
 
 
 def combining(
     lines: Amount, samples: Amount, taps: int, *, given: bool, half_precision: bool = True
 ) -> Work:
-    """Return the work of aligning and combining lines of so many samples in a stage.
+    """Return the work of aligning and combining lines of `samples` samples in a stage.
 
-    `taps` are those of both filters; `given` is whether it is the first stage.
+    `taps` is the sum of the taps of both filters. `given` is true for the first stage, which
+    combines the given lines.
     """
     aligned = lines * samples
     return Work(
@@ -42,9 +43,10 @@ def backprojecting_leaves(
     weighted: bool,
     gathered: bool = False,
 ) -> Work:
-    """Return the work of backprojecting the lines of leaves of so many pixels.
+    """Return the work of backprojecting `lines` lines to leaves of `pixels` pixels each.
 
-    `gathered` is whether samples are not looked up in registers.
+    `gathered` is true if samples are read from memory one by one, instead of looked up in
+    registers.
     """
     pairs = lines * pixels
     weighted_pairs = pairs * weighted
@@ -62,7 +64,7 @@ def backprojecting_leaves(
 def backprojecting(
     parts: int, part_pixels: int, channels: float, taps: int, *, tiled: bool, weighted: bool
 ) -> Work:
-    """Return the work of an exact image whose parts see so many channels each."""
+    """Return the work of an exact image of `parts` parts, from `channels` channels each."""
     pairs = parts * part_pixels * channels
     of_taps, weighted_pairs = pairs * COST[taps], pairs * weighted
     if tiled:

@@ -757,7 +757,9 @@ def test_a_plan_for_something_else_is_refused(what):
 
 
 def test_a_beam_beside_a_plan_is_refused():
-    with pytest.raises(ValueError, match="beam must be left out with a plan, which holds its own"):
+    with pytest.raises(
+        ValueError, match="beam must be left out with a plan, which contains its own"
+    ):
         factorize(*made(straight), planned(straight, -50), beam=HANN)
 
 

@@ -139,7 +139,7 @@ def test_what_an_exact_image_takes(beam):
     assert whole < seconds(lines, grid.with_height(np.zeros(grid.shape)))
 
 
-def test_a_beam_costs_what_it_is_told_to():
+def test_a_beam_costs_as_much_as_the_given_costs_say():
     lines, grid = over(around(0, 40))
     sees_all = BeamWindow(150, "hann")
     dear, free = (

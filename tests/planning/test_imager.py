@@ -62,7 +62,7 @@ def test_it_plans():
     assert relative_error_db(imager(lines), expected) <= -40
 
 
-def test_a_plan_from_text_serves():
+def test_a_plan_from_text_forms_the_same_image():
     lines, grid = made(straight)
     chosen = planned(lines, grid)
     read = clsas.Plan.from_json(chosen.to_json())
@@ -213,7 +213,7 @@ def test_it_warns_once_of_another_band(method):
 # What forms images
 
 
-def test_a_plan_serves_a_track_beside_its_own(platform):
+def test_a_plan_forms_images_of_a_track_beside_its_own(platform):
     lines, grid = made(swaying)
     chosen = planned(lines, grid, tolerance_db=-50)
     along = np.linspace(0, 2 * np.pi, lines.channels)

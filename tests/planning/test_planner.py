@@ -129,9 +129,9 @@ def test_relief_takes_virtual_channels_and_samples():
     grid = around(0, 40, z=-12)
     row, column = np.indices(grid.shape)
     tilt, waves = 0.01 * row - 0.005 * column, np.sin(row / 9) * np.sin(column / 9)
-    wish = {"tolerance_db": -40, "costs": EXACT_IS_SLOW, "depth": 2, "full_model": True}
+    request = {"tolerance_db": -40, "costs": EXACT_IS_SLOW, "depth": 2, "full_model": True}
     plans = [
-        plan(lines, grid.with_height(height_m), **wish)
+        plan(lines, grid.with_height(height_m), **request)
         for height_m in (0 * row, tilt, tilt + waves, tilt + 3 * waves)
     ]
     flat, tilted, low, high = (p.predicted_seconds for p in plans)
@@ -190,7 +190,7 @@ def test_given_stages_are_those_given():
 @pytest.mark.parametrize("taps", [(4, 8), (8, 4)])
 @pytest.mark.parametrize("depth", [1, 2])
 def test_taps_and_depth_for_study(taps, depth):
-    """Filters and stages are those told, also where the exact image is faster."""
+    """Filters and stages are those requested, even if the exact image is faster."""
     costs = Costs(pixel_ns=1e-3, part_ns=0.0, upsampled_sample_ns=0.0)
     assert plan(*made(straight), tolerance_db=-30, costs=costs).is_exact
     chosen = plan(*made(straight), tolerance_db=-30, taps=taps, depth=depth, costs=costs)
@@ -222,8 +222,8 @@ def test_half_precision_is_for_tolerances_and_devices_that_allow_it(device):
 
 
 @pytest.mark.parametrize("width_deg", [20, 40])
-def test_planning_ends_soon_where_nodes_follow_no_step(monkeypatch, width_deg):
-    """More of them do not help: once as many as are allowed were tried, others are not."""
+def test_planning_ends_soon_where_virtual_channels_follow_no_step(monkeypatch, width_deg):
+    """Denser ones do not help: once the densest allowed were tried, the search ends."""
     tried, errors = [], fastest.other_errors
 
     def counted(*arguments):
@@ -239,7 +239,7 @@ def test_planning_ends_soon_where_nodes_follow_no_step(monkeypatch, width_deg):
 
 
 def test_planning_ends_whatever_is_tried_in_vain(monkeypatch):
-    """A stage's nodes may not follow, however many there are."""
+    """Errors of a stage may remain, however dense its virtual channels are."""
     lines, grid = over(around(0, 40))
     measured = fastest.other_errors
 
@@ -248,8 +248,8 @@ def test_planning_ends_whatever_is_tried_in_vain(monkeypatch):
         return dataclasses.replace(found, spacing=(1e-2, *found.spacing[1:]))
 
     monkeypatch.setattr(fastest, "other_errors", hopeless)
-    wish = {"tolerance_db": -40, "costs": EXACT_IS_SLOW}
-    assert plan(lines, grid, **wish).is_exact
+    request = {"tolerance_db": -40, "costs": EXACT_IS_SLOW}
+    assert plan(lines, grid, **request).is_exact
 
 
 def test_a_track_there_and_back_is_not_factorized_with_a_beam():
@@ -257,9 +257,9 @@ def test_a_track_there_and_back_is_not_factorized_with_a_beam():
     there_m = along_x(300, 0.02)
     track_m = np.concatenate([there_m, there_m[::-1] + [0, -0.05, 0]])
     lines, grid = over(around(0, 40), track_m)
-    wish = {"tolerance_db": -30, "costs": EXACT_IS_SLOW}
-    assert not plan(lines, grid, **wish).is_exact
-    assert plan(lines, grid, beam=BeamWindow(8, "hann"), **wish).is_exact
+    request = {"tolerance_db": -30, "costs": EXACT_IS_SLOW}
+    assert not plan(lines, grid, **request).is_exact
+    assert plan(lines, grid, beam=BeamWindow(8, "hann"), **request).is_exact
 
 
 @pytest.mark.parametrize(("slope", "is_exact"), [(0.0005, False), (0.3, True)])
@@ -268,8 +268,8 @@ def test_a_beam_that_swings_past_within_few_channels_is_not_factorized(slope, is
     track_m = along_x(1000, 0.0055)
     track_m[:, 1] = slope * np.abs(track_m[:, 0] - 0.3)
     lines, grid = over(around(-0.6, 50, pixel_m=(0.012, 0.012), shape=(133, 129)), track_m)
-    wish = {"beam": BeamWindow(4.4, "hann"), "tolerance_db": -40, "costs": EXACT_IS_SLOW}
-    assert plan(lines, grid, **wish).is_exact == is_exact
+    request = {"beam": BeamWindow(4.4, "hann"), "tolerance_db": -40, "costs": EXACT_IS_SLOW}
+    assert plan(lines, grid, **request).is_exact == is_exact
 
 
 def test_an_image_that_lies_in_a_gap_of_the_track_is_not_factorized():
@@ -282,9 +282,9 @@ def test_an_image_that_lies_in_a_gap_of_the_track_is_not_factorized():
 
 def test_a_gap_is_not_covered_where_an_image_is_normalised():
     lines, grid = over(around(-1.2, 10, shape=(200, 100)), with_gap(1000, 0.011, 2))
-    wish = {"tolerance_db": -15, "costs": EXACT_IS_SLOW}
-    assert plan(lines, grid, beam=BeamWindow(5, "hann", normalise=True), **wish).is_exact
-    assert not plan(lines, grid, beam=BeamWindow(5, "hann"), **wish).is_exact
+    request = {"tolerance_db": -15, "costs": EXACT_IS_SLOW}
+    assert plan(lines, grid, beam=BeamWindow(5, "hann", normalise=True), **request).is_exact
+    assert not plan(lines, grid, beam=BeamWindow(5, "hann"), **request).is_exact
 
 
 @pytest.mark.parametrize("tolerance_db", [-30, -50])
@@ -333,29 +333,29 @@ def test_next_to_nothing_of_a_beam_is_left_out(beam_deg, share):
 def test_memory_decides_whatever_things_cost(costs, beam):
     """What fits is taken, also if it is slower; and else the least that does is named."""
     lines, grid = over(around(0, 40, shape=(600, 700)))
-    wish = {"tolerance_db": -40, "beam": beam, "costs": costs}
+    request = {"tolerance_db": -40, "beam": beam, "costs": costs}
     plain = plan(lines, grid, stages=[], beam=beam, costs=costs)
-    little = plan(lines, grid, memory_bytes=plain.memory_bytes // 2, **wish)
+    little = plan(lines, grid, memory_bytes=plain.memory_bytes // 2, **request)
     assert not little.is_exact
     assert little.memory_bytes <= plain.memory_bytes // 2
     with pytest.raises(ValueError, match=r"memory_bytes must be at least .* MiB") as refused:
-        plan(lines, grid, memory_bytes=1 << 20, **wish)
+        plan(lines, grid, memory_bytes=1 << 20, **request)
     (named,) = re.findall(r"at least ([\d.]+) MiB", str(refused.value))
     enough = int(float(named) * 2**20)
-    assert plan(lines, grid, memory_bytes=enough, **wish).memory_bytes <= enough
+    assert plan(lines, grid, memory_bytes=enough, **request).memory_bytes <= enough
     with pytest.raises(ValueError, match="memory_bytes must be at least"):
-        plan(lines, grid, memory_bytes=int(0.8 * enough), **wish)
+        plan(lines, grid, memory_bytes=int(0.8 * enough), **request)
 
 
 @pytest.mark.parametrize("kind", ["stages", "one place"])
 def test_plain_backprojection_may_need_too_much_as_well(kind):
     grid = around(0, 40)
     lines, _ = over(grid, TRACK if kind == "stages" else 0 * TRACK)
-    wish = {"stages": []} if kind == "stages" else {"tolerance_db": -40}
-    needed = plan(lines, grid, **wish).memory_bytes
-    assert plan(lines, grid, memory_bytes=needed, **wish).is_exact
+    request = {"stages": []} if kind == "stages" else {"tolerance_db": -40}
+    needed = plan(lines, grid, **request).memory_bytes
+    assert plan(lines, grid, memory_bytes=needed, **request).is_exact
     with pytest.raises(ValueError, match="memory_bytes must be") as refused:
-        plan(lines, grid, memory_bytes=needed // 2, **wish)
+        plan(lines, grid, memory_bytes=needed // 2, **request)
     (named,) = re.findall(r"at least ([\d.]+) MiB", str(refused.value))
     assert needed / 2**20 <= float(named) < needed / 2**20 + 0.1
 
@@ -371,7 +371,7 @@ def good():
 
 
 @pytest.mark.parametrize(
-    "wishes",
+    "requests",
     [
         {},
         {"tolerance_db": -40, "tolerance_wavelengths": 0.1},
@@ -380,11 +380,11 @@ def good():
         {"tolerance_db": -40, "tolerance_wavelengths": 0.1, "stages": [(2, 2)]},
     ],
 )
-def test_exactly_one_wish_is_needed(good, wishes):
+def test_exactly_one_request_is_needed(good, requests):
     with pytest.raises(
         ValueError, match="exactly one of tolerance_db, tolerance_wavelengths and stages"
     ):
-        plan(**good, **wishes)
+        plan(**good, **requests)
 
 
 @pytest.mark.parametrize(
@@ -422,7 +422,7 @@ def test_exactly_one_wish_is_needed(good, wishes):
         ("stages", 5, TypeError, r"stages must be a sequence of \(QR, QI\)"),
     ],
 )
-def test_bad_wishes_are_named(good, argument, value, error, says):
+def test_bad_requests_are_named(good, argument, value, error, says):
     with pytest.raises(error, match=says):
         plan(**good, **{argument: value})
 
@@ -475,10 +475,10 @@ def test_the_highest_frequency_leaves_out_as_little_as_is_allowed():
     noisy = dataclasses.replace(lines, samples=lines.samples + floor)
     highest, bin_m = [], 1 / (256 * lines.range_step_m)
     for outside in (1e-6, 1e-9, 1e-11):
-        view = VisibilityModel.of(noisy, grid, None, outside)
-        cycles_per_m, share = frequencies(view)
-        assert share[cycles_per_m > view.highest_cycles_per_m + bin_m].sum() <= outside
-        highest.append(view.highest_cycles_per_m)
+        model = VisibilityModel.of(noisy, grid, None, outside)
+        cycles_per_m, share = frequencies(model)
+        assert share[cycles_per_m > model.highest_cycles_per_m + bin_m].sum() <= outside
+        highest.append(model.highest_cycles_per_m)
     assert highest[2] > highest[0]
 
 
@@ -503,10 +503,10 @@ def test_predictions_are_sums_over_work_and_causes(case, tolerance_db):
     assert chosen.predicted_seconds == pytest.approx(seconds)
     causes = vars(chosen.errors)
     assert chosen.predicted_error_db == pytest.approx(10 * np.log10(sum(causes.values())))
-    told = chosen.describe()
+    described = chosen.describe()
     for name, power in causes.items():
         line = f"\n{name.replace(chr(95), chr(32)):<16}"
-        assert (line in told) == (power > 1e-3 * sum(causes.values())), name
+        assert (line in described) == (power > 1e-3 * sum(causes.values())), name
     read = Plan.from_json(chosen.to_json())
     assert read.work == chosen.work
     assert read.errors == chosen.errors

@@ -17,7 +17,7 @@ from clsas.planning.scaling import GROUPS, Scale
 
 SAME = Scale(*(1.0 for _ in dataclasses.fields(Scale)))
 TWICE = Scale(*(2.0 for _ in dataclasses.fields(Scale)))
-WISH = {"tolerance_db": -30}
+REQUEST = {"tolerance_db": -30}
 
 
 @pytest.fixture
@@ -46,15 +46,15 @@ def scene():
 
 
 def test_the_first_plan_measures_and_later_ones_read_what_it_stored(cache, measured):
-    first = plan(*scene(), **WISH)
+    first = plan(*scene(), **REQUEST)
     assert len(measured) == 1
     assert first.prediction.cost_source == "scaled"
     stored = costs.load(open_device())
     assert stored.source == "scaled"
     assert stored.costs == costs.defaults(open_device())
-    assert plan(*scene(), **WISH).to_json() == first.to_json()
+    assert plan(*scene(), **REQUEST).to_json() == first.to_json()
     costs.save(open_device(), EXACT_IS_SLOW, "scaled")
-    assert plan(*scene(), **WISH).exact_seconds > 10 * first.exact_seconds
+    assert plan(*scene(), **REQUEST).exact_seconds > 10 * first.exact_seconds
     assert len(measured) == 1
 
 
@@ -62,7 +62,7 @@ def test_a_device_twice_as_slow_takes_twice_the_time(tmp_path, monkeypatch, meas
     times = []
     for number, measured.scale in enumerate((SAME, TWICE)):
         monkeypatch.setenv("CLSAS_CACHE", str(tmp_path / str(number)))
-        found = plan(*scene(), **WISH)
+        found = plan(*scene(), **REQUEST)
         times.append((found.predicted_seconds, found.exact_seconds))
     assert np.divide(times[1], times[0]) == pytest.approx([2, 2])
 
@@ -84,17 +84,19 @@ def test_factors_are_positive(value):
         dataclasses.replace(SAME, stages=value)
 
 
-@pytest.mark.parametrize("wish", [{"stages": []}, {"stages": [(2, 2)]}], ids=["exact", "stages"])
-def test_plans_without_a_search_measure_nothing(cache, measured, wish):
-    assert plan(*scene(), **wish).prediction.cost_source == "default"
+@pytest.mark.parametrize(
+    "request_", [{"stages": []}, {"stages": [(2, 2)]}], ids=["exact", "stages"]
+)
+def test_plans_without_a_search_measure_nothing(cache, measured, request_):
+    assert plan(*scene(), **request_).prediction.cost_source == "default"
     assert not measured
     assert not cache.exists()
 
 
 def test_nor_do_plans_of_small_images_or_with_given_costs(cache, measured, monkeypatch):
-    assert plan(*scene(), **WISH, costs=EXACT_IS_SLOW).prediction.cost_source == "given"
+    assert plan(*scene(), **REQUEST, costs=EXACT_IS_SLOW).prediction.cost_source == "given"
     monkeypatch.setattr("clsas.planning.planner._SEARCH_S", 1e6)
-    assert plan(*scene(), **WISH).prediction.cost_source == "default"
+    assert plan(*scene(), **REQUEST).prediction.cost_source == "default"
     assert not measured
 
 
@@ -104,7 +106,7 @@ def test_another_driver_is_measured_anew(cache, measured):
         device, info=dataclasses.replace(device.info, driver="another"), _kernels={}
     )
     for each in (device, other, device, other):
-        plan(*scene(), **WISH, device=each)
+        plan(*scene(), **REQUEST, device=each)
     assert measured == [device, other]
     keys = {
         costs.key(dataclasses.replace(device.info, **change))
@@ -114,13 +116,13 @@ def test_another_driver_is_measured_anew(cache, measured):
 
 
 def test_another_version_of_clsas_measures_anew(cache, measured, monkeypatch):
-    plan(*scene(), **WISH)
+    plan(*scene(), **REQUEST)
     monkeypatch.setattr(costs, "__version__", "99.0")
     assert costs.load(open_device()).source == "default"
 
 
 def test_a_calibration_replaces_scaled_costs(cache, measured, monkeypatch):
-    plan(*scene(), **WISH)
+    plan(*scene(), **REQUEST)
     module = "clsas.planning.calibration."
     monkeypatch.setattr(module + "_SIZES", ((200, 128), (400, 96)))
     monkeypatch.setattr(module + "_SMALL_SIZES", ((50, 32), (100, 64)))
@@ -129,32 +131,32 @@ def test_a_calibration_replaces_scaled_costs(cache, measured, monkeypatch):
         monkeypatch.setattr(module + name, 100.0)
     found = calibrate()
     assert costs.load(open_device()).costs == found
-    assert plan(*scene(), **WISH).prediction.cost_source == "calibrated"
+    assert plan(*scene(), **REQUEST).prediction.cost_source == "calibrated"
     assert len(measured) == 1
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"KEY": {"pixel_ns": 0.5}}', '{"KEY": 5}'])
-def test_a_broken_or_foreign_file_is_told_and_measured_anew(cache, measured, content):
+def test_a_broken_or_foreign_file_is_reported_and_measured_again(cache, measured, content):
     cache.parent.mkdir()
     cache.write_text(content.replace("KEY", costs.key(open_device().info)))
     with pytest.warns(ClsasWarning, match=r"costs stored in .*costs\.json are ignored"):
-        found = plan(*scene(), **WISH)
+        found = plan(*scene(), **REQUEST)
     assert found.prediction.cost_source == "scaled"
     assert len(measured) == 1
-    assert plan(*scene(), **WISH).prediction.cost_source == "scaled"
+    assert plan(*scene(), **REQUEST).prediction.cost_source == "scaled"
     assert json.loads(cache.read_text())
 
 
 def test_costs_of_other_devices_stay(cache, measured):
     cache.parent.mkdir()
     cache.write_text('{"another device": {"of": "a later version"}}')
-    plan(*scene(), **WISH)
+    plan(*scene(), **REQUEST)
     stored = json.loads(cache.read_text())
     assert stored["another device"] == {"of": "a later version"}
     assert len(stored) == 2
 
 
-def test_costs_that_cannot_be_stored_serve_this_process(cache, measured, monkeypatch):
+def test_costs_that_cannot_be_stored_are_used_by_this_process(cache, measured, monkeypatch):
     measured.scale = TWICE
 
     def read_only(*args):
@@ -162,10 +164,10 @@ def test_costs_that_cannot_be_stored_serve_this_process(cache, measured, monkeyp
 
     monkeypatch.setattr(costs, "replacing", read_only)
     with pytest.warns(ClsasWarning, match="cannot be stored, so that every process") as heard:
-        found = plan(*scene(), **WISH)
+        found = plan(*scene(), **REQUEST)
     assert len(heard) == 1
     assert found.prediction.cost_source == "scaled"
-    again = plan(*scene(), **WISH)  # without a warning
+    again = plan(*scene(), **REQUEST)  # without a warning
     assert again.predicted_seconds == found.predicted_seconds
     assert len(measured) == 1
 
