@@ -18,12 +18,7 @@
 #include "interpolation.h"
 #include "samples.h"
 
-#ifndef HAS_PICK
-#undef WINDOWS
-#define WINDOWS 1
-#endif
-
-#ifdef HAS_PICK
+#if HAS_PICK
 
 /* POSITIONS: how many whole samples the positions of lanes can start from, next to each other, within a window of
  * WINDOW_SAMPLES. */
@@ -121,6 +116,8 @@ INLINE vfloat samples_from(__global const sample_t *sample, vint index)
 #endif
 
 #else
+#undef WINDOWS
+#define WINDOWS 1
 
 typedef struct {
     __global const sample_t *line;

@@ -12,27 +12,26 @@
 #include "phases.h"
 
 /* LANE_COLUMNS and LANE_ROWS: positions of the lanes from their block's centre, pixels. */
-#if WIDTH == 16
-#define BLOCK_COLUMNS 4
-#define BLOCK_ROWS 4
-#define LANE_COLUMNS (vfloat)(-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f)
-#define LANE_ROWS (vfloat)(-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.5f, -.5f, .5f, .5f, .5f, .5f, 1.5f, 1.5f, 1.5f, 1.5f)
-#elif WIDTH == 8
-#define BLOCK_COLUMNS 4
-#define BLOCK_ROWS 2
-#define LANE_COLUMNS (vfloat)(-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f)
-#define LANE_ROWS (vfloat)(-.5f, -.5f, -.5f, -.5f, .5f, .5f, .5f, .5f)
-#elif WIDTH == 4
-#define BLOCK_COLUMNS 2
-#define BLOCK_ROWS 2
-#define LANE_COLUMNS (vfloat)(-.5f, .5f, -.5f, .5f)
-#define LANE_ROWS (vfloat)(-.5f, -.5f, .5f, .5f)
-#else
-#define BLOCK_COLUMNS 1
-#define BLOCK_ROWS 1
-#define LANE_COLUMNS 0.0f
-#define LANE_ROWS 0.0f
-#endif
+#define BLOCK_COLUMNS JOIN(BLOCK_COLUMNS_, WIDTH)
+#define BLOCK_ROWS JOIN(BLOCK_ROWS_, WIDTH)
+#define LANE_COLUMNS ((vfloat)JOIN(LANE_COLUMNS_, WIDTH))
+#define LANE_ROWS ((vfloat)JOIN(LANE_ROWS_, WIDTH))
+#define BLOCK_COLUMNS_1 1
+#define BLOCK_ROWS_1 1
+#define LANE_COLUMNS_1 (0.0f)
+#define LANE_ROWS_1 (0.0f)
+#define BLOCK_COLUMNS_4 2
+#define BLOCK_ROWS_4 2
+#define LANE_COLUMNS_4 (-.5f, .5f, -.5f, .5f)
+#define LANE_ROWS_4 (-.5f, -.5f, .5f, .5f)
+#define BLOCK_COLUMNS_8 4
+#define BLOCK_ROWS_8 2
+#define LANE_COLUMNS_8 (-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f)
+#define LANE_ROWS_8 (-.5f, -.5f, -.5f, -.5f, .5f, .5f, .5f, .5f)
+#define BLOCK_COLUMNS_16 4
+#define BLOCK_ROWS_16 4
+#define LANE_COLUMNS_16 (-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f)
+#define LANE_ROWS_16 (-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.5f, -.5f, .5f, .5f, .5f, .5f, 1.5f, 1.5f, 1.5f, 1.5f)
 #define STACK 4
 #define ITEM_ROWS (BLOCK_ROWS * STACK)
 

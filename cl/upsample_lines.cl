@@ -25,17 +25,16 @@
 #include "phases.h"
 #include "samples.h"
 
-#ifdef HAS_PICK
-#if WIDTH == 16
-#define INT_LANES ((vint)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
-#define EVEN 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30
-#define ODD 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31
-#else
-#define INT_LANES ((vint)(0, 1, 2, 3, 4, 5, 6, 7))
-#define EVEN 0, 2, 4, 6, 8, 10, 12, 14
-#define ODD 1, 3, 5, 7, 9, 11, 13, 15
-#endif
-#endif
+/* Numbers of all lanes, and of every other one of two vectors. */
+#define INT_LANES ((vint)JOIN(INT_LANES_, WIDTH))
+#define INT_LANES_8 (0, 1, 2, 3, 4, 5, 6, 7)
+#define INT_LANES_16 (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
+#define EVEN JOIN(EVEN_, WIDTH)
+#define EVEN_8 0, 2, 4, 6, 8, 10, 12, 14
+#define EVEN_16 EVEN_8, 16, 18, 20, 22, 24, 26, 28, 30
+#define ODD JOIN(ODD_, WIDTH)
+#define ODD_8 1, 3, 5, 7, 9, 11, 13, 15
+#define ODD_16 ODD_8, 17, 19, 21, 23, 25, 27, 29, 31
 
 /* A given line, of `count` samples, and the shift in frequency that it takes. */
 typedef struct {
@@ -71,7 +70,7 @@ INLINE float2 sample_at(const Given *given, int index)
 #endif
 }
 
-#ifdef HAS_PICK
+#if HAS_PICK
 /* WIDTH samples of x from an index on, shifted in frequency, as real and imaginary parts. */
 INLINE void load_samples(const Given *given, int index, vfloat *re, vfloat *im)
 {

@@ -107,9 +107,12 @@ class Run:
         options |= {"APERTURE_TAPS": image.aperture.filter.taps, "HALF": int(self.half_precision)}
         options |= {"CHUNK": CHUNK, "PHASE_TERMS": phases.PRECISE_TERMS}
         ramp = int(self.geometry.ramps)
-        rows = int(self.geometry.track.is_sheet)
-        self.first_stage = device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, ROWS=rows, **options)
-        self.later_stage = device.kernel("stage", SHIFTS_GIVEN=0, RAMP=0, ROWS=2 * rows, **options)
+        if self.geometry.track.is_sheet:
+            self.first_stage = device.kernel("first_sheet_stage", RAMP=ramp, **options)
+            self.later_stage = device.kernel("later_sheet_stage", **options)
+        else:
+            self.first_stage = device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, **options)
+            self.later_stage = device.kernel("stage", SHIFTS_GIVEN=0, RAMP=0, **options)
         kind = PlaneLeaves if self.geometry.surface.is_plane else SurfaceLeaves
         self.leaves = kind(
             lines, roots, plan, self.levels[-1], device, pixels, self.half_precision, self.gain
@@ -211,7 +214,7 @@ class Run:
         return _Tables(slot, pitches, strides, bands)
 
     def _stage_values(self, sector: Sector, level: int) -> dict[str, NDArray]:
-        """Return what the tables of a stage hold, see `cl/stage.cl`."""
+        """Return what the tables of a stage hold, see `cl/stages.h`."""
         nodes, need = sector.nodes[level], sector.needs[level]
         values = {f"base{level}": nodes.base, f"between{level}": nodes.between}
         first_of_parent = np.zeros_like(need.first)
