@@ -35,7 +35,8 @@ INLINE void fill_chunk(__local Chunk *chunk, const Parent *parent, int first, in
 {
     for (int c = share->item * WIDTH; c < count; c += share->items * WIDTH) {
         const int channel = first + c;
-        const Shifts shifts = shifts_of(parent, channel);
+        Shifts shifts;
+        find_shifts(parent, channel, &shifts);
         for (int lane = 0; lane < WIDTH; lane++)
             chunk->start[c + lane] = INT_LANE(shifts.start, lane);
         vfloat range_weight[TAPS];

@@ -1,11 +1,11 @@
 /* The pixels of a work-item, and their sums over channels.
  *
- * The lanes of a vector form a block of BLOCK_COLUMNS x BLOCK_ROWS pixels. A work-item computes STACK blocks, one below
- * the other.
+ * The lanes of a vector are the pixels of a block, BLOCK_COLUMNS x BLOCK_ROWS of them. A work-item computes STACK blocks, one
+ * below the other.
  *
  * Build options
- *   OVERWRITE  1: sums replace pixels; 0: they are added to them.
- *   BEAM, NORMALISE  as in beam.h; with both, weights are summed beside the echoes.
+ *   OVERWRITE  1: sums replace the pixels; 0: they are added to the pixels.
+ *   BEAM, NORMALISE  as in beam.h; with both, weights are summed as well as echoes.
  */
 
 #include "lookup.h"
@@ -60,7 +60,7 @@ INLINE void clear_sums(Sums *sums)
 }
 
 /* Adds the echoes of one channel to a block: its line at t + 0.5 samples from the lookup's reference sample, rotated by
- * `cycles`. With BEAM they are weighted, and each weight counts for so many channels. */
+ * `cycles`. With BEAM the echoes are weighted, and `channels` times each weight is added to the sums of weights. */
 INLINE void add_echoes(Sums *sums, int block, const Lookup *lookup, vfloat t, __global const float *filter, vfloat cycles,
                        __global const float *phase_polynomials, vfloat weight, float channels)
 {
@@ -84,7 +84,7 @@ INLINE void add_echoes(Sums *sums, int block, const Lookup *lookup, vfloat t, __
 #define PUT +=
 #endif
 
-/* Puts a work-item's blocks into the pixels from (row, column) on, of an image whose rows hold `columns`. */
+/* Puts a work-item's blocks into the pixels from (row, column) on of an image with `columns` columns. */
 INLINE void put_blocks(const vfloat *re, const vfloat *im, __global float2 *pixels, int columns, int row, int column)
 {
 #pragma unroll

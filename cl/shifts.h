@@ -27,7 +27,8 @@
 #include "geometry.h"
 #include "samples.h"
 
-/* How WIDTH channels are aligned. */
+/* How WIDTH channels are aligned. find_shifts() is passed where to put them: Oclgrind (21.10) cannot run what LLVM makes of
+ * a function that returns them. */
 typedef struct {
     vint start;
     vfloat nu, cycles, ramp;
@@ -46,17 +47,14 @@ INLINE __global const sample_t *line_of(const Parent *parent, int channel)
     return LINE(parent->lines, parent->order[channel], parent->pitch);
 }
 
-/* Shifts of the WIDTH channels from number `channel` on. */
-INLINE Shifts shifts_of(const Parent *parent, int channel)
+/* Finds the shifts of the WIDTH channels from number `channel` on. */
+INLINE void find_shifts(const Parent *parent, int channel, Shifts *shifts)
 {
-    Shifts shifts;
-    for (int lane = 0; lane < WIDTH; lane++)
-        ((int *)&shifts.start)[lane] = parent->start[channel + lane];
-    shifts.nu = LOAD(parent->nu + channel);
-    shifts.cycles = LOAD(parent->cycles + channel);
+    shifts->start = AS_VINT(LOAD((__global const float *)(parent->start + channel)));
+    shifts->nu = LOAD(parent->nu + channel);
+    shifts->cycles = LOAD(parent->cycles + channel);
     if (RAMP)
-        shifts.ramp = LOAD(parent->ramp + channel);
-    return shifts;
+        shifts->ramp = LOAD(parent->ramp + channel);
 }
 #else
 typedef struct {
@@ -75,9 +73,9 @@ INLINE __global const sample_t *line_of(const Parent *parent, int channel)
     return LINE(parent->lines, channel - parent->first_channel, parent->pitch);
 }
 
-/* Shifts of the WIDTH channels from number `channel` on, from the change of range between the parent's centre and the
- * child's. */
-INLINE Shifts shifts_of(const Parent *parent, int channel)
+/* Finds the shifts of the WIDTH channels from number `channel` on, from the change of range between the parent's centre
+ * and the child's. */
+INLINE void find_shifts(const Parent *parent, int channel, Shifts *shifts)
 {
     __global const float *position = parent->positions + channel, *offset = parent->offset;
     const float3 drift = parent->drift;
@@ -89,7 +87,8 @@ INLINE Shifts shifts_of(const Parent *parent, int channel)
     /* Rounding half a sample less finds the lower of the two middle taps. */
     const vfloat shift = change * parent->samples_per_m - 0.5f;
     const vfloat shifted = shift + ROUNDER;
-    return (Shifts){VINT_OF_SHIFTED(shifted) + parent->first_sample, shift - (shifted - ROUNDER),
-                    change * parent->cycles_per_m};
+    shifts->start = VINT_OF_SHIFTED(shifted) + parent->first_sample;
+    shifts->nu = shift - (shifted - ROUNDER);
+    shifts->cycles = change * parent->cycles_per_m;
 }
 #endif

@@ -1,19 +1,19 @@
-/* Upsampling of range lines: every line, shifted in frequency, at PHASES / step times its rate,
+/* Upsampling of range lines: shifts every line in frequency, and samples it at PHASES / step times its rate,
  *
  *     y(m) = sum_t h_p(t) x(q + 1 - TAPS/2 + t) exp(-j 2 pi frequency (q + 1 - TAPS/2 + t)),
  *
- * where (first + m) step = q PHASES + p, 0 <= p < PHASES: y(m) lies at (first + m) step / PHASES of x, and h_p is the
- * filter for that fraction of a sample. Beyond its ends a line is zero.
+ * where (first + m) step = q PHASES + p, 0 <= p < PHASES. So y(m) lies at sample (first + m) step / PHASES of x, and h_p is
+ * the filter for the fraction p / PHASES of a sample. Beyond its ends a line is zero.
  *
- * Build options: WIDTH (vectors.h; lanes are consecutive samples of y), PERMUTE (vectors.h; 1 takes the lanes' samples from
- * two registers), HALF (samples.h, of y), PHASE_TERMS (phases.h), and
+ * Build options: WIDTH (vectors.h; lanes are consecutive samples of y), PERMUTE (x86.h; lanes then pick their samples from
+ * two registers), HALF (samples.h; for y), PHASE_TERMS (phases.h), and
  *   TAPS             of the filters, even.
  *   PHASES           a multiple of WIDTH.
  *   FREQUENCY_SHIFT  0: frequency is 0.
  *
  * samples           float2 [lines at work][count].
- * filters           float [PHASES / WIDTH][TAPS][WIDTH]: lane by lane the filters of samples m, m + 1, ... from multiples
- *                   of WIDTH on.
+ * filters           float [PHASES / WIDTH][TAPS][WIDTH]: the filters of WIDTH consecutive samples from each multiple m of
+ *                   WIDTH on, one for each lane.
  * phase_polynomials see phases.h.
  * frequency         2^-32 cycles per sample of x, with FREQUENCY_SHIFT.
  * lines, pitch      the upsampled lines (samples.h), from line number first_line on: y in `length` samples from number
@@ -47,7 +47,7 @@ typedef struct {
 } Given;
 
 #if FREQUENCY_SHIFT
-/* Phase of the shift at a sample, cycles: whole cycles overflow. */
+/* Phase of the shift at a sample, in cycles. Whole cycles overflow, and so do not matter. */
 INLINE float phase_at(const Given *given, int index)
 {
     return (int)((uint)given->frequency * (uint)index) * -0x1p-32f;
@@ -149,8 +149,8 @@ __kernel void upsample_lines(__global const float2 *samples, int count, __global
         const int m = k - margin;
         vfloat re = 0.0f, im = 0.0f;
         if (m >= 0 && m < length) {
-            /* An offset of whole samples keeps positions from being negative, so that division rounds down. As an int,
-             * a position can be that of lines of up to 2^31 / PHASES samples. */
+            /* An offset of whole samples keeps positions from being negative, so that division rounds down. Positions fit an
+             * int for lines of up to 2^31 / PHASES samples. */
             const int offset = 1 << 20;
             const int position = (first + m) * step + offset * PHASES;
             const int begin = position / PHASES - offset + 1 - TAPS / 2;
