@@ -293,9 +293,10 @@ def all_channels(
 def band_table(
     bands: Bands | None, need: ChannelRanges, first_of_parent: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return what the stage kernel is told of every subimage's bands, [roots, subimages, bands, 7].
+    """Return the table of bands that the stage kernels read, [roots, subimages, bands, 7].
 
-    See `cl/stage.cl`. `first_of_parent` is the channel of each parent's first line.
+    Its columns are the members of `Band` in `cl/stages.h`. `first_of_parent` is the channel of each
+    parent's first line.
     """
     if bands is None:
         none = np.zeros_like(need.first)
