@@ -1,13 +1,13 @@
-/* Where antennas are, seen from the centres of tiles or groups of points.
+/* Positions of antennas relative to the centres of tiles or groups of points.
  *
- * Positions are float32 differences from an origin near them, and the host splits each into the nearest float32 number
- * and its remainder: so a short distance between two far points stays exact.
+ * Positions are float32 differences from an origin nearby. The host splits each into the nearest float32 number and its
+ * remainder, so that a short distance between two points far from the origin stays exact.
  *
  * Build options
  *   BISTATIC  1: receivers have positions of their own; 0: they are the transmitters.
  *   MOVING    1: receivers move during the echo's flight.
  *   BEAM      not 0: the track's direction is needed (beam.h).
- * A kernel defines CHANNEL_VALUES(p) before it includes this file: the lanes' values of the channels from pointer p on.
+ * Before it includes this file, a kernel defines CHANNEL_VALUES(p): what its lanes load for the channels from pointer p on.
  *
  * geometry: float [rows][geometry_pitch], a column per channel. The rows: transmitter x y z, then their remainders (m,
  * from the origin); with BISTATIC the receiver's likewise; with MOVING the receiver's velocity x y z over the sound
@@ -46,11 +46,11 @@ INLINE Vector to_centre(__global const float *geometry, int geometry_pitch, int 
                     (centre[2] - antenna.z) + (centre[5] - remainder.z)};
 }
 
-/* The vector from a moving receiver, at the time that the echo of a point arrives there, to that point: from the vectors
- * from the transmitter and from the receiver at the time of transmission.
+/* The vector to a point from a moving receiver, where that is when the point's echo arrives. It follows from the vectors to
+ * the point from the transmitter and from the receiver at the time of transmission.
  *
- * When the sound reaches the point, the receiver is at -d from it. The way back, of length l, satisfies |d - l b| = l, or
- * (1 - b.b) l^2 + 2 (d.b) l - d.d = 0. */
+ * When the sound reaches the point, the vector from the receiver to the point is d. The way back, of length l, satisfies
+ * |d - l b| = l with the receiver's velocity b over the sound speed, or (1 - b.b) l^2 + 2 (d.b) l - d.d = 0. */
 INLINE Vector from_receiver_at_arrival(Vector transmitter, Vector receiver, Vector velocity)
 {
     const Vector d = sum_of(receiver, -magnitude(transmitter), velocity);

@@ -1,18 +1,19 @@
-/* Exact backprojection onto points anywhere: adds to every point x the sum over channels
+/* Backprojection onto points anywhere: adds to every point x the sum over channels
  *
  *     I(x) += sum_n w_n(x) s_n(rho_n(x)) exp(+j 2 pi cycles_n(x)),
  *
- * in groups of STACK blocks of WIDTH points about a common centre. The range of every point differs from the centre's by
- * what distance_change() (geometry.h) finds.
+ * where the points form groups of STACK blocks of WIDTH points about a common centre. distance_change() (geometry.h) finds
+ * how much the range of every point differs from the centre's. The same kernel forms exact images and the leaves of
+ * factorized ones (ALIGNED).
  *
  * Build options: WIDTH and PERMUTE (vectors.h), HALF (samples.h), TAPS and WINDOWS (lookup.h), PHASE_TERMS (phases.h),
  * BEAM, ONE_CUBIC and NORMALISE (beam.h), OVERWRITE (pixels.h), ALIGNED (parts.h), BISTATIC and MOVING (antennas.h).
  *
  * lines, line_pitch     see samples.h.
- * ranges, references    see parts.h; parts are groups.
- * drift                 with ALIGNED: by how much less every range grows, per metre along x y z.
+ * ranges, reference_... see parts.h; the parts are groups.
+ * drift                 with ALIGNED: how much shorter every range becomes because receivers move, per metre along x y z.
  * geometry, centres     see antennas.h; `centres` holds those of all groups, from number first_range on those at work.
- * groups                groups at work.
+ * groups                number of groups at work.
  * offsets               float [3][points], m from the groups' centres: x y z of the points of all groups.
  * samples_per_m         samples per metre of range, which is half a path.
  * cycles_per_sample     phase per sample of range.
@@ -70,7 +71,7 @@ INLINE Antennas antennas_of(__global const float *geometry, int geometry_pitch, 
     return antennas;
 }
 
-/* How much longer the path is to points than to their group's centre, m. */
+/* How much longer the two-way path is to points than to their group's centre, m. */
 INLINE vfloat path_change(const Antennas *antennas, Vector offset)
 {
     const vfloat out = distance_change(antennas->transmitter, offset);
@@ -147,7 +148,7 @@ __kernel void backproject_points(__global const sample_t *lines, int line_pitch,
         const size_t pair = (size_t)group * channel_pitch + entry;
         const Reference reference = {reference_sample[pair], reference_fraction[pair], reference_phase[pair]};
 #endif
-        /* Half a sample less is what interpolate() wants. */
+        /* interpolate() expects positions that are half a sample less. */
         const float start = reference.fraction - 0.5f;
 #if BEAM && NORMALISE && ALIGNED
         const float channels = represented[channel];
@@ -162,7 +163,7 @@ __kernel void backproject_points(__global const sample_t *lines, int line_pitch,
         for (int block = 0; block < STACK; block++) {
             __global const float *x = offsets + block * WIDTH;
             const Vector offset = {LOAD(x), LOAD(x + points), LOAD(x + 2 * (size_t)points)};
-            /* Weights first: 10 % faster than after the path, as fewer registers are spilled. */
+            /* Weights come first: after the path they would take 10 % longer, as more registers are spilled. */
 #if BEAM
             const vfloat weight = point_weights(&antennas, &beam, offset);
 #else

@@ -1,23 +1,24 @@
-/* Exact backprojection onto tiles of a plane grid: adds to every pixel x the sum over channels
+/* Backprojection onto tiles of a plane grid: adds to every pixel x the sum over channels
  *
  *     I(x) += sum_n w_n(x) s_n(rho_n(x)) exp(+j 2 pi cycles_n(x)),
  *
- * with s_n interpolated between samples, and ranges rho_n expanded about the tile's centre by expand_tiles.
+ * where s_n is interpolated between samples, and expand_tiles has expanded the ranges rho_n about the tile's centre. The
+ * same kernel forms exact images and the leaves of factorized ones (ALIGNED).
  *
  * Build options: WIDTH and PERMUTE (vectors.h), HALF (samples.h), TAPS and WINDOWS (lookup.h), PHASE_TERMS (phases.h),
  * BEAM, ONE_CUBIC and NORMALISE (beam.h), OVERWRITE (pixels.h), ALIGNED (parts.h), and
  *   TILE_ROWS, TILE_COLUMNS  pixels of a tile: multiples of ITEM_ROWS and of BLOCK_COLUMNS (pixels.h).
  *
  * lines, line_pitch     see samples.h.
- * ranges, references    see parts.h.
+ * ranges, reference_... see parts.h.
  * expansions            see expansions.h.
  * cycles_per_sample     phase per sample of range.
  * filter                see interpolation.h.
  * phase_polynomials     see phases.h.
  * beam_...              see beam.h.
- * represented           float [channels], with NORMALISE and ALIGNED: how many channels each line stands for, which is
- *                       what its beam weight counts. Without it every weight counts once.
- * weight_sums           float2, as pixels, with NORMALISE: the sum of the beam weights, as real and as imaginary part.
+ * represented           float [channels], with NORMALISE and ALIGNED: how many channels each line stands for. Its beam
+ *                       weight counts so many times; without ALIGNED every weight counts once.
+ * weight_sums           float2, like `pixels`, with NORMALISE: sums of the beam weights, in both parts.
  * pixels                float2 [rows][columns].
  * corners               int [regions][2]: first row and column in `pixels` of regions of tiles_down x tiles_across tiles.
  *                       Tiles are numbered row by row within a region, and region by region, from first_tile on.
@@ -33,16 +34,17 @@
 #define BLOCKS_ACROSS (TILE_COLUMNS / BLOCK_COLUMNS)
 #define BLOCKS_PER_WINDOW (STACK / WINDOWS)
 
-/* Keeps weights that lie in memory there: in registers they would leave none, and a product of AVX-512 takes one factor,
- * for all lanes, from memory. With AVX2 they are spilled as vectors, from which a product takes them. */
+/* Makes the compiler read weights from memory each time. In registers they would leave no room for anything else, and with
+ * AVX-512 a product can take one factor for all lanes from memory. With AVX2 the compiler spills them as vectors, which a
+ * product can take from memory. */
 #if AVX == 512
 #define FORGET_MEMORY __asm__ volatile("" : : : "memory")
 #else
 #define FORGET_MEMORY
 #endif
 
-/* A GPU keeps indexed arrays in registers only where loops are unrolled. On a CPU, unrolled loops would spill, for every
- * channel, all that is the same for every block. */
+/* A GPU keeps indexed arrays in registers only where loops are unrolled. On a CPU, unrolled loops would spill everything
+ * that is the same for all blocks, again for every channel. */
 #if WIDTH == 1
 #define EACH_CHANNEL _Pragma("unroll")
 #define EACH_WINDOW _Pragma("unroll")
@@ -108,7 +110,7 @@ typedef struct {
 #endif
 } ItemBeam;
 
-/* Finds a channel's beam over a work-item; returns 0 where it covers none of the pixels. `term` leads to the table
+/* Finds a channel's beam over the pixels of a work-item; returns 0 if it covers none of them. `term` points to the table
  * coordinate at the tile's centre. */
 INLINE int find_item_beam(__global const float *term, int channel_pitch, const Beam *beam, const Positions *at,
                           ItemBeam *item)
@@ -123,13 +125,13 @@ INLINE int find_item_beam(__global const float *term, int channel_pitch, const B
     const per_cubic coordinate = centre + (J_0(c, i) + j * (J_1(c, i) + j * (J_2(c, i) + j * J_3(c))));
     const per_cubic slope_i = J_0_SLOPE(c, i) + j * (J_1_SLOPE(c, i) + j * J_2_SLOPE(c));
     const per_cubic slope_j = J_1(c, i) + j * (2.0f * J_2(c, i) + j * (3.0f * J_3(c)));
-    /* Half a pixel more than the lanes extend leaves room for the curvature. */
+    /* Extents are half a pixel larger than those of the lanes, which leaves room for the curvature. */
     const per_cubic extent = 0.5f * BLOCK_COLUMNS * MAGNITUDE(slope_i) + 0.5f * CUBIC_ROWS * MAGNITUDE(slope_j);
     const per_cubic_int covers = (coordinate + extent > beam->low) & (coordinate - extent < beam->high);
     if (!ANY(covers))
         return 0;
 #if ONE_CUBIC
-    /* Linear about the work-item's middle, with the one second derivative that matters. */
+    /* Linear about the middle of the work-item's pixels, with the only second derivative that matters. */
     const vfloat aside = at->i - i;
     item->c1 = slope_j + aside * (c.ij + 2.0f * (i * c.iij + j * c.ijj));
     item->c0 = coordinate + aside * slope_i - j * item->c1;
@@ -152,7 +154,7 @@ INLINE vfloat block_weights(const ItemBeam *item, const Beam *beam, int block, v
 }
 #endif
 
-/* The windows of the blocks, each about the middle of those that share it. */
+/* The windows of the blocks. Each lies about the middle of the blocks that share it. */
 INLINE Windows item_windows(const Polynomial *position, const Positions *at, int reference, int pitch)
 {
     const float c0 = IN_MIDDLE_COLUMN(position->c0), c1 = IN_MIDDLE_COLUMN(position->c1);
@@ -173,8 +175,8 @@ typedef struct {
 #endif
 } ItemChannel;
 
-/* Channels that are prepared before any adds its echoes: what comes before the first block of a channel is a long chain,
- * which a CPU overlaps with those of other channels only if they follow each other. */
+/* Channels that are prepared before any of them adds its echoes. Preparing a channel is a long chain of operations, which a
+ * CPU overlaps with those of other channels only if they follow each other closely. */
 #if WIDTH == 1
 #define CHANNELS_AT_ONCE 1
 #else
@@ -238,7 +240,7 @@ EACH_CHANNEL
             const size_t pair = first_entry + entry;
             const Reference reference = {reference_sample[pair], reference_fraction[pair], reference_phase[pair]};
 #endif
-            /* Half a sample less is what interpolate() wants. */
+            /* interpolate() expects positions that are half a sample less. */
             const float start = reference.fraction - 0.5f;
             const float cycles = reference.phase - start * cycles_per_sample;
             item_channel->position = polynomial_in_j(start, coefficients_at(term, channel_pitch), at.i);

@@ -1,17 +1,17 @@
-/* Weights of channels by the beam: by the sine of the aspect angle to a pixel.
+/* Beam weights of channels, which depend on the sine of the aspect angle to a pixel.
  *
  * With u the track's direction at a channel and e the unit vector to the pixel from the middle of transmitter and
- * receiver, u.e is the sine of the aspect angle. The weights are tabulated over it: a pixel's table coordinate is
- * u.e - beam_origin, where the host has scaled u and beam_origin to intervals of the table.
+ * receiver, u.e is the sine of the aspect angle, over which the weights are tabulated. The table coordinate of a pixel is
+ * u.e - beam_origin; the host has scaled u and beam_origin to intervals of the table.
  *
  * Build options
  *   BEAM       intervals of the table; 0: no weights.
- *   ONE_CUBIC  1: pixels lie so close that one cubic serves all pixels of a work-item, or all points of a block; 0: every
- *              block, or every point, has one.
- *   NORMALISE  1: sum the weights too.
+ *   ONE_CUBIC  1: pixels lie so close together that one cubic serves all pixels of a work-item (tiles), or all points of
+ *              a block (points); 0: every block, or every point, has its own.
+ *   NORMALISE  1: also sum the weights.
  *
- * beam_table: float [BEAM][4], a cubic of the weight per interval, constant terms first, in a variable that goes from 0
- * to 1 over the interval. Weights are 0 at table coordinates up to beam_low and from beam_high on.
+ * beam_table: float [BEAM][4], the weight as a cubic for each interval, in a variable that goes from 0 to 1 over the
+ * interval; constant terms come first. Weights are 0 at table coordinates up to beam_low and from beam_high on.
  */
 
 #include "vectors.h"
@@ -21,8 +21,8 @@ typedef struct {
     float origin, low, high;
 } Beam;
 
-/* Number of the interval that holds a table coordinate, as a float. Every number, NaN too, gives an interval of the
- * table. */
+/* Number of the interval that contains a table coordinate, as a float. Every coordinate, including NaN, gives an interval
+ * of the table. */
 #define DEFINE_INTERVAL_AT(type, name)                                     \
     INLINE type name(type coordinate)                                      \
     {                                                                      \
@@ -34,7 +34,7 @@ typedef struct {
 #if BEAM
 DEFINE_INTERVAL_AT(vfloat, intervals_at)
 
-/* The value of cubics at x, but 0 where the table coordinate lies outside (low, high). */
+/* Values of cubics at x, or 0 where the table coordinate lies outside (low, high). */
 INLINE vfloat weights_within(vfloat c0, vfloat c1, vfloat c2, vfloat c3, vfloat x, vfloat coordinate, const Beam *beam)
 {
     vfloat weight = c0 + x * (c1 + x * (c2 + x * c3));

@@ -3,25 +3,25 @@
  *
  *     t(i, j) = c_i i + c_j j + c_ii i^2 + c_ij i j + c_jj j^2 + c_iii i^3 + c_iij i^2 j + c_ijj i j^2 + c_jjj j^3
  *
- * in samples. With p the path from transmitter to receiver, e_t and e_r the unit vectors from either to the pixel, R_t and
- * R_r the distances, and b the receiver's velocity over the sound speed (0 unless MOVING),
+ * in samples. Let p be the path from transmitter to receiver, e_t and e_r the unit vectors from them to the pixel, R_t and
+ * R_r the distances, and b the receiver's velocity over the sound speed (0 unless MOVING). Then
  *
  *     dp   = (e_t + e_r).dx / (1 + e_r.b),
  *     d2p  = (dx'P_t dx / R_t + dy'P_r dy / R_r) / (1 + e_r.b),   dy = dx - b dp,   P = 1 - e e',
- *     d3|D| = -3 (e.dx) (dx'P dx) / R^2; b is left out of it, being a share |b| of the smallest term.
+ *     d3|D| = -3 (e.dx) (dx'P dx) / R^2, without b, which would change this smallest term by a fraction |b| only.
  *
- * With BEAM the expansion of the beam's table coordinate (beam.h) follows: q = along.D / R - beam_origin. Its numerator
- * is linear, so of the terms X_n of order n in a quotient of Taylor series
+ * With BEAM the expansion of the beam's table coordinate (beam.h) follows, q = along.D / R - beam_origin. Its numerator is
+ * linear. With X_n for the terms of order n of a function X, a quotient of Taylor series therefore has
  *
  *     q_1 = (along.dx - R_1 q_0)/R_0,   q_2 = -(R_1 q_1 + R_2 q_0)/R_0,   q_3 = -(R_1 q_2 + R_2 q_1 + R_3 q_0)/R_0.
  *
  * Build options: WIDTH (vectors.h), BISTATIC, MOVING and BEAM (antennas.h).
  *
- * geometry, centres  see antennas.h; `centres` holds the tiles at work only.
+ * geometry, centres  see antennas.h; `centres` holds only the tiles at work.
  * ranges             see parts.h. A work-item expands WIDTH channels of a tile.
  * column_step, row_step  m per pixel.
  * samples_per_m      samples per metre of range, which is half a path.
- * drift              samples by which every range grows less, per column and per row.
+ * drift              samples by which every range becomes shorter because receivers move, per column and per row.
  * beam_origin        see beam.h.
  * expansions         float [tiles][EXPANSION_TERMS][channel_pitch], in the order of expansions.h.
  *
@@ -32,7 +32,7 @@
 #include "antennas.h"
 #include "expansions.h"
 
-/* Taylor coefficients of a function of pixels, without the constant one. */
+/* Taylor coefficients of a function of pixels, without the constant term. */
 typedef struct {
     vfloat i, j, ii, ij, jj, iii, iij, ijj, jjj;
 } Taylor;
@@ -66,8 +66,8 @@ INLINE Taylor scaled_expansion(Taylor a, vfloat factor)
                     a.iii * factor, a.iij * factor, a.ijj * factor, a.jjj * factor};
 }
 
-/* Expansion of the path by way of a receiver that moves, from those of the distances to the transmitter and to the
- * receiver at the time of arrival, which lies at -D from the centre. */
+/* Expansion of the path to a receiver that moves, from the expansions of the distances to the transmitter and to the
+ * receiver at the time of arrival. D leads from the latter to the centre. */
 INLINE Taylor moving_path_expansion(Taylor out, Taylor back, Vector D, Vector velocity, Vector column_step,
                                     Vector row_step)
 {
@@ -84,7 +84,7 @@ INLINE Taylor moving_path_expansion(Taylor out, Taylor back, Vector D, Vector ve
     return scaled_expansion(sum_of_expansions(out, back), closing);
 }
 
-/* Expansion of along.D / |D|; `value` is that at the centre, and R expands |D|. */
+/* Expansion of along.D / |D|. `value` becomes its value at the centre; R is the expansion of |D|. */
 INLINE Taylor aspect_expansion(Vector D, Vector along, Taylor R, vfloat *value, Vector column_step, Vector row_step)
 {
     const vfloat inverse = 1.0f / magnitude(D);
@@ -126,7 +126,7 @@ __kernel void expand_tiles(__global const float *geometry, int geometry_pitch, _
 {
     const int entry = get_global_id(0) * WIDTH, tile = get_global_id(1);
     __global const float *centre = centres + 6 * tile;
-    /* Channels beyond the tile's last are expanded for nobody, but must be read within the rows. */
+    /* Expansions of channels beyond the tile's last are not used, but their geometry must be read within the rows. */
     const int channel = clamp(ranges[3 * (first_range + tile)] + entry, 0, geometry_pitch - WIDTH);
     const Vector column = uniform_vector(column_step), row = uniform_vector(row_step);
 

@@ -1,9 +1,9 @@
-/* Expansions of the range over a tile, to third order in pixels i along columns and j along rows from its centre, as
- * expand_tiles finds them and backproject_tiles evaluates them.
+/* Expansions of the range over a tile, to third order in pixels from its centre: i along columns, j along rows.
+ * expand_tiles finds them, and backproject_tiles evaluates them.
  *
  * expansions: float [tiles][EXPANSION_TERMS][channel_pitch], from each tile's first channel on. Terms 0 to 8 are the
- * coefficients of i, j, i^2, i j, j^2, i^3, i^2 j, i j^2 and j^3 for the range from the centre's, samples. With BEAM
- * follow the beam's table coordinate at the centre (beam.h) and its coefficients in the same order.
+ * coefficients of i, j, i^2, i j, j^2, i^3, i^2 j, i j^2 and j^3 for the difference from the centre's range, samples. With
+ * BEAM they are followed by the beam's table coordinate at the centre (beam.h) and its coefficients in the same order.
  */
 
 #include "vectors.h"

@@ -1,10 +1,10 @@
-/* Vectors in space, one per lane, and how distances change without cancellation. */
+/* Vectors in space, one per lane, and changes of distance that are computed without cancellation. */
 
 #include "vectors.h"
 
-/* In loops of a constant number of passes, Mesa's rusticl (25.0, on llvmpipe) hands inline functions the value that a struct
- * had in an earlier pass. So no loop changes a Vector from pass to pass, and that of one lane, where the compiler unrolls
- * more, is no struct. */
+/* In loops with a constant number of passes, Mesa's rusticl (25.0, on llvmpipe) passes to inline functions the value that a
+ * struct had in an earlier pass. So no loop changes a Vector from pass to pass. With one lane, where the compiler unrolls
+ * more loops, a Vector is not a struct. */
 #if WIDTH == 1
 typedef float3 Vector;
 #else
@@ -47,7 +47,7 @@ INLINE vfloat distance_change(Vector D, Vector d)
     return change / (sqrt(max(square + change, 0.0f)) + sqrt(square) + FLT_MIN);
 }
 
-/* The same to a receiver that moves on while the echo comes back: q for which q = |D + d - q b| - |D|, from
+/* The same for a receiver that moves on while the echo comes back: the q that satisfies q = |D + d - q b| - |D|, from
  *
  *     (1 - b.b) q^2 + 2 (|D| + (D + d).b) q - (2 D + d).d = 0. */
 INLINE vfloat moving_distance_change(Vector D, Vector d, Vector b)

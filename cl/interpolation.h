@@ -1,9 +1,10 @@
 /* Weights of an interpolation filter between samples.
  *
- * An interpolation at nu in [-0.5, 0.5] samples from the middle of an even number of taps weighs the taps at
- * +-(pair + 0.5) by E(nu^2) +- nu O(nu^2), with polynomials E and O of its own for every pair.
+ * The number of taps is even. For an interpolation at nu in [-0.5, 0.5] samples from their middle, the two taps of a pair,
+ * at +-(pair + 0.5) samples, have the weights E(nu^2) +- nu O(nu^2). Every pair has its own polynomials E and O.
  *
- * filter: float [taps / 2][2][taps / 2], per pair from the innermost the coefficients of E, then O, highest power first.
+ * filter: float [taps / 2][2][taps / 2]; for each pair, from the innermost one on, the coefficients of E and then of O,
+ * highest powers first.
  */
 
 #include "vectors.h"

@@ -1,32 +1,27 @@
-/* Looking a range line up between its samples, at a position of its own for every lane.
+/* Range lines read between their samples, where every lane has a position of its own.
  *
- * Fetching the samples is what limits backprojection, so there are four ways to do it:
- *   - WIDTH 1: a work-item reads its samples, real and imaginary part at once;
- *   - several lanes: every lane reads its samples one by one;
- *   - with HAS_PICK (vectors.h), lanes pick their samples from vectors of consecutive ones. 32 registers of AVX-512 hold
- *     two vectors of each part, with the samples of all taps;
- *   - 16 registers of AVX2 hold none: for each tap one vector is loaded, or two.
- * Picking is two to four times as fast as reading one by one. The host asks for it where the positions of all lanes of
- * a block lie within a window.
+ * The speed of backprojection is limited by how fast samples are fetched, so there are four ways to do it:
+ *   - with WIDTH 1 a work-item reads its samples, real and imaginary parts at once;
+ *   - with more lanes, every lane reads its samples one by one;
+ *   - with HAS_PICK (x86.h) and AVX-512, lanes pick their samples from two vectors of consecutive ones of each part, which
+ *     contain the samples of all taps, and for which there are enough registers (32);
+ *   - with HAS_PICK and AVX2 (16 registers), one or two vectors are loaded for each tap.
+ * Picking is two to four times as fast as reading one by one. The host asks for it if the positions of all lanes of a
+ * block lie within a window.
  *
  * Build options
  *   PERMUTE  vectors from which lanes pick, 1 or 2 (2 with AVX-512), or 0.
  *   TAPS     samples per interpolation: 2, 4, 6 or 8.
- *   WINDOWS  windows that the blocks of a work-item take: 1, 2 or 4. Without windows it counts as 1.
+ *   WINDOWS  windows for the blocks of a work-item: 1, 2 or 4. Without HAS_PICK there are none, and it counts as 1.
  */
 
 #include "interpolation.h"
 #include "samples.h"
 
-#ifndef HAS_PICK
-#undef WINDOWS
-#define WINDOWS 1
-#endif
+#if HAS_PICK
 
-#ifdef HAS_PICK
-
-/* POSITIONS: how many whole samples the positions of lanes can start from, next to each other, within a window of
- * WINDOW_SAMPLES. */
+/* POSITIONS: number of adjacent whole samples at which the taps of a lane can start in a window of WINDOW_SAMPLES
+ * samples. */
 #if AVX == 512
 #define POSITIONS (2 * WIDTH - TAPS + 1)
 #define WINDOW_SAMPLES (2 * WIDTH)
@@ -35,8 +30,8 @@
 #define WINDOW_SAMPLES (PERMUTE * WIDTH + TAPS - 1)
 #endif
 
-/* A window of a line. Positions are in samples from a reference sample of the line, less 0.5; `first` leads from a
- * position's integer part to the first of its taps in the window. */
+/* A window of a line. Positions are in samples from a reference sample of the line, less 0.5. The integer part of a position
+ * plus `first` is the number, in the window, of the first of its taps. */
 typedef struct {
 #if AVX == 512
     vfloat re_low, re_high, im_low, im_high;
@@ -63,12 +58,12 @@ typedef union {
     int of[4];
 } Numbers;
 
-/* Where windows start in their line, and the `first` of their lookups. */
+/* Where windows start in their line, and `first` of each (see Lookup). */
 typedef struct {
     Numbers start, first;
 } Windows;
 
-/* The windows about positions t from sample `reference`; within the line whatever t is. */
+/* The windows about positions t from sample `reference`. They lie within the line for every t. */
 INLINE Windows windows_about(float4 t, int reference, int pitch)
 {
     const int4 lowest = as_int4((t - 0.5f * (POSITIONS - 1)) + ROUNDER) - 0x4B400000;
@@ -99,7 +94,7 @@ typedef struct {
 
 INLINE Taps fetch_taps(const Lookup *lookup, vfloat shifted)
 {
-    /* Picking ignores all but an index's lowest bits, so ROUNDER's bits may stay. */
+    /* Picking ignores all but the lowest bits of an index, so those of ROUNDER need not be removed. */
     return (Taps){lookup, AS_VINT(shifted) + lookup->first};
 }
 
@@ -121,6 +116,8 @@ INLINE vfloat samples_from(__global const sample_t *sample, vint index)
 #endif
 
 #else
+#undef WINDOWS
+#define WINDOWS 1
 
 typedef struct {
     __global const sample_t *line;
@@ -161,7 +158,7 @@ typedef struct {
 
 INLINE Taps fetch_taps(const Lookup *lookup, vfloat shifted)
 {
-    /* Positions outside the line move inside, where the host has put zeros. */
+    /* Positions outside the line are moved inside, where the host has put zeros. */
     const vint index = min(max(VINT_OF_SHIFTED(shifted) + lookup->first, (vint)0), (vint)(lookup->pitch - TAPS));
     Taps taps;
 #if WIDTH == 1
@@ -184,8 +181,8 @@ INLINE Taps fetch_taps(const Lookup *lookup, vfloat shifted)
 
 #endif
 
-/* The line at t + 0.5 samples from the reference sample of the lookup. The 0.5 makes rounding find the lower of the two
- * middle taps. */
+/* Interpolates the line at t + 0.5 samples from the reference sample of the lookup. Because of the 0.5, rounding t finds the
+ * lower of the two middle taps. */
 INLINE void interpolate(const Lookup *lookup, vfloat t, __global const float *filter, vfloat *re, vfloat *im)
 {
     const vfloat shifted = t + ROUNDER;

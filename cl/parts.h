@@ -1,15 +1,15 @@
-/* The parts of an image that have a centre of their own, tiles or groups of points, and what they need of the lines.
+/* The parts of an image that have a centre of their own, which are tiles or groups of points, and the lines they need.
  *
- * No absolute range enters a kernel: the host refers every (part, channel) pair, in float64, to the part's centre, and
- * kernels add the difference in range between a pixel and that centre.
+ * Kernels never receive absolute ranges. For every (part, channel) pair the host computes, in float64, the range of the
+ * part's centre; kernels add the difference between the ranges of a pixel and of that centre.
  *
  * Build options
- *   ALIGNED  1: the host's earlier stages have aligned every line on its part's centre, at the same sample and at phase
- *            0; 0: sample and phase of the centre come per (part, channel).
+ *   ALIGNED  1: earlier stages have aligned every line on the centre of its part, whose echo is at the same sample of all
+ *            lines and has phase 0; 0: its sample and phase are given for each (part, channel).
  *
  * ranges: int [parts][3], the channels that a part receives from: the first one, the one after the last, and the line of
- * the first one; the lines of the others follow. What is held per (part, channel) begins with the part's first channel,
- * [parts][channel_pitch]. The parts at work begin at number first_range of `ranges`.
+ * the first one; the lines of the others follow. Tables per (part, channel), [parts][channel_pitch], begin with the part's
+ * first channel. The parts at work begin at number first_range of `ranges`.
  *
  * reference_sample: int, the sample nearest to the centre's echo, counted from the line's first sample.
  * reference_fraction: float, from there to the centre's echo, samples.

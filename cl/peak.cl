@@ -1,10 +1,10 @@
-/* Arithmetic peak of a device: every work-item runs CHAINS independent chains of multiply-adds on vectors of WIDTH floats,
- * which is steps * CHAINS * WIDTH * 2 floating-point operations.
+/* Measures the arithmetic peak of a device. Every work-item computes CHAINS independent chains of multiply-adds on vectors
+ * of WIDTH floats, which takes steps * CHAINS * WIDTH * 2 floating-point operations.
  *
- * result: float [items]; a sum that keeps the compiler from dropping the work.
+ * result: float [items], sums that keep the compiler from removing the work.
  *
  * Build options
- *   CHAINS  Too few do not hide the latency of a multiply-add; too many do not fit the registers.
+ *   CHAINS  number of chains. Too few do not hide the latency of a multiply-add; too many do not fit the registers.
  */
 
 #include "vectors.h"

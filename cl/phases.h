@@ -1,13 +1,14 @@
 /* Sine and cosine of phases in cycles.
  *
- * Polynomials of our own, because sin() and cos() of wide vectors are scalar code on some CPU drivers, and because
- * reducing radians loses bits that reducing cycles keeps.
+ * They are computed by polynomials here, because some CPU drivers compute sin() and cos() of wide vectors in scalar code,
+ * and because reducing radians to one period loses bits that reducing cycles keeps.
  *
  * Build options
- *   PHASE_TERMS  terms of each polynomial: 4 err by -61 dB, 5 by -92 dB, 6 by -126 dB, and 7 as single precision does.
+ *   PHASE_TERMS  terms of each polynomial. Errors are -61 dB with 4 terms, -92 dB with 5, -126 dB with 6, and those of single
+ *                precision with 7.
  *
- * phase_polynomials: float [2][PHASE_TERMS]. With r the phase less its nearest integer, sin(2 pi r) is r times the first
- * polynomial in r^2, and cos(2 pi r) is the second one; the coefficients come highest power first.
+ * phase_polynomials: float [2][PHASE_TERMS]. With r the phase minus the nearest integer, sin(2 pi r) is r times the first
+ * polynomial in r^2, and cos(2 pi r) is the second one. Coefficients are in the order of falling powers.
  */
 
 #include "vectors.h"

@@ -1,38 +1,37 @@
 /* The pixels of a work-item, and their sums over channels.
  *
- * The lanes of a vector form a block of BLOCK_COLUMNS x BLOCK_ROWS pixels. A work-item computes STACK blocks, one below
- * the other.
+ * The lanes of a vector are the pixels of a block, BLOCK_COLUMNS x BLOCK_ROWS of them. A work-item computes STACK blocks, one
+ * below the other.
  *
  * Build options
- *   OVERWRITE  1: sums replace pixels; 0: they are added to them.
- *   BEAM, NORMALISE  as in beam.h; with both, weights are summed beside the echoes.
+ *   OVERWRITE  1: sums replace the pixels; 0: they are added to the pixels.
+ *   BEAM, NORMALISE  as in beam.h; with both, weights are summed as well as echoes.
  */
 
 #include "lookup.h"
 #include "phases.h"
 
 /* LANE_COLUMNS and LANE_ROWS: positions of the lanes from their block's centre, pixels. */
-#if WIDTH == 16
-#define BLOCK_COLUMNS 4
-#define BLOCK_ROWS 4
-#define LANE_COLUMNS (vfloat)(-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f)
-#define LANE_ROWS (vfloat)(-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.5f, -.5f, .5f, .5f, .5f, .5f, 1.5f, 1.5f, 1.5f, 1.5f)
-#elif WIDTH == 8
-#define BLOCK_COLUMNS 4
-#define BLOCK_ROWS 2
-#define LANE_COLUMNS (vfloat)(-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f)
-#define LANE_ROWS (vfloat)(-.5f, -.5f, -.5f, -.5f, .5f, .5f, .5f, .5f)
-#elif WIDTH == 4
-#define BLOCK_COLUMNS 2
-#define BLOCK_ROWS 2
-#define LANE_COLUMNS (vfloat)(-.5f, .5f, -.5f, .5f)
-#define LANE_ROWS (vfloat)(-.5f, -.5f, .5f, .5f)
-#else
-#define BLOCK_COLUMNS 1
-#define BLOCK_ROWS 1
-#define LANE_COLUMNS 0.0f
-#define LANE_ROWS 0.0f
-#endif
+#define BLOCK_COLUMNS JOIN(BLOCK_COLUMNS_, WIDTH)
+#define BLOCK_ROWS JOIN(BLOCK_ROWS_, WIDTH)
+#define LANE_COLUMNS ((vfloat)JOIN(LANE_COLUMNS_, WIDTH))
+#define LANE_ROWS ((vfloat)JOIN(LANE_ROWS_, WIDTH))
+#define BLOCK_COLUMNS_1 1
+#define BLOCK_ROWS_1 1
+#define LANE_COLUMNS_1 (0.0f)
+#define LANE_ROWS_1 (0.0f)
+#define BLOCK_COLUMNS_4 2
+#define BLOCK_ROWS_4 2
+#define LANE_COLUMNS_4 (-.5f, .5f, -.5f, .5f)
+#define LANE_ROWS_4 (-.5f, -.5f, .5f, .5f)
+#define BLOCK_COLUMNS_8 4
+#define BLOCK_ROWS_8 2
+#define LANE_COLUMNS_8 (-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f)
+#define LANE_ROWS_8 (-.5f, -.5f, -.5f, -.5f, .5f, .5f, .5f, .5f)
+#define BLOCK_COLUMNS_16 4
+#define BLOCK_ROWS_16 4
+#define LANE_COLUMNS_16 (-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 1.5f)
+#define LANE_ROWS_16 (-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.5f, -.5f, .5f, .5f, .5f, .5f, 1.5f, 1.5f, 1.5f, 1.5f)
 #define STACK 4
 #define ITEM_ROWS (BLOCK_ROWS * STACK)
 
@@ -61,7 +60,7 @@ INLINE void clear_sums(Sums *sums)
 }
 
 /* Adds the echoes of one channel to a block: its line at t + 0.5 samples from the lookup's reference sample, rotated by
- * `cycles`. With BEAM they are weighted, and each weight counts for so many channels. */
+ * `cycles`. With BEAM the echoes are weighted, and `channels` times each weight is added to the sums of weights. */
 INLINE void add_echoes(Sums *sums, int block, const Lookup *lookup, vfloat t, __global const float *filter, vfloat cycles,
                        __global const float *phase_polynomials, vfloat weight, float channels)
 {
@@ -85,7 +84,7 @@ INLINE void add_echoes(Sums *sums, int block, const Lookup *lookup, vfloat t, __
 #define PUT +=
 #endif
 
-/* Puts a work-item's blocks into the pixels from (row, column) on, of an image whose rows hold `columns`. */
+/* Puts a work-item's blocks into the pixels from (row, column) on of an image with `columns` columns. */
 INLINE void put_blocks(const vfloat *re, const vfloat *im, __global float2 *pixels, int columns, int row, int column)
 {
 #pragma unroll

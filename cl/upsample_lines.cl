@@ -1,19 +1,19 @@
-/* Upsampling of range lines: every line, shifted in frequency, at PHASES / step times its rate,
+/* Upsampling of range lines: shifts every line in frequency, and samples it at PHASES / step times its rate,
  *
  *     y(m) = sum_t h_p(t) x(q + 1 - TAPS/2 + t) exp(-j 2 pi frequency (q + 1 - TAPS/2 + t)),
  *
- * where (first + m) step = q PHASES + p, 0 <= p < PHASES: y(m) lies at (first + m) step / PHASES of x, and h_p is the
- * filter for that fraction of a sample. Beyond its ends a line is zero.
+ * where (first + m) step = q PHASES + p, 0 <= p < PHASES. So y(m) lies at sample (first + m) step / PHASES of x, and h_p is
+ * the filter for the fraction p / PHASES of a sample. Beyond its ends a line is zero.
  *
- * Build options: WIDTH (vectors.h; lanes are consecutive samples of y), PERMUTE (vectors.h; 1 takes the lanes' samples from
- * two registers), HALF (samples.h, of y), PHASE_TERMS (phases.h), and
+ * Build options: WIDTH (vectors.h; lanes are consecutive samples of y), PERMUTE (x86.h; lanes then pick their samples from
+ * two registers), HALF (samples.h; for y), PHASE_TERMS (phases.h), and
  *   TAPS             of the filters, even.
  *   PHASES           a multiple of WIDTH.
  *   FREQUENCY_SHIFT  0: frequency is 0.
  *
  * samples           float2 [lines at work][count].
- * filters           float [PHASES / WIDTH][TAPS][WIDTH]: lane by lane the filters of samples m, m + 1, ... from multiples
- *                   of WIDTH on.
+ * filters           float [PHASES / WIDTH][TAPS][WIDTH]: the filters of WIDTH consecutive samples from each multiple m of
+ *                   WIDTH on, one for each lane.
  * phase_polynomials see phases.h.
  * frequency         2^-32 cycles per sample of x, with FREQUENCY_SHIFT.
  * lines, pitch      the upsampled lines (samples.h), from line number first_line on: y in `length` samples from number
@@ -25,17 +25,16 @@
 #include "phases.h"
 #include "samples.h"
 
-#ifdef HAS_PICK
-#if WIDTH == 16
-#define INT_LANES ((vint)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
-#define EVEN 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30
-#define ODD 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31
-#else
-#define INT_LANES ((vint)(0, 1, 2, 3, 4, 5, 6, 7))
-#define EVEN 0, 2, 4, 6, 8, 10, 12, 14
-#define ODD 1, 3, 5, 7, 9, 11, 13, 15
-#endif
-#endif
+/* Numbers of all lanes, and of every other one of two vectors. */
+#define INT_LANES ((vint)JOIN(INT_LANES_, WIDTH))
+#define INT_LANES_8 (0, 1, 2, 3, 4, 5, 6, 7)
+#define INT_LANES_16 (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
+#define EVEN JOIN(EVEN_, WIDTH)
+#define EVEN_8 0, 2, 4, 6, 8, 10, 12, 14
+#define EVEN_16 EVEN_8, 16, 18, 20, 22, 24, 26, 28, 30
+#define ODD JOIN(ODD_, WIDTH)
+#define ODD_8 1, 3, 5, 7, 9, 11, 13, 15
+#define ODD_16 ODD_8, 17, 19, 21, 23, 25, 27, 29, 31
 
 /* A given line, of `count` samples, and the shift in frequency that it takes. */
 typedef struct {
@@ -48,7 +47,7 @@ typedef struct {
 } Given;
 
 #if FREQUENCY_SHIFT
-/* Phase of the shift at a sample, cycles: whole cycles overflow. */
+/* Phase of the shift at a sample, in cycles. Whole cycles overflow, and so do not matter. */
 INLINE float phase_at(const Given *given, int index)
 {
     return (int)((uint)given->frequency * (uint)index) * -0x1p-32f;
@@ -71,7 +70,7 @@ INLINE float2 sample_at(const Given *given, int index)
 #endif
 }
 
-#ifdef HAS_PICK
+#if HAS_PICK
 /* WIDTH samples of x from an index on, shifted in frequency, as real and imaginary parts. */
 INLINE void load_samples(const Given *given, int index, vfloat *re, vfloat *im)
 {
@@ -150,8 +149,8 @@ __kernel void upsample_lines(__global const float2 *samples, int count, __global
         const int m = k - margin;
         vfloat re = 0.0f, im = 0.0f;
         if (m >= 0 && m < length) {
-            /* An offset of whole samples keeps positions from being negative, so that division rounds down. As an int,
-             * a position can be that of lines of up to 2^31 / PHASES samples. */
+            /* An offset of whole samples keeps positions from being negative, so that division rounds down. Positions fit an
+             * int for lines of up to 2^31 / PHASES samples. */
             const int offset = 1 << 20;
             const int position = (first + m) * step + offset * PHASES;
             const int begin = position / PHASES - offset + 1 - TAPS / 2;

@@ -1,9 +1,9 @@
-/* The vectors of the device's compiler, as far as its own macros tell. The host reads the required work-group size
- * without running the kernel: along x the floats of a vector; along y 2 if the compiler can permute them in registers
- * (vectors.h), else 1.
+/* Reports the vectors of the device's compiler, according to the macros that it defines. The host does not run the kernel
+ * but reads its required work-group size: along x the floats of a vector; along y 2 if the compiler can permute them in
+ * registers (x86.h), else 1.
  *
- * A driver reports what the processor has. On processors newer than itself its compiler uses less, and vectors wider than
- * the compiler's break it.
+ * The driver reports the vectors of the processor, but if the processor is newer than the driver, its compiler may use
+ * shorter ones, and vectors longer than the compiler's break it.
  */
 
 #ifdef __AVX512F__

@@ -305,7 +305,9 @@ def all_channels(
 def band_table(
     bands: Bands | None, need: ChannelRanges, first_of_parent: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return the stage kernel's table of bands, [roots, subimages, bands, 7]: see `cl/stage.cl`.
+    """Return the stage kernel's table of bands, [roots, subimages, bands, 7].
+
+    Its columns are the members of `Band` in `cl/stages.h`.
 
     Parameters
     ----------

@@ -101,11 +101,17 @@ class _Kernels:
             "CHUNK": CHUNK,
             "PHASE_TERMS": phases.PRECISE_TERMS,
         }
-        ramp, rows = int(geometry.ramps), int(geometry.track.is_sheet)
+        ramp = int(geometry.ramps)
         division = geometry.division
+        if geometry.track.is_sheet:
+            first = device.kernel("first_sheet_stage", RAMP=ramp, **options)
+            later = device.kernel("later_sheet_stage", **options)
+        else:
+            first = device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, **options)
+            later = device.kernel("stage", SHIFTS_GIVEN=0, RAMP=0, **options)
         return cls(
-            first=device.kernel("stage", SHIFTS_GIVEN=1, RAMP=ramp, ROWS=rows, **options),
-            later=device.kernel("stage", SHIFTS_GIVEN=0, RAMP=0, ROWS=2 * rows, **options),
+            first=first,
+            later=later,
             filters=filters,
             parents=[
                 device.upload(division.parents(level).astype(np.int32)) if level else None
@@ -267,7 +273,7 @@ def _bands(virtual: VirtualChannels) -> int:
 
 
 def _table_values(geometry: Geometry, sector: Sector, level: int) -> dict[str, NDArray]:
-    """Return the values of a stage's tables, by name; see `cl/stage.cl`."""
+    """Return the values of a stage's tables, by name; see `cl/stages.h`."""
     virtual, need = sector.virtual[level], sector.needs[level]
     values = {f"base{level}": virtual.base, f"between{level}": virtual.between}
     if virtual.bands is not None and virtual.bands.between is not None:

@@ -1,4 +1,4 @@
-"""Kernels of `cl/`: their sources, and their arguments by name."""
+"""The kernels of `cl/`: their sources, and their arguments, which are given by name."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def kernel_source(name: str) -> str:
 
 
 def whole_source(name: str) -> str:
-    """Return the text of a file of `cl/` in which every included header is inserted, each once.
+    """Return the text of a file of `cl/` in which headers replace the lines that include them.
 
-    Headers are inserted here and not by the driver, because some drivers cannot read paths with
-    spaces, or do not build again after a header has changed. Messages of the compiler still name
-    the original files.
+    Each header is put in once. This is not left to the driver, because some drivers cannot read
+    paths with spaces, and some cache a program without noticing that a header has changed. The
+    compiler's messages still name the original files and lines.
     """
     return "\n".join(_with_headers(name, set()))
 
@@ -54,12 +54,12 @@ def _with_headers(name: str, included: set[str]) -> list[str]:
 
 
 def kernel_parameters(text: str, name: str, options: Mapping[str, int]) -> dict[str, str]:
-    """Return the parameters of a kernel in order, as types by name.
+    """Return the types of a kernel's parameters by name, in order.
 
-    They are read from the source, because the answers of drivers are not reliable: Intel's driver
-    has none for a program from its cache, and PoCL renames parameters with the name of an OpenCL
-    function. The parameter list may contain `#if`, `#else` and `#endif`, with build options, `!`
-    and `&&` in conditions.
+    They are read from the source, because the drivers' own answers are not reliable: Intel's driver
+    knows none for a program from its cache, and PoCL renames parameters that have the name of an
+    OpenCL function. The parameter list may contain `#if`, `#else` and `#endif`, with conditions of
+    build options, `!` and `&&`.
 
     Parameters
     ----------
@@ -68,12 +68,18 @@ def kernel_parameters(text: str, name: str, options: Mapping[str, int]) -> dict[
     name : str
         Name of the kernel.
     options : mapping of str to int
-        Build options. A missing option is 0, as it is for the compiler.
+        Build options. Missing ones are 0, as they are for the compiler.
 
     Returns
     -------
     dict of str to str
-        Each type is "buffer", or the type of a number or vector, such as "int" or "float4".
+        The type of a pointer is "buffer"; others are those of the source, such as "int" or
+        "float4".
+
+    Raises
+    ------
+    ValueError
+        If the source does not declare the kernel, or its parameter list cannot be read.
     """
     text = _COMMENT.sub("", text)
     found = re.search(rf"__kernel\s+void\s+{name}\s*\(([^)]*)\)", text)
@@ -127,9 +133,11 @@ class Kernel:
     Attributes
     ----------
     name : str
+        Name of the kernel, and of its file in `cl/`.
     parameters : dict of str to str
         Types by name, in order; see `kernel_parameters`.
     compiled : pyopencl.Kernel
+        The kernel as PyOpenCL runs it.
     build_seconds : float
         Time that the driver took to build the kernel.
     """
@@ -140,7 +148,7 @@ class Kernel:
     build_seconds: float = 0.0
 
     def __post_init__(self) -> None:
-        """Set the argument types; refuse a source that does not agree with the built kernel."""
+        """Check the number of parameters, and set their types."""
         self._converters = {
             parameter: _converter(type_) for parameter, type_ in self.parameters.items()
         }
@@ -149,7 +157,7 @@ class Kernel:
                 f"kernel {self.name} was built with {self.compiled.num_args} parameters, but its "
                 f"source declares {len(self.parameters)}: {', '.join(self.parameters)}"
             )
-        # PyOpenCL passes numbers ten times as fast if their types are known.
+        # PyOpenCL passes numbers more than ten times as fast if it knows their types.
         self.compiled.set_scalar_arg_dtypes(
             [_SCALARS.get(type_) for type_ in self.parameters.values()]
         )
@@ -160,7 +168,7 @@ class Kernel:
         Raises
         ------
         TypeError
-            If an argument is missing or unknown, or has a type that does not match its parameter.
+            If an argument is missing, unknown, or not of its parameter's type.
         """
         if arguments.keys() != self.parameters.keys():
             missing = [name for name in self.parameters if name not in arguments]
@@ -181,7 +189,10 @@ class Kernel:
 
 
 def _converter(type_: str) -> Callable[[object], object]:
-    """Return a function that converts a value to the type of a parameter, or raises TypeError."""
+    """Return a function that converts a value to a parameter's type.
+
+    The function raises a TypeError whose message says what is expected, such as "a buffer".
+    """
     scalars = {"buffer": _buffer, "int": _int, "float": _float}
     if type_ in scalars:
         return scalars[type_]
@@ -213,7 +224,7 @@ def _vector(length: int, value: object) -> np.ndarray:
     vector = np.asarray(value)
     if vector.shape != (length,) or vector.dtype.kind not in "iuf":
         raise TypeError(f"{length} numbers")
-    # A vector of three numbers is stored in the space of four.
+    # OpenCL stores a vector of three like one of four.
     converted = np.zeros(4 if length == 3 else length, np.float32)
     converted[:length] = vector
     return converted

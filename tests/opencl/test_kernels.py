@@ -5,27 +5,29 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
+from clsas.factorized.buffers import stage_tables
 from clsas.opencl import kernels, phases
 from clsas.opencl.device import DeviceError
 from clsas.opencl.kernels import kernel_parameters, kernel_source, whole_source
 
 HERE = Path(kernels.__file__)
 FOLDERS = (HERE.parents[1] / "cl", HERE.parents[2] / "cl")
-SOURCES = sorted(path.name for folder in FOLDERS for path in folder.glob("*.*"))
+SOURCES = sorted(path.name for folder in FOLDERS for path in folder.glob("*.[ch]*"))
 
 NUMBERS = {"WIDTH": 1, "TAPS": 4, "PHASE_TERMS": 6, "WINDOWS": 1}
 TILE = {"TILE_ROWS": 16, "TILE_COLUMNS": 16}
 BEAMS = [{"BEAM": beam, "NORMALISE": normalise} for beam, normalise in ((0, 0), (64, 0), (64, 1))]
 PIXELS = [beam | {"ALIGNED": aligned} for beam in BEAMS for aligned in (0, 1)]
-STAGES = [
-    {"SHIFTS_GIVEN": given, "RAMP": ramp, "ROWS": rows, "APERTURE_TAPS": 4, "CHUNK": 16}
-    for given, ramp, rows in ((0, 0, 0), (1, 0, 0), (1, 1, 0), (1, 0, 1), (1, 1, 1), (0, 0, 2))
-]
+STAGE = NUMBERS | {"APERTURE_TAPS": 4, "CHUNK": 16}
 OPTIONS = {
     "backproject_tiles": [NUMBERS | TILE | options for options in PIXELS],
     "backproject_points": [NUMBERS | options for options in PIXELS],
     "expand_tiles": [NUMBERS | {"BEAM": beam} for beam in (0, 64)],
-    "stage": [NUMBERS | options for options in STAGES],
+    "stage": [
+        STAGE | {"SHIFTS_GIVEN": given, "RAMP": ramp} for given, ramp in ((0, 0), (1, 0), (1, 1))
+    ],
+    "first_sheet_stage": [STAGE | {"RAMP": ramp} for ramp in (0, 1)],
+    "later_sheet_stage": [STAGE],
     "upsample_lines": [NUMBERS | {"PHASES": 64, "FREQUENCY_SHIFT": shift} for shift in (0, 1)],
     "peak": [NUMBERS | {"CHAINS": 8}],
 }
@@ -163,6 +165,13 @@ def test_a_count_that_the_compiler_denies_is_refused(platform, together):
 def test_every_kernel_is_in_the_table():
     declared = [name for name in SOURCES if "__kernel" in kernel_source(name)]
     assert {Path(name).stem for name in declared} == {*OPTIONS, "vector_size"}
+
+
+def test_the_table_of_bands_has_the_columns_that_kernels_read():
+    table = stage_tables(0, 1, 1, 1, ramps=False)["bands0"]
+    (struct,) = re.findall(r"typedef struct \{([^}]*)\} Band;", kernel_source("stages.h"))
+    columns = re.sub(r"/\*.*?\*/|\bint\b", "", struct).replace(",", ";").split(";")
+    assert len([name for name in columns if name.strip()]) == table.shape[-1]
 
 
 @pytest.mark.filterwarnings("ignore::pyopencl.CompilerWarning")
