@@ -14,7 +14,7 @@ from clsas.cli.outputs import json_able, report
 from clsas.cli.parameters import INPUT
 from clsas.files.cphd import START as CPHD
 from clsas.files.matlab import is_matlab
-from clsas.planning.planner import (
+from clsas.planning.request import (
     BEST_TOLERANCE_DB,
     TOLERANCE_DB,
     WORST_TOLERANCE_DB,

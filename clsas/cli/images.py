@@ -32,7 +32,7 @@ from clsas.exact.run import execute
 from clsas.files.scene_tables import PLAN_KEYS
 from clsas.measures.tradeoff import summary
 from clsas.opencl.device import Device, KernelTimes, open_device
-from clsas.planning.planner import WORST_TOLERANCE_DB
+from clsas.planning.request import WORST_TOLERANCE_DB
 from clsas.plans.factorization import UNREACHED, ExactImage
 from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 

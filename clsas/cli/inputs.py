@@ -15,7 +15,7 @@ from clsas.core import validate
 from clsas.files import scene_files as config
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS
-from clsas.planning.planner import TOLERANCE_DB
+from clsas.planning.request import TOLERANCE_DB
 from clsas.plot.colours import colour_map as check_colour_map
 
 DEFAULT_REQUEST = {"tolerance_db": TOLERANCE_DB}

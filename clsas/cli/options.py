@@ -14,7 +14,7 @@ from clsas.cli.parameters import AXIS, INPUT, PERCENTILES, RATIO, STAGES, Output
 from clsas.core import validate
 from clsas.exact.backprojection import BEST_ACCURACY_DB
 from clsas.files.hdf5 import SUFFIXES
-from clsas.planning.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, wavelengths
+from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, wavelengths
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.sonar.beam import SHAPES
 from clsas.sonar.coverage import UnreachedWarning

@@ -34,8 +34,9 @@ from clsas.measures.effects import (
 from clsas.opencl.device import Device, open_device
 from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
-from clsas.planning.planner import BEST_TOLERANCE_DB, TOLERANCE_DB, WORST_TOLERANCE_DB, plan
+from clsas.planning.planner import plan
 from clsas.planning.prediction import half_precision_error
+from clsas.planning.request import BEST_TOLERANCE_DB, TOLERANCE_DB, WORST_TOLERANCE_DB
 from clsas.plans.factorization import Factorization
 from clsas.plans.plan import Plan
 from clsas.signal.compression import Window

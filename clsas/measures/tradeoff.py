@@ -25,7 +25,8 @@ from clsas.measures.shadows import DARKEST, dark_level_db
 from clsas.measures.tradeoff_result import Response, Row, Tradeoff
 from clsas.opencl.device import Device, open_device
 from clsas.planning.factorize import factorize
-from clsas.planning.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, checked_pairs, plan
+from clsas.planning.planner import plan
+from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, checked_pairs
 from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 

@@ -12,7 +12,7 @@ from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import BEST_ACCURACY_DB
 from clsas.mosaics.provenance import REQUESTS
 from clsas.mosaics.scheduling import Growth
-from clsas.planning.planner import TOLERANCE_DB, checked_pairs, tolerance_in_db
+from clsas.planning.request import TOLERANCE_DB, checked_pairs, tolerance_in_db
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.directions import MOST_TRACK_PINGS
 

@@ -23,13 +23,7 @@ from clsas.planning.exact_image import Exact, expect
 from clsas.planning.fastest import Outcome, fastest, off_track
 from clsas.planning.nearest_beams import nearest_plan
 from clsas.planning.prediction import MARGIN_DB, Conditions, exact_plan
-from clsas.planning.request import BEST_TOLERANCE_DB as BEST_TOLERANCE_DB
-from clsas.planning.request import TOLERANCE_DB as TOLERANCE_DB
-from clsas.planning.request import WORST_TOLERANCE_DB as WORST_TOLERANCE_DB
 from clsas.planning.request import Request
-from clsas.planning.request import checked_pairs as checked_pairs
-from clsas.planning.request import tolerance_in_db as tolerance_in_db
-from clsas.planning.request import wavelengths as wavelengths
 from clsas.planning.search import Allowed
 from clsas.planning.visibility_model import LinesModel, VisibilityModel, model_of
 from clsas.plans.factorization import UNREACHED

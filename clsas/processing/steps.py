@@ -33,7 +33,8 @@ from clsas.navigation.known_points import calibrate_track
 from clsas.navigation.micronavigation import Micronavigation, micronavigate
 from clsas.opencl.device import Device
 from clsas.planning.factorize import factorize
-from clsas.planning.planner import TOLERANCE_DB, plan
+from clsas.planning.planner import plan
+from clsas.planning.request import TOLERANCE_DB
 from clsas.plans.factorization import ExactImage
 from clsas.processing import numbers
 from clsas.processing.record import StepRecord
