@@ -27,7 +27,7 @@ Progress = Callable[[int, int], None]
 
 
 class Imager:
-    """Former of any number of images of the same geometry, exact or factorized.
+    """Any number of images of the same geometry, exact or factorized.
 
     Everything that does not depend on the samples is computed once. Exactly one of `plan`,
     `tolerance_db` and `accuracy_db` must be given.
