@@ -185,7 +185,7 @@ def row(
             "measured": chapter6.fraction(max(map(scene.measured_m, patches))),
         }
     plans = [patch.record.plan for patch in patches]
-    stages = [1 + len(plan["image"]["sides"]) if plan else 1 for plan in plans]
+    stages = [1 + len(plan["method"]["sides"]) if plan else 1 for plan in plans]
     other = image is exact or ALL in method.name  # images that are not compared
     error_db = None if other else clsas.relative_error_db(image, exact)
     mast_db = chapter6.mast_db(image)

@@ -749,9 +749,9 @@ def test_demo_writes_over_no_other_files(tmp_path, monkeypatch):
     (out / "scene.toml").write_bytes(mine)
     before = {file: file.read_bytes() for file in out.iterdir()}
     _, stderr = run("demo", "--out", out, code=1)
-    assert "would write over scene.toml, echoes.h5" in stderr
+    assert "overwrite scene.toml, echoes.h5" in stderr
     (out / "scene.toml").unlink()
-    assert "would write over echoes.h5" in run("demo", "--out", out, code=1)[1]
+    assert "overwrite echoes.h5" in run("demo", "--out", out, code=1)[1]
     del before[out / "scene.toml"]
     assert {file: file.read_bytes() for file in out.iterdir()} == before
 

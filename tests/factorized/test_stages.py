@@ -571,10 +571,10 @@ def test_a_grid_that_no_line_reaches_warns_and_is_zero():
     grid = around(0, 400)
     with pytest.warns(ClsasWarning, match="no pixel"):
         chosen = plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
-    assert not factorize(lines, grid, chosen).pixels.any()
-    with pytest.warns(ClsasWarning, match="no pixel"):
-        image = factorize(lines, grid, Plan.from_json(chosen.to_json()))
-    assert not image.pixels.any()
+    for each in (chosen, Plan.from_json(chosen.to_json())):
+        with pytest.warns(ClsasWarning, match="no pixel"):
+            image = factorize(lines, grid, each)
+        assert not image.pixels.any()
 
 
 # Half precision

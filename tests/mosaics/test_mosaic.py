@@ -161,7 +161,7 @@ class TestFactorized:
     @pytest.mark.slow
     def test_every_patch_is_as_good_as_predicted(self, scene, formed):
         for patch in formed[1]:
-            assert patch.record.plan["image"]["sides"]  # it was factorized
+            assert patch.record.plan["method"]["sides"]  # it was factorized
             exact = clsas.Image(scene[1].pixels[patch.rows, patch.columns], patch.grid)
             measured = relative_error_db(patch.image, exact)
             assert measured <= patch.record.predicted_error_db <= self.TOLERANCE_DB
@@ -233,7 +233,7 @@ def test_pings_that_do_not_fit_into_memory_are_refused(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_the_thesis_stages_work_in_patches():
     patches = list(clsas.mosaic(LINES, GRID, stages=[(2, 2), (2, 2)], beam=BEAM, patches=(2, 2)))
-    assert [len(patch.record.plan["image"]["aperture"]["factors"]) for patch in patches] == [2] * 4
+    assert [len(patch.record.plan["method"]["aperture"]["factors"]) for patch in patches] == [2] * 4
 
 
 @pytest.mark.slow

@@ -86,9 +86,17 @@ def imaging(folder: Path) -> dict[str, Call]:
         ),
         "Imager": Call(
             clsas.Imager,
-            whole | {"plan": plan, "device": 0},
+            whole
+            | {
+                "plan": plan,
+                "tolerance_db": None,
+                "accuracy_db": None,
+                "beam": None,
+                "device": 0,
+            },
             kinds=device,
             names=scene_names,
+            accepts=dict.fromkeys(("tolerance_db", "accuracy_db", "beam"), optional),
         ),
         "Imager:tolerance": Call(
             clsas.Imager,
@@ -103,7 +111,7 @@ def imaging(folder: Path) -> dict[str, Call]:
             accepts={"beam": optional},
         ),
         "Imager.close": Call(clsas.Imager(lines, grid, plan).close, {}),
-        "Imager()": Call(
+        "Imager:called": Call(
             clsas.Imager(lines, grid, accuracy_db=-50.0),
             {"lines": lines, "accumulate": s.image, "progress": nothing},
             accepts=dict.fromkeys(("accumulate", "progress"), optional),
