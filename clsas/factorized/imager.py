@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,29 @@ from clsas.sonar.coverage import reaches, warn_unreached
 from clsas.sonar.simplify import Model, leave_out
 
 
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Results of planning that images need again. A missing one is computed when it is needed.
+
+    Attributes
+    ----------
+    model : Model or None
+        The scene without the effects that the plan leaves out.
+    track : MeanTrack or None
+        Its mean track, of the shape that the factorization has.
+    surface : Surface or None
+        The surface of its grid.
+    """
+
+    model: Model | None = None
+    track: MeanTrack | None = None
+    surface: Surface | None = None
+
+
+NOTHING = Known()
+"""What is known of a plan that was read, or made for lines that hardly differ."""
+
+
 class FactorizedImager:
     """An imager that forms factorized images by a plan, of lines with one geometry.
 
@@ -32,8 +55,8 @@ class FactorizedImager:
     plan : Plan
         A plan with a factorization, made for this geometry or for one that differs very little.
     device : Device
-    track, surface : optional
-        Results of planning: see `clsas.factorized.geometry.geometry_of`.
+    known : Known
+        Results of planning for the same lines and grid.
     warned : bool
         True if the user has already been warned that no line contributes to the image.
     """
@@ -45,19 +68,21 @@ class FactorizedImager:
         plan: Plan,
         device: Device,
         *,
-        track: MeanTrack | None = None,
-        surface: Surface | None = None,
+        known: Known = NOTHING,
         warned: bool = False,
     ) -> None:
-        model = Model(lines, grid, plan.beam)
-        if plan.left_out:
-            model = leave_out(lines, grid, plan.beam, plan.left_out)
+        model = known.model or leave_out(lines, grid, plan.beam, plan.left_out)
         self.grid, self.plan, self.device = grid, plan, device.for_stages()
         self._model, self._warned = model, warned
         self._along = None if model.beam is None else model.beam.directions(model.lines)
         self._reached = reaches(model.lines, model.grid, model.beam, self._along)
         self._roots = Roots(
-            model.lines, model.grid, plan.factorization, model.beam, track=track, surface=surface
+            model.lines,
+            model.grid,
+            plan.factorization,
+            model.beam,
+            track=known.track,
+            surface=known.surface,
         )
 
     def form(self, lines: RangeLines, progress: Callable[[int, int], None] | None = None) -> Image:
@@ -70,10 +95,8 @@ class FactorizedImager:
             Called as progress(pixels done, pixels).
         """
         model, grid = self._model, self.grid
-        if self.plan.left_out and lines.samples is not model.lines.samples:
+        if self.plan.left_out:
             lines = replace(model.lines, samples=lines.samples)
-        elif self.plan.left_out:
-            lines = model.lines
         largest = check_numbers(lines, model.beam)
         if not self._reached:
             self._warn_unreached(lines)

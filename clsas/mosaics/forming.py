@@ -213,9 +213,7 @@ def _formed(
         "memory_bytes": patch_bytes + int(chosen.memory_bytes),
         "plan": json.loads(_without_directions(chosen).to_json()),
     }
-    imager = former(
-        lines, grid, chosen, device, track=found.track, surface=found.surface, warned=True
-    )
+    imager = former(lines, grid, chosen, device, known=found.known, warned=True)
     return imager.form(lines), how
 
 

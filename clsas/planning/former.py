@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from clsas.aperture.mean_track import MeanTrack
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import ExactImager
-from clsas.factorized.imager import FactorizedImager
-from clsas.factorized.surface import Surface
+from clsas.factorized.imager import NOTHING, FactorizedImager, Known
 from clsas.opencl.device import Device
 from clsas.plans.factorization import ExactImage
 from clsas.plans.plan import Plan
@@ -23,8 +21,7 @@ def former(
     plan: Plan,
     device: Device,
     *,
-    track: MeanTrack | None = None,
-    surface: Surface | None = None,
+    known: Known = NOTHING,
     warned: bool = False,
 ) -> Former:
     """Return the former of images by a plan. It neither checks lines nor warns of ambiguous ones.
@@ -33,8 +30,8 @@ def former(
     ----------
     lines, grid, plan, device
         The plan may have been made for lines whose channels lie slightly beside these.
-    track, surface : optional
-        Results of planning: see `clsas.planning.planner.Planned`.
+    known : Known
+        Results of planning for the same lines and grid.
     warned : bool
         True if the user has already been warned that no line adds anything to the image.
     """
@@ -42,4 +39,4 @@ def former(
         accuracy_db = plan.method.accuracy_db
         preparation = prepare(lines, grid, accuracy_db=accuracy_db, beam=plan.beam, device=device)
         return ExactImager(preparation, warned=warned)
-    return FactorizedImager(lines, grid, plan, device, track=track, surface=surface, warned=warned)
+    return FactorizedImager(lines, grid, plan, device, known=known, warned=warned)

@@ -142,13 +142,7 @@ class Imager:
             found = planned(request)
             self.plan = found.plan
             self._former = former(
-                lines,
-                grid,
-                found.plan,
-                self.device,
-                track=found.track,
-                surface=found.surface,
-                warned=True,
+                lines, grid, found.plan, self.device, known=found.known, warned=True
             )
         else:
             validate.instance("plan", plan, Plan)
@@ -157,7 +151,7 @@ class Imager:
             plan.check(lines, grid)
             self.beam = plan.beam
             self._former = former(lines, grid, plan, self.device)
-        self._lines_digest = lines_digest(lines)
+        self._lines_digest = self.plan.lines_digest if self.plan else lines_digest(lines)
         self._warned_of_band = False
         self._checked = weakref.ref(lines)
         if plan is not None and not plan.is_exact:

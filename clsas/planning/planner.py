@@ -13,7 +13,7 @@ from clsas.core.digests import grid_digest, lines_digest
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import ACCURACY_DB
-from clsas.factorized.surface import Surface
+from clsas.factorized.imager import NOTHING, Known
 from clsas.opencl.device import Device, open_device
 from clsas.planning import costs as stored_costs
 from clsas.planning import scaling
@@ -190,15 +190,12 @@ class Planned:
     Attributes
     ----------
     plan : Plan
-    track : MeanTrack or None
-        The mean track of a factorization.
-    surface : Surface or None
-        The surface of the grid without the effects that the plan leaves out.
+    known : Known
+        Results for a factorization; none for an exact image.
     """
 
     plan: Plan
-    track: MeanTrack | None = None
-    surface: Surface | None = None
+    known: Known = NOTHING
 
 
 def planned(request: Request) -> Planned:
@@ -222,7 +219,7 @@ def planned(request: Request) -> Planned:
     chosen = _completed(found, request, scene, model, costs)
     if chosen.is_exact or not isinstance(model, VisibilityModel):
         return Planned(chosen)
-    return Planned(chosen, track, model.surface)
+    return Planned(chosen, Known(scene, track, model.surface))
 
 
 def _simplified(request: Request) -> Model:

@@ -6,7 +6,6 @@ from cases import along_x, lines_over
 from click.testing import CliRunner
 
 import clsas
-from clsas import plot
 from clsas.cli import main
 from clsas.core.grid import Grid
 
@@ -27,20 +26,6 @@ def folder(tmp_path, monkeypatch):
     )
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    """Figures that a command saves."""
-    saved = []
-    save = plot.save
-
-    def recorded(figure, path, **options):
-        saved.append(figure)
-        save(figure, path, **options)
-
-    monkeypatch.setattr(plot, "save", recorded)
-    return saved
 
 
 def run(*args, code=0):

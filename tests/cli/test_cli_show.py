@@ -10,7 +10,6 @@ from cases import along_x, lines_over
 from click.testing import CliRunner
 
 import clsas
-from clsas import plot
 from clsas.cli import main
 
 pytest.importorskip("matplotlib")
@@ -59,20 +58,6 @@ def folder(files, tmp_path, monkeypatch):
         (tmp_path / file.name).symlink_to(file)
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    """Figures that a command saves."""
-    saved = []
-    save = plot.save
-
-    def recorded(figure, path, **options):
-        saved.append(figure)
-        save(figure, path, **options)
-
-    monkeypatch.setattr(plot, "save", recorded)
-    return saved
 
 
 def run(*args, code=0):
