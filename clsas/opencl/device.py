@@ -118,6 +118,7 @@ class Device:
     uploads: cl.CommandQueue
     # By name and options. The kernel that was used last comes last.
     _kernels: dict[tuple, Kernel] = field(default_factory=dict, repr=False)
+    _build_times_s: list[float] = field(default_factory=list, repr=False)
     _events: list[tuple[str, cl.Event]] | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
@@ -140,12 +141,11 @@ class Device:
 
     @property
     def build_seconds(self) -> float:
-        """Time that the driver took to build the kernels that the device keeps, seconds.
+        """Time that the driver has taken to build kernels, seconds.
 
         Drivers such as PoCL compile again when a kernel first runs. That time is not included.
         """
-        with self._lock:
-            return sum(kernel.build_seconds for kernel in self._kernels.values())
+        return math.fsum(self._build_times_s)
 
     def kernel(self, name: str, **options: int) -> Kernel:
         """Return the kernel of `cl/<name>.cl`, built once per set of options.
@@ -187,7 +187,8 @@ class Device:
             raise not_built(what, self.info.platform, error) from error
         # Program.all_kernels is avoided, because PyOpenCL never releases the kernels it returns.
         compiled = cl.Kernel(program, name)
-        return Kernel(name, parameters, compiled, build_seconds=time.perf_counter() - start)
+        self._build_times_s.append(time.perf_counter() - start)
+        return Kernel(name, parameters, compiled)
 
     def run(
         self,

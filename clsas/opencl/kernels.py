@@ -138,14 +138,11 @@ class Kernel:
         Types by name, in order; see `kernel_parameters`.
     compiled : pyopencl.Kernel
         The kernel as PyOpenCL runs it.
-    build_seconds : float
-        Time that the driver took to build the kernel.
     """
 
     name: str
     parameters: dict[str, str]
     compiled: cl.Kernel
-    build_seconds: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the number of parameters, and set their types."""

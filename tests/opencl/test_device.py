@@ -154,7 +154,7 @@ def test_a_wish_goes_before_the_environment(monkeypatch):
 
 
 def test_the_time_of_building_kernels_is_counted_once(platform):
-    device = dataclasses.replace(platform, _kernels={})
+    device = dataclasses.replace(platform, _kernels={}, _build_times_s=[])
     assert device.build_seconds == 0
     options = {"WIDTH": 1, "BEAM": 0, "BISTATIC": 1, "MOVING": 0}
     device.kernel("expand_tiles", **options)
@@ -278,11 +278,14 @@ def test_nothing_is_built_for_a_kernel_that_is_there(platform, monkeypatch):
 @pytest.mark.slow
 def test_only_the_kernels_used_last_are_kept(platform, monkeypatch):
     monkeypatch.setattr(module, "_MOST_KERNELS", 3)
-    device = dataclasses.replace(platform, _kernels={})
+    device = dataclasses.replace(platform, _kernels={}, _build_times_s=[])
     first = device.kernel("peak", WIDTH=1, CHAINS=8)
     for unused in range(5):
         assert device.kernel("peak", WIDTH=1, CHAINS=8) is first  # used again and again
+        before_s = device.build_seconds
         device.kernel("peak", WIDTH=1, CHAINS=8, UNUSED=unused)
+        # The time of kernels that are no longer kept is not taken back.
+        assert device.build_seconds > before_s
     assert len(device._kernels) == 3
     for unused in range(3):
         device.kernel("peak", WIDTH=1, CHAINS=8, UNUSED=unused)
