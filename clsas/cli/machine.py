@@ -101,7 +101,7 @@ def measure_costs(device: str | None, as_json: bool) -> None:
 
 @click.command()
 @click.option(
-    "--out", type=File(file_okay=False), default="clsas-demo",
+    "-o", "--out", type=File(file_okay=False), default="clsas-demo",
     show_default=True, help="Folder for the files: a new one, or that of an earlier demo.",
 )  # fmt: skip
 @options.device

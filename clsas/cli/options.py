@@ -84,7 +84,7 @@ as_json = click.option("--json", "as_json", is_flag=True, help="Print results as
 dynamic_range = click.option(
     "--dynamic-range-db", "--db", "dynamic_range_db", type=float,
     help="Dynamic range of the picture, dB. [default: 60]",
-    callback=checked(partial(validate.positive, "dynamic_range_db", unit="dB")),
+    callback=checked(validate.dynamic_range_db),
 )  # fmt: skip
 colour_map = click.option(
     "--colour-map", "--colours", "colour_map",

@@ -116,6 +116,8 @@ class File(click.Path):
         """Return the path; a usage error if it is both read and written."""
         if not os.fspath(value):
             self.fail("must be a path, got an empty one", param, ctx)
+        if os.fspath(value) == "-":
+            self.fail("must be a path; '-' for standard input or output is not one", param, ctx)
         path: Any = super().convert(value, param, ctx)
         if not self.written and path.exists():
             try:

@@ -47,8 +47,9 @@ class Grid:
 
         origin_m + row row_step_m + column column_step_m (+ height_m[row, column] along z).
 
-    All coordinates are float64, which resolves UTM-sized coordinates (1e7 m) to nanometres. Arrays
-    that need no conversion are not copied, so do not write into them afterwards.
+    All coordinates are float64, which resolves UTM-sized coordinates (1e7 m) to nanometres. Those
+    beyond 1e9 m raise ValueError. Arrays that need no conversion are not copied, so do not write
+    into them afterwards.
 
     Attributes
     ----------
@@ -114,6 +115,7 @@ class Grid:
             if any(getattr(self, name) is not None for name in (*plane, "height_m")):
                 raise ValueError("points_m must stand alone: it excludes a plane and heights")
             put("points_m", (*shape, 3))
+            self._check_bounds()
             return
         if len(shape) != 2:
             raise ValueError(f"shape of a plane must be (rows, columns), got {shape}")
@@ -122,6 +124,16 @@ class Grid:
         _check_steps(*self.vectors_m[1:], shape)
         if self.height_m is not None:
             put("height_m", shape)
+        self._check_bounds()
+
+    def _check_bounds(self) -> None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            farthest_m = float(np.abs(self.bounds_m).max())
+        if not farthest_m <= validate.FARTHEST_M:
+            raise ValueError(
+                f"pixels must lie within {validate.FARTHEST_M:g} m of the origin along each axis, "
+                f"got one at {farthest_m:g} m"
+            )
 
     def __repr__(self) -> str:
         """Return the shape and the extents of the pixels in x, y and z."""

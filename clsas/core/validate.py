@@ -119,6 +119,11 @@ def positive(name: str, value: float, unit: str = "") -> float:
     return number(name, value, unit, above=0.0)
 
 
+def dynamic_range_db(value: float) -> float:
+    """Return the dynamic range of a picture, dB, as a float that float32 amplitudes can span."""
+    return number("dynamic_range_db", value, "dB", above=0.0, most=2000.0)
+
+
 def count(name: str, value: int, *, least: int = 1, most: int | None = None) -> int:
     """Return `value` as an int from `least` to `most`; raises TypeError or ValueError.
 

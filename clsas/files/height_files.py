@@ -61,7 +61,9 @@ def _from_csv(path: Path) -> NDArray:
             raise ValueError("the file is empty")
         return np.loadtxt(io.StringIO(text), np.float64, delimiter=",", ndmin=2)
     except ValueError as error:  # UnicodeDecodeError too
-        raise ValueError(f"must hold numbers separated by commas: {error}: {path}") from None
+        # What follows the semicolon is advice for callers of NumPy.
+        reason = str(error).partition(";")[0]
+        raise ValueError(f"must hold numbers separated by commas: {reason}: {path}") from None
 
 
 def _from_npy(path: Path) -> NDArray:

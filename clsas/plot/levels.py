@@ -65,8 +65,7 @@ class Scale:
             put("reference", validate.positive("reference", self.reference))
         if self.percentiles is None:
             if self.dynamic_range_db is not None:
-                range_db = validate.positive("dynamic_range_db", self.dynamic_range_db, "dB")
-                put("dynamic_range_db", range_db)
+                put("dynamic_range_db", validate.dynamic_range_db(self.dynamic_range_db))
             return
         if self.dynamic_range_db is not None:
             raise ValueError("dynamic_range_db and percentiles exclude each other, got both")

@@ -210,7 +210,7 @@ def test_bad_input_is_named():
     data = lines(np.ones((10, 4), complex))
     with pytest.raises(ValueError, match="must be on a plane or height map"):
         plot.image_db(points)
-    with pytest.raises(ValueError, match="dynamic_range_db must be finite and > 0 dB"):
+    with pytest.raises(ValueError, match="dynamic_range_db must be finite and > 0 and <= 2000 dB"):
         plot.image_db(IMAGE, dynamic_range_db=0)
     with pytest.raises(ValueError, match="reference must be finite and > 0"):
         plot.image_db(IMAGE, reference=-1)
