@@ -23,13 +23,11 @@ from clsas.measures.assessment_result import Assessment, Effect
 from clsas.measures.effects import (
     BEAM,
     KEYS,
+    LINES_WITHOUT,
     SINGLE,
-    SWAY,
     ErrorWithout,
     Survey,
     errors_without,
-    lines_without,
-    track_errors_m,
 )
 from clsas.opencl.device import Device, open_device
 from clsas.planning.costs import Costs
@@ -45,7 +43,7 @@ from clsas.signal.spectrum import measure_spectrum
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.simplify import APART, MOTION, RELIEF, SHARE, leave_out
+from clsas.sonar.simplify import RELIEF, SHARE, leave_out
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Pointing, Track, channels
 
@@ -324,10 +322,10 @@ def _images(survey: Survey, planned: Callable[..., Plan]) -> dict[str, _Image]:
         inputs[BEAM] = lines, grid, None
         # Moving antennas changes the directions of a track: keep those of the given lines.
         beam = replace(beam, along=beam.directions(lines))
-    modelled, off_m = survey.modelled, track_errors_m(lines)
-    for name in (MOTION, APART, SWAY):
+    modelled = survey.modelled
+    for name, without in LINES_WITHOUT.items():
         if modelled[name]:
-            inputs[name] = lines_without(name, lines, off_m), grid, beam
+            inputs[name] = without(lines), grid, beam
     if modelled[RELIEF] and len(grid.shape) == 2:
         flat = leave_out(lines, grid, beam, (RELIEF,)).grid
         if flat.is_planar:

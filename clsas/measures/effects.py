@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -161,7 +162,7 @@ def errors_without(survey: Survey) -> dict[str, ErrorWithout]:
     of_lines = pattern if pattern is not None and survey.element_pattern else 1.0
     errors = {
         name: sample.error_of_ranges(range_m, sample.weights * of_lines)
-        for name, range_m in _ranges_without(sample, track_errors_m(lines)).items()
+        for name, range_m in _ranges_without(survey, sample).items()
     }
     if pattern is not None:
         errors[PATTERN] = _error_of_weights(sample.weights * pattern, sample.weights)
@@ -176,32 +177,39 @@ def errors_without(survey: Survey) -> dict[str, ErrorWithout]:
     return errors
 
 
-def _ranges_without(sample: _Sample, off_m: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """Return the ranges of a sample without each effect on them.
-
-    `off_m` holds the distances of all channels from a straight track.
-    """
-    lines = sample.lines
-    effects = [APART, SWAY] if lines.rx_velocity_m_s is None else [APART, SWAY, MOTION]
+def _ranges_without(survey: Survey, sample: _Sample) -> dict[str, NDArray[np.float64]]:
+    """Return the ranges of a sample without each effect on them."""
+    lines = survey.full_lines
     ranges_m = {
-        effect: ranges_of(sample.points_m, lines_without(effect, lines, off_m[sample.channels]))
-        for effect in effects
+        name: ranges_of(sample.points_m, without(lines).select(sample.channels))
+        for name, without in LINES_WITHOUT.items()
+        if name != MOTION or lines.rx_velocity_m_s is not None
     }
-    return ranges_m | {RELIEF: ranges_of(sample.flat_m, lines)}
+    return ranges_m | {RELIEF: ranges_of(sample.flat_m, sample.lines)}
 
 
-def lines_without(effect: str, lines: RangeLines, off_m: NDArray[np.float64]) -> RangeLines:
-    """Return lines without one effect of their antennas.
+def _without_motion(lines: RangeLines) -> RangeLines:
+    """Return lines whose receivers stay where they were at transmission."""
+    return replace(lines, rx_velocity_m_s=None)
 
-    Without `MOTION` receivers stay where they were at transmission. Without `APART` transmitter and
-    receiver are both at the phase centre. Without `SWAY` they are moved by -`off_m`, [channels, 3],
-    onto a straight track.
-    """
-    if effect == MOTION:
-        return replace(lines, rx_velocity_m_s=None)
-    if effect == APART:
-        return replace(lines, tx_m=lines.phase_centres_m, rx_m=lines.phase_centres_m)
+
+def _at_phase_centres(lines: RangeLines) -> RangeLines:
+    """Return lines whose transmitters and receivers are both at the phase centre."""
+    return replace(lines, tx_m=lines.phase_centres_m, rx_m=lines.phase_centres_m)
+
+
+def _on_straight_track(lines: RangeLines) -> RangeLines:
+    """Return lines whose antennas are moved onto a straight track."""
+    off_m = track_errors_m(lines)
     return replace(lines, tx_m=lines.tx_m - off_m, rx_m=lines.rx_m - off_m)
+
+
+LINES_WITHOUT: dict[str, Callable[[RangeLines], RangeLines]] = {
+    MOTION: _without_motion,
+    APART: _at_phase_centres,
+    SWAY: _on_straight_track,
+}
+"""Functions that return lines without an effect of their antennas."""
 
 
 def ranges_of(points_m: NDArray[np.float64], lines: RangeLines) -> NDArray[np.float64]:
