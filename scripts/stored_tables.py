@@ -1,9 +1,9 @@
 """Measured tables of the documentation: CSV files in docs/tables, which its pages show.
 
-A file begins with lines `# key: value` that state the origin of its numbers (`ORIGIN`); a header and
-rows follow. A page shows a file between two comments, `<!-- table: PATH -->` with the path relative
-to the page, and `<!-- end of table -->`. `scripts/pages tables` fills in what stands between them,
-so that the page can also be read on GitHub, which does not include files.
+A file begins with lines `# key: value` that state the origin of its numbers (`ORIGIN`). A header
+and rows follow. A page shows a file between two comments, `<!-- table: PATH -->` with the path
+relative to the page, and `<!-- end of table -->`. `scripts/pages tables` fills in what stands
+between them. The page can therefore be read on GitHub too, which does not include files.
 """
 
 from __future__ import annotations
@@ -88,6 +88,21 @@ def read(path: Path) -> StoredTable:
         if len(row) != len(header):
             raise ValueError(f"{path}: {len(row)} cells in {row}, {len(header)} in the header")
     return StoredTable(origin, header, rows)
+
+
+def printed(text: str) -> list[tuple[list[str], list[list[str]]]]:
+    """Return header and rows of every Markdown table in what a command printed."""
+    found: list[tuple[list[str], list[list[str]]]] = []
+    before = ""
+    for line in text.splitlines():
+        if line.startswith("|"):
+            cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line.strip()[1:-1])]
+            if not before.startswith("|"):
+                found.append((cells, []))
+            elif not set(line) <= set("|- :"):
+                found[-1][1].append(cells)
+        before = line
+    return found
 
 
 def markdown(table: StoredTable, link: str) -> str:

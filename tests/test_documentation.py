@@ -175,6 +175,15 @@ def test_a_stored_table_that_is_damaged_or_states_no_origin_is_refused(lines, fa
         stored_tables.read(tmp_path / "a.csv")
 
 
+def test_printed_tables_can_be_stored(tmp_path):
+    header, rows = ["a", "b, c"], [["1", "x (2 to 3)"], ["", "`|λ|`"]]
+    origin = dict.fromkeys(stored_tables.ORIGIN, "x")
+    text = stored_tables.markdown(stored_tables.StoredTable(origin, header, rows[:1]), "a.csv")
+    assert stored_tables.printed(f"Title\n\n{text}\n{text}") == [(header, rows[:1])] * 2
+    stored_tables.write(tmp_path / "a.csv", origin, header, rows)
+    assert stored_tables.read(tmp_path / "a.csv").rows == rows
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
 def test_tables_of_pages_are_even_and_those_of_their_files(page):
     text = page.read_text()

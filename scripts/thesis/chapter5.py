@@ -30,7 +30,7 @@ from clsas.plot.canvas import with_fewer_colours
 from clsas.sonar.system import Sonar, line_array
 
 sys.path.append(str(Path(__file__).parents[1]))
-import stored_tables  # noqa: E402
+import stored_tables
 
 Stages = Sequence[tuple[int, int]]  # (QR, QI)
 

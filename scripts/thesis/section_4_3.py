@@ -112,6 +112,7 @@ def main() -> None:
             largest_m = float(np.abs(errors_m).max())
             rms_m = math.sqrt(np.mean(errors_m**2))
             images = {lines: scene.factorized(lines, stages) for lines in exact}
+            error_db = clsas.relative_error_db(images[scene.scattered], exact[scene.scattered])
             rows.append(
                 {
                     "eq. 45": chapter5.fraction(formula_m),
@@ -123,9 +124,7 @@ def main() -> None:
                     "measured/eq. 45": f"{largest_m / formula_m:.2f}",
                     "rms/eq. 45": f"{rms_m / formula_m:.2f}",
                     "loss dB": f"{loss_db(images[scene.middle], exact[scene.middle]):.2f}",
-                    "scene error dB": "{:.1f}".format(
-                        clsas.relative_error_db(images[scene.scattered], exact[scene.scattered])
-                    ),
+                    "scene error dB": f"{error_db:.1f}",
                 }
             )
     chapter5.report(given.out, "section_4_3", rows)
