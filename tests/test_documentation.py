@@ -242,3 +242,17 @@ def is_there(name):
             return False
         return True
     return False
+
+
+def test_the_index_of_the_thesis_is_complete():
+    text = (DOCS / "thesis-index.md").read_text()
+    rows = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("| ")][2:]
+    assert {row[3].strip() for row in rows} == {"done", "differs", "left out"}
+    listed = {"equation": set(), "figure": set(), "table": set()}
+    for row in rows:
+        for kind, numbers in re.findall(r"(equation|figure|table)s? ([\d, to]*\d)", row[0]):
+            for first, last in re.findall(r"(\d+)(?: to (\d+))?", numbers):
+                listed[kind] |= set(range(int(first), int(last or first) + 1))
+    for kind, last in {"equation": 45, "figure": 45, "table": 8}.items():
+        assert listed[kind] == set(range(1, last + 1)), kind
+    assert sum(row[0].strip() == "future work" for row in rows) == 5
