@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import stored_tables
 
 import clsas
 
@@ -16,6 +17,8 @@ pytest.importorskip("matplotlib")
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+STORED = sorted(stored_tables.TABLES.rglob("*.csv"))
 FIGURES = [path for path in (DOCS / "figures").glob("*.py") if path.stem != "drawing"]
 PROGRAMS = sorted([*(DOCS / "tutorials").glob("*.md"), *FIGURES])
 
@@ -132,9 +135,90 @@ def test_the_citation_is_of_this_version():
     assert f"## {clsas.__version__}" in (DOCS / "changelog.md").read_text()
 
 
+ORIGIN = [
+    "# clsas: 0.1.0",
+    "# commit: 0123abc",
+    "# date: 2026-01-02",
+    "# device: a device",
+    "# driver: PoCL 3.0",
+    "# command: scripts/bench speed",
+]
+
+
 @pytest.mark.parametrize(
-    "page", [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))], ids=lambda path: path.stem
+    ("row", "even"), [("| 1 | 2 |", True), ("| 1 |", False), ("| 1 | 2 | 3 |", False),
+                      ("| 1 | 2", False), (r"| `a\|b` | 2 |", True), ("| `a|b` | 2 |", False)],
+)  # fmt: skip
+def test_a_row_with_missing_or_further_cells_is_found(row, even, tmp_path):
+    table = f"| a | b |\n| --- | --- |\n| 1 | 2 |\n{row}\n"
+    assert stored_tables.uneven(f"Text.\n\n{table}\nText.\n") == [row] * (not even)
+    assert stored_tables.uneven(f"```text\n{table}```\n") == []
+
+
+@pytest.mark.parametrize(
+    ("lines", "fault"),
+    [
+        ([*ORIGIN, "a,b", "1,2"], None),
+        ([*ORIGIN, "a,b", "1"], "1 cells"),
+        ([*ORIGIN, "a,b", "1,2,3"], "3 cells"),
+        ([*ORIGIN[1:], "a,b", "1,2"], "clsas"),
+        ([*ORIGIN[:3], *ORIGIN[4:], "a,b", "1,2"], "device"),
+        ([*ORIGIN[:5], "# command: ", "a,b", "1,2"], "command"),
+    ],
 )
+def test_a_stored_table_that_is_damaged_or_states_no_origin_is_refused(lines, fault, tmp_path):
+    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
+    if fault is None:
+        assert stored_tables.read(tmp_path / "a.csv").rows == [["1", "2"]]
+        return
+    with pytest.raises(ValueError, match=fault):
+        stored_tables.read(tmp_path / "a.csv")
+
+
+def test_printed_tables_can_be_stored(tmp_path):
+    header, rows = ["a", "b, c"], [["1", "x (2 to 3)"], ["", "`|λ|`"]]
+    origin = dict.fromkeys(stored_tables.ORIGIN, "x")
+    text = stored_tables.markdown(stored_tables.StoredTable(origin, header, rows[:1]), "a.csv")
+    assert stored_tables.printed(f"Title\n\n{text}\n{text}") == [(header, rows[:1])] * 2
+    stored_tables.write(tmp_path / "a.csv", origin, header, rows)
+    assert stored_tables.read(tmp_path / "a.csv").rows == rows
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
+def test_tables_of_pages_are_even_and_those_of_their_files(page):
+    text = page.read_text()
+    assert stored_tables.uneven(text) == []
+    assert len(stored_tables.SHOWN.findall(text)) == text.count("<!-- table: ")
+    assert stored_tables.filled(page) == text, "run scripts/pages tables"
+
+
+@pytest.mark.parametrize("path", STORED, ids=lambda path: path.stem)
+def test_stored_tables_are_of_the_version_that_they_claim(path):
+    origin = stored_tables.read(path).origin
+    version = origin["clsas"]
+    assert re.search(
+        rf"^## {re.escape(version)}\b", (DOCS / "changelog.md").read_text(), re.MULTILINE
+    )
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", origin["date"])
+    assert re.fullmatch(r"[0-9a-f]{7}( changed)?(, [0-9a-f]{7})*", origin["commit"])
+    for commit in re.findall(r"[0-9a-f]{7}", origin["commit"]):
+        done = subprocess.run(
+            ["git", "-C", ROOT, "show", f"{commit}:pyproject.toml"], capture_output=True, text=True
+        )
+        if done.returncode == 0:  # in a clone with its history
+            assert tomllib.loads(done.stdout)["project"]["version"] == version
+
+
+def test_every_stored_table_is_shown_once():
+    shown = [
+        (page.parent / link).resolve()
+        for page in PAGES
+        for _, link, _ in stored_tables.SHOWN.findall(page.read_text())
+    ]
+    assert sorted(shown) == STORED
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
 def test_files_and_names_that_pages_mention_exist(page):
     text = page.read_text()
     for path in re.findall(r"`((?:tests|scripts|clsas|docs)/[\w./]+)`", text):
@@ -158,3 +242,17 @@ def is_there(name):
             return False
         return True
     return False
+
+
+def test_the_index_of_the_thesis_is_complete():
+    text = (DOCS / "thesis-index.md").read_text()
+    rows = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("| ")][2:]
+    assert {row[3].strip() for row in rows} == {"done", "differs", "left out"}
+    listed = {"equation": set(), "figure": set(), "table": set()}
+    for row in rows:
+        for kind, numbers in re.findall(r"(equation|figure|table)s? ([\d, to]*\d)", row[0]):
+            for first, last in re.findall(r"(\d+)(?: to (\d+))?", numbers):
+                listed[kind] |= set(range(int(first), int(last or first) + 1))
+    for kind, last in {"equation": 45, "figure": 45, "table": 8}.items():
+        assert listed[kind] == set(range(1, last + 1)), kind
+    assert sum(row[0].strip() == "future work" for row in rows) == 5

@@ -159,6 +159,7 @@ def operations(
     -----
     As in the worked example of the thesis, N lines take part in the first stage for each of its
     QI^2 subimages, N/QR in the second for each of its QI^4, and so on.
+    [44] as printed divides the operations of a stage by the QR of that stage, too.
     """
     counts, subimages = [], 1
     for (summed, divisions), length in zip(stages, samples, strict=True):

@@ -39,7 +39,7 @@ KEYS = {
     ENDS: "[simulate] range_m",
     SINGLE: "",
 }
-"""Key of a scene file that leaves each effect out; "" where the grid or the device decides."""
+"""Key of a scene file that leaves each effect out; "" if there is none."""
 
 _CHANNELS, _PIXELS = 256, 16  # channels sampled, and pixels along either side of the grid
 _FREQUENCIES = 8  # frequencies of the band sampled, each with an equal share of the power

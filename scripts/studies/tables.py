@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import itertools
 import multiprocessing
@@ -202,7 +201,7 @@ def factorized(devices: list[str], names: list[str] | None = None) -> None:
     )
 
 
-def scaling(device: str, largest: int, csv_file: str | None, png_file: str | None) -> None:
+def scaling(device: str, largest: int, png_file: str | None) -> None:
     """Print the times for N channels and N x N pixels by N, and the fitted exponents."""
     sizes = [size for size in SIZES if size <= largest]
     measured = [
@@ -228,9 +227,6 @@ def scaling(device: str, largest: int, csv_file: str | None, png_file: str | Non
     exponents = {name: exponent(sizes, times) for name, times in seconds.items()}
     print(f"\n{measured[0]['device']}, {measured[0]['driver']}: for large N time grows as", end=" ")
     print(", ".join(f"N^{value:.2f} ({name})" for name, value in exponents.items()))
-    if csv_file is not None:
-        with open(csv_file, "w", newline="") as file:
-            csv.writer(file).writerows([names, *rows])
     if png_file is not None:
         draw_scaling(sizes, seconds, exponents, measured[0]["device"], png_file)
 

@@ -8,9 +8,9 @@ bandwidth; 100 kHz is chosen here.
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 import statistics
+import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -28,6 +28,9 @@ from clsas.aperture import nearest
 from clsas.opencl.device import Device, open_device
 from clsas.plot.canvas import with_fewer_colours
 from clsas.sonar.system import Sonar, line_array
+
+sys.path.append(str(Path(__file__).parents[1]))
+import stored_tables
 
 Stages = Sequence[tuple[int, int]]  # (QR, QI)
 
@@ -218,7 +221,7 @@ class Quality:
             "PSLR dB": f"{self.pslr_db:.1f}",
             "ISLR dB": f"{self.islr_db:.1f}",
             "loss dB": f"{self.loss_db:.2f}",
-            "image error dB": f"{self.error_db:.1f}",
+            "image error dB": "" if self.error_db == -math.inf else f"{self.error_db:.1f}",
         }
 
 
@@ -259,15 +262,60 @@ def in_turn(work: dict[object, Callable[[], object]], repeats: int) -> dict[obje
     return {key: statistics.median(each) for key, each in taken.items()}
 
 
-def arguments(description: str, repeats: int | None = None) -> tuple[argparse.Namespace, Scene]:
-    """Return the arguments of the command line, and their scene."""
-    parser = argparse.ArgumentParser(description=description.splitlines()[0])
+@dataclass(frozen=True)
+class Output:
+    """Where a script writes its tables and pictures.
+
+    Attributes
+    ----------
+    folder : Path or None
+        None for the documentation: docs/tables/thesis, and those pictures that are in docs/images.
+    device : Device
+        What computes, which tables state.
+    """
+
+    folder: Path | None
+    device: Device
+
+    @classmethod
+    def of(cls, given: argparse.Namespace, device: Device) -> Output:
+        """Return the output that the command line asks for."""
+        if not given.docs:
+            given.out.mkdir(parents=True, exist_ok=True)
+        return cls(None if given.docs else given.out, device)
+
+    def table(self, stem: str) -> Path:
+        """Return the file of a table."""
+        return (self.folder or stored_tables.TABLES / "thesis") / f"{stem}.csv"
+
+    def picture(self, stem: str) -> Path | None:
+        """Return the file of a picture, or None if the documentation does not show it."""
+        if self.folder:
+            return self.folder / f"{stem}.png"
+        name = stem.removeprefix("figures_").removeprefix("figure_").replace("_", "-")
+        shown = stored_tables.ROOT / "docs" / "images" / f"thesis-{name}.png"
+        return shown if shown.exists() else None
+
+
+def add_output(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `Output`, and the device."""
     parser.add_argument(
         "--out", type=Path, default=Path("thesis"), help="folder for CSV and PNG files"
     )
     parser.add_argument(
+        "--docs",
+        action="store_true",
+        help="write the tables and pictures of the documentation instead",
+    )
+    parser.add_argument(
         "--device", help="device, as listed by `clsas devices` [default: the fastest]"
     )
+
+
+def arguments(description: str, repeats: int | None = None) -> tuple[argparse.Namespace, Scene]:
+    """Return the arguments of the command line, and their scene."""
+    parser = argparse.ArgumentParser(description=description.splitlines()[0])
+    add_output(parser)
     parser.add_argument(
         "--pixels",
         type=int,
@@ -287,8 +335,8 @@ def arguments(description: str, repeats: int | None = None) -> tuple[argparse.Na
             help="timed runs of each image [default: %(default)s]",
         )
     given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
     scene = Scene(open_device(given.device), given.pixels, given.bistatic)
+    given.out = Output.of(given, scene.device)
     print(
         f"{scene.device.info.label}: {scene.lines.channels} lines, {given.pixels} x {given.pixels} "
         f"pixels of {scene.side_m:g} m x {scene.side_m:g} m from {NEAREST_M:g} m"
@@ -296,17 +344,16 @@ def arguments(description: str, repeats: int | None = None) -> tuple[argparse.Na
     return given, scene
 
 
-def report(out: Path, stem: str, rows: Sequence[dict[str, object]]) -> None:
-    """Print rows as a Markdown table and write them as CSV."""
+def report(out: Output, stem: str, rows: Sequence[dict[str, object]]) -> None:
+    """Print rows as a Markdown table and write them as CSV, with their origin."""
     header = list(rows[0])
-    print("|", " | ".join(header), "|")
-    print("|", " | ".join("---" for _ in header), "|")
-    for row in rows:
-        print("|", " | ".join(str(row[column]) for column in header), "|")
-    with open(out / f"{stem}.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, header)
-        writer.writeheader()
-        writer.writerows(rows)
+    info, options = out.device.info, [each for each in sys.argv[1:] if each != "--docs"]
+    command = " ".join([f"scripts/thesis/{Path(sys.argv[0]).name}", *options])
+    device = f"{info.name}, {info.compute_units} compute units"
+    origin = stored_tables.here(device, f"{info.platform} {info.driver}", command)
+    cells = [[str(row[column]) for column in header] for row in rows]
+    print(stored_tables.markdown(stored_tables.StoredTable(origin, header, cells), stem))
+    stored_tables.write(out.table(stem), origin, header, cells)
 
 
 def figure(width: float = 6.0, height: float = 4.0):
@@ -316,9 +363,11 @@ def figure(width: float = 6.0, height: float = 4.0):
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def save(drawn, out: Path, stem: str, dpi: float = 120.0, colours: int = 64) -> None:
+def save(drawn, out: Output, stem: str, dpi: float = 120.0, colours: int = 64) -> None:
     """Write a figure as PNG with few colours, which makes a small file."""
-    path = out / f"{stem}.png"
+    path = out.picture(stem)
+    if path is None:
+        return
     plot.save(drawn, path, dpi=dpi)
     path.write_bytes(with_fewer_colours(path, colours))
-    print(f"wrote {out / stem}.csv and .png")
+    print(f"wrote {path}")

@@ -15,6 +15,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from chapter5 import Output, add_output
 from range_errors import range_errors_m
 from scipy.spatial.distance import cdist
 
@@ -171,12 +172,7 @@ def mast_db(image: clsas.Image) -> float:
 def arguments(description: str, repeats: int) -> tuple[argparse.Namespace, Scene]:
     """Return the arguments of the command line, and their scene."""
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.add_argument(
-        "--out", type=Path, default=Path("thesis"), help="folder for CSV and PNG files"
-    )
-    parser.add_argument(
-        "--device", help="device, as listed by `clsas devices` [default: the fastest]"
-    )
+    add_output(parser)
     parser.add_argument(
         "--pixels",
         type=int,
@@ -193,9 +189,9 @@ def arguments(description: str, repeats: int) -> tuple[argparse.Namespace, Scene
         help="timed runs of each image [default: %(default)s]",
     )
     given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
     lines = wreck.lines() if given.lines is None else clsas.load(given.lines)
     found = Scene(open_device(given.device), lines, given.pixels)
+    given.out = Output.of(given, found.device)
     print(
         f"{found.device.info.label}: {lines.channels} lines of {lines.length} samples, "
         f"{given.pixels} x {given.pixels} pixels of the whole scene"

@@ -18,22 +18,22 @@ def main() -> None:
     work = {1: scene.backproject} | {k: partial(scene.form, p) for k, p in plans.items()}
     seconds = chapter5.in_turn(work, given.repeats)
 
-    rows = []
+    rows, exact = [], scene.lines.channels * scene.grid.size
     for key in work:
         if key == 1:
-            stages, operations = 1, scene.lines.channels * scene.grid.size
+            stages, operations = 1, exact
         elif key in range(2, 8):
             samples = [stage.samples for stage in plans[key].stages[:-1]]
             counts = (scene.lines.channels, samples, scene.grid.size)
             stages, operations = key, sum(nearest.operations(equal_stages(key), *counts))
         else:
             stages = len(plans[key].sides) + 1
-            operations = sum(s.operations for s in plans[key].stages) or rows[0]["operations"]
+            operations = sum(s.operations for s in plans[key].stages) or exact
         rows.append(
             {
                 "plan": "nearest beam" if isinstance(key, int) else f"interpolated, {key}",
                 "stages": stages,
-                "operations": f"{operations:.4g}" if key != 1 else operations,
+                "million operations": f"{operations / 1e6:.1f}",
                 "seconds": f"{seconds[key]:.3f}",
                 "over backprojection": f"{seconds[1] / seconds[key]:.2f}",
             }

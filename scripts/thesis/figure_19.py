@@ -28,12 +28,12 @@ def main() -> None:
         rows.append(
             {
                 "stages": number,
-                "[45] mm": f"{1e3 * by_formula[-1]:.4f}",
-                "[45]": chapter5.fraction(by_formula[-1]),
+                "eq. 45 mm": f"{1e3 * by_formula[-1]:.4f}",
+                "eq. 45": chapter5.fraction(by_formula[-1]),
                 "measured mm": f"{1e3 * largest[-1]:.4f}",
                 "measured": chapter5.fraction(largest[-1]),
-                "measured/[45]": f"{largest[-1] / by_formula[-1]:.3f}",
-                "rms/[45]": f"{np.sqrt(np.mean(errors_m**2)) / by_formula[-1]:.3f}",
+                "measured/eq. 45": f"{largest[-1] / by_formula[-1]:.3f}",
+                "rms/eq. 45": f"{np.sqrt(np.mean(errors_m**2)) / by_formula[-1]:.3f}",
                 **quality.cells(),
             }
         )

@@ -48,12 +48,12 @@ def main() -> None:
             plan = scene.plan(stages=stages)
             quality = scene.measure(scene.form(plan))
             usable = quality.usable(exact)
-            tried.setdefault((number, usable), []).append(error_m)
+            tried.setdefault((number, usable), {})[error_m] = chapter5.name(stages)
             rows.append(
                 {
                     "stages": number,
                     "QR x QI": chapter5.name(stages),
-                    "[45]": chapter5.fraction(error_m),
+                    "eq. 45": chapter5.fraction(error_m),
                     "measured": chapter5.fraction(scene.largest_error_m(plan)),
                     **quality.cells(),
                     "usable": "yes" if usable else "no",
@@ -65,23 +65,31 @@ def main() -> None:
         usable = "yes" if quality.usable(exact) else "no"
         row = dict.fromkeys(rows[0], "") | {"stages": len(plan.sides) + 1}
         rows.append(row | {"QR x QI": f"{db} dB"} | quality.cells() | {"usable": usable})
-    chapter5.report(given.out, "figure_37", rows)
-    largest = {}
+    if given.out.folder:
+        chapter5.report(given.out, "figure_37_plans", rows)
+    limits, largest = [], {}
     for number in range(2, 6):
-        usable, unusable = (tried.get((number, yes), []) for yes in (True, False))
+        usable, unusable = (tried.get((number, yes), {}) for yes in (True, False))
         least, most = min(unusable, default=math.nan), max(usable, default=math.nan)
-        print(
-            f"{number} stages, by [45]: unusable from {chapter5.fraction(least)}, usable up to "
-            f"{chapter5.fraction(most)}"
+        limits.append(
+            {
+                "stages": number,
+                "largest usable error, eq. 45": chapter5.fraction(most),
+                "its plan, QR x QI": usable.get(most, ""),
+                "least unusable error, eq. 45": chapter5.fraction(least),
+                "its plan": unusable.get(least, ""),
+                "thesis's limit": {2: "about λ/4", 5: "about λ/10"}.get(number, ""),
+            }
         )
         largest[number] = WAVELENGTH_M / most
+    chapter5.report(given.out, "figure_37", limits)
 
     figure = chapter5.figure()
     axes = figure.subplots()
     for row in rows:
-        if row["[45]"]:
+        if row["eq. 45"]:
             style = "go" if row["usable"] == "yes" else "rx"
-            axes.semilogy(row["stages"], float(row["[45]"].removeprefix("λ/")), style)
+            axes.semilogy(row["stages"], float(row["eq. 45"].removeprefix("λ/")), style)
     axes.plot(largest.keys(), largest.values(), "k-", label="The largest usable of these")
     axes.plot(*THESIS, "b--", label="Ends of the thesis's figure")
     axes.axhline(4, color="grey", linestyle=":", label="λ/4")

@@ -177,11 +177,11 @@ def row(
     shadow: wreck.Shadow,
 ) -> dict[str, object]:
     """Return the row of an image in the table, without its seconds."""
-    scene, worst = method.scene, {"thesis": "", "[45]": "", "measured": ""}
+    scene, worst = method.scene, {"thesis": "", "eq. 45": "", "measured": ""}
     if method.figure in THESIS:
         worst = {
             "thesis": THESIS[method.figure][1],
-            "[45]": chapter6.fraction(max(map(scene.formula_m, patches))),
+            "eq. 45": chapter6.fraction(max(map(scene.formula_m, patches))),
             "measured": chapter6.fraction(max(map(scene.measured_m, patches))),
         }
     plans = [patch.record.plan for patch in patches]

@@ -21,16 +21,16 @@ def main() -> None:
     for title, do in work.items():
         stages, exact = STAGES.get(title), title == "backprojection"
         quality = scene.exact_quality if exact else scene.measure(do())
-        row = {"plan": title, "QR x QI": "", "[45] mm": "", "[45]": "", "measured": ""}
+        row = {"plan": title, "QR x QI": "", "eq. 45 mm": "", "eq. 45": "", "measured": ""}
         if stages:
             error_m = scene.error_m(stages)
             row |= {
                 "QR x QI": chapter5.name(stages),
-                "[45] mm": f"{1e3 * error_m:.4f}",
-                "[45]": chapter5.fraction(error_m),
+                "eq. 45 mm": f"{1e3 * error_m:.4f}",
+                "eq. 45": chapter5.fraction(error_m),
                 "measured": chapter5.fraction(scene.largest_error_m(plans[title])),
             }
-        error = "-inf" if exact else f"{scene.scattered.error_db(**requests[title]):.1f}"
+        error = "" if exact else f"{scene.scattered.error_db(**requests[title]):.1f}"
         measured = {"scene error dB": error, "seconds": f"{seconds[title]:.3f}"}
         rows.append(row | quality.cells() | measured)
     chapter5.report(given.out, "section_5_2_1", rows)
@@ -39,7 +39,7 @@ def main() -> None:
     axes = figure.subplots()
     for row in rows[1:]:
         place = float(row["scene error dB"]), float(row["seconds"])
-        axes.plot(*place, "^" if not row["[45]"] else "o", label=row["plan"])
+        axes.plot(*place, "^" if not row["eq. 45"] else "o", label=row["plan"])
     axes.axhline(seconds["backprojection"], color="grey", linestyle=":", label="backprojection")
     axes.set(
         xlabel="measured error of an image of 300 points (dB)", ylabel="time (s)", ylim=(0, None)
