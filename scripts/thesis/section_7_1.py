@@ -15,7 +15,6 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 
 import chapter5
 import numpy as np
@@ -268,14 +267,13 @@ def measured(system: System, device: Device, repeats: int) -> dict[str, object]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("thesis"), help="folder for the results")
-    parser.add_argument("--device", help="device, as listed by `clsas devices`")
+    chapter5.add_output(parser)
     parser.add_argument("--pixels", type=int, help="pixels along each side, instead of 1024")
     parser.add_argument("--sweep", action="append", choices=SWEEPS, help="only this sweep")
     parser.add_argument("--repeats", type=int, default=3, help="timed runs [default: %(default)s]")
     given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
     device = open_device(given.device)
+    out = chapter5.Output.of(given, device)
     rows = []
     for sweep in given.sweep or SWEEPS:
         for system in SYSTEMS:
@@ -289,11 +287,11 @@ def main() -> None:
                     cells = measured(case, device, given.repeats)
                 rows.append({"varied": sweep, "system": system.name, "value": value} | cells)
                 print(*rows[-1].values(), sep=" | ", flush=True)
-    chapter5.report(given.out, "section_7_1", rows)
-    draw(rows, given.sweep or list(SWEEPS), given.out)
+    chapter5.report(out, "section_7_1", rows)
+    draw(rows, given.sweep or list(SWEEPS), out)
 
 
-def draw(rows: Sequence[dict[str, object]], sweeps: Sequence[str], out: Path) -> None:
+def draw(rows: Sequence[dict[str, object]], sweeps: Sequence[str], out: chapter5.Output) -> None:
     """Draw the speed-up over the channels per pixel, a panel for each sweep."""
     figure = chapter5.figure(11, 6.5)
     panels = np.ravel(figure.subplots(2, 3, sharex=True, sharey=True))
