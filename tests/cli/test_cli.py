@@ -95,7 +95,7 @@ def test_results_in_json(made):
     assert (point["x_m"], point["y_m"]) == pytest.approx((0, 20), abs=1e-3)
     assert "offset_m" not in point["range"]
     scene = read_scene(folder / "scene.toml")
-    azimuth_m, _ = demo.expected_resolution_m(scene.sonar, scene.track, np.array([0, 20.0, 0]))
+    azimuth_m, _ = expected_resolution_m(scene.sonar, scene.track, np.array([0, 20.0, 0]))
     assert point["azimuth"]["resolution_m"] == pytest.approx(azimuth_m, rel=0.02)
     # Hamming's 1.3 c/2B, and a little more along the ground.
     assert point["range"]["resolution_m"] == pytest.approx(1.3 * 0.0125, rel=0.1)
@@ -765,7 +765,7 @@ def test_expected_resolution_of_a_plain_aperture():
     pulse = clsas.Pulse(carrier_hz=1e5, bandwidth_hz=5e3, duration_s=0.1)
     sonar = clsas.Sonar(pulse, [[0.0, 0.0, 0.0]])
     track = clsas.Track.straight([-5, 0, 0], [1, 0, 0], 1001, 0.01)
-    azimuth_m, range_m = demo.expected_resolution_m(sonar, track, np.array([0, 1000.0, 0]))
+    azimuth_m, range_m = expected_resolution_m(sonar, track, np.array([0, 1000.0, 0]))
     assert azimuth_m == pytest.approx(0.8859 * 0.015 * 1000 / (2 * 10.01), rel=1e-3)
     assert range_m == pytest.approx(0.8859 * 1500 / (2 * 5e3), rel=0.02)
 
