@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
 from clsas.core.decibels import in_db
@@ -23,10 +24,12 @@ from clsas.sonar.visibility import sines
 _FREQUENCIES = 4001  # across the band; twice as many change widths by 1e-4 at most
 _PER_WIDTH = 4  # positions per -3 dB width at which the level of a grating lobe is computed
 _MOST_POSITIONS = 2000  # arbitrary bound on the time of this computation
+_BOUNDING = 64  # positions of a lobe from which the farthest distance in range follows
 _CENTRES = 9  # phase centres from which lobes are searched; 17 change a level by less than 0.1 dB
+_FEWEST = 401  # frequencies across the band for the response far from its peak
 _PER_CELL = 20  # samples of the range response per c/2B, between which it is linear
 _MOST_TABLE = 1 << 22  # complex numbers computed at once: 64 MiB
-_MOST_WORK = 1 << 26  # pairs of positions and channels: seconds. More channels get fewer positions.
+_MOST_WORK = 1 << 24  # pairs of positions and channels: 2 s. More channels get fewer positions.
 _MOST_CHANNELS = 8192  # above which channels of nearly equal spatial frequencies are added up
 _WIDEST = 64.0  # responses wider than this over the extent of their spectrum have no aperture
 
@@ -170,10 +173,8 @@ def grating_lobe_db(
     points_m = points_m[:: -(-len(points_m) * len(tx) // _MOST_WORK)]
     range_m = bistatic_range_m(seen.point_m, tx, rx)
     parts_m = np.array_split(points_m, -(-len(points_m) * len(tx) // _MOST_TABLE))
-    farthest_m = max(
-        float(np.abs(bistatic_range_m(part_m[:, None], tx, rx) - range_m).max())
-        for part_m in parts_m
-    )
+    some_m = points_m[:: max(1, len(points_m) // _BOUNDING), None]
+    farthest_m = 1.1 * float(np.abs(bistatic_range_m(some_m, tx, rx) - range_m).max())
     nodes_m, response = _range_response(sonar, window, farthest_m)
     largest = 0.0
     for part_m in parts_m:
@@ -224,13 +225,17 @@ def _range_response(
 
     The response of the peak is 1. `farthest_m` is the largest distance to either side.
     """
-    frequency, power = _band(sonar, window)
-    step_m = sonar.sound_speed_m_s / (2 * sonar.pulse.bandwidth_hz) / _PER_CELL
-    nodes_m = np.linspace(-farthest_m, farthest_m, 2 * int(np.ceil(farthest_m / step_m)) + 1)
-    turns = 4j * np.pi / sonar.sound_speed_m_s * frequency
-    parts_m = np.array_split(nodes_m, -(-len(nodes_m) * len(frequency) // _MOST_TABLE))
-    response = [np.exp(np.multiply.outer(part_m, turns)) @ power for part_m in parts_m]
-    return nodes_m, np.concatenate(response) / power.sum()
+    sound_m_s, band_hz = sonar.sound_speed_m_s, sonar.pulse.bandwidth_hz
+    # Steps in frequency so small that the response repeats only far beyond the farthest distance.
+    count = max(_FEWEST, int(np.ceil(8 * farthest_m * band_hz / sound_m_s)))
+    frequency = np.linspace(-0.5, 0.5, count) * band_hz
+    power = np.interp(frequency, *_band(sonar, window))
+    length = scipy.fft.next_fast_len(_PER_CELL * count)
+    places_m = np.arange(length // 2) * sound_m_s * (count - 1) / (2 * length * band_hz)
+    response = scipy.fft.ifft(power, length)[: length // 2] * length / power.sum()
+    response *= np.exp(2j * np.pi / sound_m_s * -band_hz * places_m)
+    mirrored = np.concatenate([-places_m[:0:-1], places_m])
+    return mirrored, np.concatenate([response[:0:-1].conj(), response])
 
 
 def _band(sonar: Sonar, window: Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -126,5 +126,7 @@ def limits(
             if isinstance(each, Limit):
                 results.append(replace(each, subject=subject))
             else:
-                missing |= dict.fromkeys(each[0].split(), each[1])
+                names, reason = each
+                for name in names.split():
+                    missing.setdefault(name, reason)
     return Limits(tuple(results), missing)
