@@ -20,7 +20,7 @@ _FROM_SCENE = ("range_m", "pointing", "element_pattern", "motion_in_flight")
 @click.argument("scene", metavar="SCENE.TOML", type=INPUT)
 @options.as_json
 def limits(scene: Path, as_json: bool) -> None:
-    """Show the limits of a survey: sampling, resolution, swath, speed.
+    """Show the limits of a survey: sampling, speed, resolution.
 
     The survey is that of a scene file, before anything is simulated or recorded. Every number comes
     with the limit that it should keep, the equation, and a sentence on what it means. A scene needs

@@ -224,19 +224,40 @@ class Survey:
         return float(np.diff(np.sort(self.centres_m @ self.along)).max(initial=0.0))
 
     @cached_property
+    def pitch_m(self) -> float:
+        """Regular spacing of the phase centres: that of the array, or the usual advance."""
+        if self.is_array:
+            return _usual_gap_m(self.ping_m @ self.along)
+        return float(np.median(self.steps_m)) if self.is_moving else 0.0
+
+    @property
     def lobe_m(self) -> float | None:
         """Distance of the first grating lobes from a target in the middle [26], if known."""
-        if self.distance_m is None or not self.spacing_m:
+        if self.distance_m is None or not self.pitch_m:
             return None
-        return grating_lobe_m(self.sonar.wavelength_m, self.spacing_m, self.distance_m)
+        return grating_lobe_m(self.sonar.wavelength_m, self.pitch_m, self.distance_m)
+
+    @property
+    def ping_lobe_m(self) -> float | None:
+        """The same for the spacing of the pings of an array."""
+        if self.distance_m is None or not self.is_moving or not self.is_array:
+            return None
+        step_m = float(np.median(self.steps_m))
+        return grating_lobe_m(self.sonar.wavelength_m, step_m, self.distance_m) if step_m else None
+
+    def lobe_db(self, lobe_m: float) -> float | None:
+        """Return the level of lobes at a distance from a target in the middle, if known."""
+        if self.view is None or self.width_m is None:
+            return None
+        if lobe_m not in self._levels_db:
+            level_db = grating_lobe_db(self.sonar, self.view, lobe_m, self.width_m, self.window)
+            self._levels_db[lobe_m] = min(level_db, 0.0)
+        return self._levels_db[lobe_m]
 
     @cached_property
-    def lobe_db(self) -> float | None:
-        """Level of these lobes relative to the target, if known."""
-        if self.lobe_m is None or self.view is None or self.width_m is None:
-            return None
-        level_db = grating_lobe_db(self.sonar, self.view, self.lobe_m, self.width_m, self.window)
-        return min(level_db, 0.0)
+    def _levels_db(self) -> dict[float, float]:
+        """Levels of lobes that have been computed, by their distances."""
+        return {}
 
     @cached_property
     def beam_sines(self) -> tuple[float, float] | None:
@@ -257,9 +278,14 @@ class Survey:
 
 def _length_m(places_m: NDArray[np.float64]) -> float:
     """Return the extent of places, each of which extends over the usual distance to the next."""
+    return float(np.ptp(places_m)) + _usual_gap_m(places_m)
+
+
+def _usual_gap_m(places_m: NDArray[np.float64]) -> float:
+    """Return the median distance between neighbouring places; 0 if all are one."""
     gaps_m = np.diff(np.sort(places_m))
     gaps_m = gaps_m[gaps_m > 1e-9 * gaps_m.max(initial=0.0)]
-    return float(gaps_m.sum() + np.median(gaps_m)) if gaps_m.size else 0.0
+    return float(np.median(gaps_m)) if gaps_m.size else 0.0
 
 
 def _clipped(low_rad: float, high_rad: float) -> tuple[float, float]:

@@ -10,6 +10,39 @@ from clsas.core.tables import Report, Table
 
 _INDENT = "    "
 
+LABELS = {
+    "first_echo_s": "first echo",
+    "last_echo_s": "last echo",
+    "ping_rate_hz": "ping rate",
+    "unambiguous_range_m": "unambiguous range",
+    "swath_m": "swath",
+    "recorded_from_m": "recorded from",
+    "recorded_to_m": "recorded to",
+    "sample_rate_hz": "sample rate",
+    "advance_m": "distance per ping",
+    "overlap": "overlap of pings",
+    "speed_m_s": "speed",
+    "greatest_speed_m_s": "greatest speed",
+    "phase_centre_spacing_m": "phase-centre spacing",
+    "doppler_bandwidth_hz": "Doppler bandwidth",
+    "grating_lobe_m": "grating lobes",
+    "grating_lobe_db": "grating-lobe level",
+    "ping_lobe_m": "ping lobes",
+    "ping_lobe_db": "ping-lobe level",
+    "range_resolution_m": "range (c/2B)",
+    "range_width_m": "range (-3 dB)",
+    "azimuth_resolution_m": "azimuth (L/2)",
+    "azimuth_width_m": "azimuth (-3 dB)",
+    "aperture_m": "synthetic aperture",
+    "range_pixel_m": "pixels in range",
+    "azimuth_pixel_m": "pixels in azimuth",
+    "array_far_field_m": "far field of the array",
+    "aperture_far_field_m": "far field of the aperture",
+    "phase_centre_shift_m": "phase-centre path",
+    "phase_centre_error_m": "phase-centre error",
+}
+"""Words for the name of every result, in their order."""
+
 
 @dataclass(frozen=True)
 class Limit:
@@ -128,14 +161,15 @@ class Limits:
         if not checked:
             lines = ["No limit could be checked."]
         elif not broken:
-            lines = [f"All {len(checked)} limits are kept."]
+            lines = [f"All limits that could be checked are kept ({len(checked)})."]
         else:
-            lines = [f"{len(broken)} of {len(checked)} limits are not kept:"]
+            are = "is" if len(broken) == 1 else "are"
+            lines = [f"{len(broken)} of {len(checked)} limits {are} not kept:"]
         for each in broken:
             lines.append(f"  {each.label}: {_excess(each)}. {each.consequence}.")
         reasons: dict[str, list[str]] = {}
         for name, reason in self.missing.items():
-            reasons.setdefault(reason, []).append(name)
+            reasons.setdefault(reason, []).append(LABELS[name])
         if reasons:
             lines.append("Not given:")
         lines += [f"  {', '.join(names)}: {reason}" for reason, names in reasons.items()]

@@ -7,12 +7,21 @@ from dataclasses import replace
 
 from clsas.core.grid import Grid
 from clsas.measures.limits_geometry import Survey
+from clsas.measures.limits_imaging import approximations, resolution
 from clsas.measures.limits_result import Limit, Limits
-from clsas.measures.limits_subjects import SUBJECTS
+from clsas.measures.limits_sampling import along_track, grating_lobes, ping_interval
 from clsas.signal.compression import Window
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Pointing, Track
+
+_SUBJECTS = {
+    "Range and ping interval": ping_interval,
+    "Sampling along the track, and speed": along_track,
+    "Grating lobes": grating_lobes,
+    "Resolution": resolution,
+    "Near field and phase centres": approximations,
+}
 
 
 def limits(
@@ -121,7 +130,7 @@ def limits(
     )
     results: list[Limit] = []
     missing: dict[str, str] = {}
-    for subject, yields in SUBJECTS.items():
+    for subject, yields in _SUBJECTS.items():
         for each in yields(survey):
             if isinstance(each, Limit):
                 results.append(replace(each, subject=subject))

@@ -434,9 +434,9 @@ def test_limits_of_scenes_with_missing_and_wrong_parts(tmp_path):
     scene = tmp_path / "scene.toml"
     scene.write_text('[sonar]\npreset = "edgetech"\n')
     text, _ = run("limits", scene)
-    assert "range, c/2B" in text
-    assert "advance_m, overlap, speed_m_s" in text
-    scene.write_text("[track]\n" + EXAMPLE.split("[track]\n")[1].split("[")[0])
+    assert "range (c/2B)" in text
+    assert "distance per ping, overlap of pings, speed" in text
+    scene.write_text(EXAMPLE[EXAMPLE.index("[grid]") : EXAMPLE.index("[image]")])
     assert "missing table [sonar]" in run("limits", scene, code=1)[1]
     scene.write_text(EXAMPLE.replace("ping_interval_s", "ping_intervals"))
     assert "ping_intervals" in run("limits", scene, code=1)[1]

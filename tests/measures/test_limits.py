@@ -9,7 +9,7 @@ import clsas
 from clsas.core.geometry import bistatic_range_m
 from clsas.exact.reference import ideal
 from clsas.files.scene_files import built_in_scene, parse_scene
-from clsas.measures.limits_result import Limit
+from clsas.measures.limits_result import LABELS, Limit
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.system import Pulse, Sonar, line_array
 from clsas.sonar.track import Pointing, Track
@@ -147,6 +147,9 @@ def test_pings_that_leave_a_gap_cause_lobes_where_they_are_predicted():
     x_m = np.linspace(0.4, 1.1, 701)
     amplitude = image_along_x(sonar, track, point_m, x_m, np.sqrt(60**2 - x_m**2))
     assert x_m[amplitude.argmax()] == pytest.approx(found["ping_lobe_m"].value, rel=0.03)
+    level_db = 20 * np.log10(amplitude.max())
+    assert found["ping_lobe_db"].value == pytest.approx(level_db, abs=0.5)
+    assert "Expect grating lobes at multiples of 0.75 m" in found.describe()
     # Without gaps, there is nothing but side lobes.
     whole = Track.straight([-1.8, 0, 0], [0.4, 0, 0], 10, 1.0)
     assert image_along_x(sonar, whole, point_m, x_m, np.sqrt(60**2 - x_m**2)).max() < 0.3
@@ -295,13 +298,14 @@ def test_missing_parts_are_named(arguments, names, reason):
         with pytest.raises(KeyError, match=name):
             found[name]
     text = found.describe()
-    assert all(name in text for name in names)
+    assert all(LABELS[name] in text for name in names)
     # Whatever is known remains.
     assert found["range_resolution_m"].value == pytest.approx(7.5e-3)
 
 
 def test_every_result_is_given_or_missing(wide):
-    names = {each.name for each in wide.results}
+    names = set(LABELS)
+    assert [each.name for each in wide.results] == list(LABELS)
     one = Sonar(Pulse(100e3, 20e3, 1e-3), [[0, 0, 0]])
     circle = np.linspace(0, 2 * np.pi, 50)
     turning = Track(np.stack([np.cos(circle), np.sin(circle), 0 * circle], -1), np.arange(50.0))
@@ -328,7 +332,7 @@ def test_a_result_reads_well(wide):
     )
     assert max(map(len, text.splitlines()[:-4])) <= 110
     assert repr(wide) == (
-        "Limits(28 results, limits not kept: phase_centre_spacing_m, doppler_bandwidth_hz)"
+        "Limits(29 results, limits not kept: phase_centre_spacing_m, doppler_bandwidth_hz)"
     )
     assert "<table>" in wide._repr_html_()
     for each in wide.results:
