@@ -20,6 +20,7 @@ NO_ELEMENT = "requires the length of the elements, which are omnidirectional"
 NO_ARRAY = "requires several receivers along the track"
 NO_STEP = "requires several receivers along the track, or the length of the elements"
 NO_CENTRES = "requires several phase centres: a track, or several receivers"
+NO_LOBES = "requires lobes; these would lie beyond end-fire"
 CURVED = "requires a straight track; this one is curved, or turns back"
 UNSEEN = "requires an aperture: several places from which the beam covers the middle"
 

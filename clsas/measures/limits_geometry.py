@@ -69,6 +69,8 @@ class Survey:
         check_compression(window=self.window)
         for name in ("element_pattern", "motion_in_flight"):
             object.__setattr__(self, name, validate.flag(name, getattr(self, name)))
+        if self.distance_m == 0:
+            raise ValueError("grid must not have its middle at a phase centre of the track")
 
     @property
     def element_m(self) -> float | None:
@@ -177,9 +179,10 @@ class Survey:
             return self.grid.at(np.array([middle, next_to])).mean(axis=0)
         if self.range_m is None:
             return None
-        up = np.array([0.0, 0.0, 1.0])
-        aside = np.cross(up, self.along)
-        aside /= np.linalg.norm(aside) or 1.0
+        aside = np.array([-self.along[1], self.along[0], 0.0])
+        if not aside.any():  # a vertical track
+            aside[1] = 1.0
+        aside /= np.linalg.norm(aside)
         return self.centres_m.mean(axis=0) + np.mean(self.range_m) * aside
 
     @property
@@ -252,7 +255,8 @@ class Survey:
         if lobe_m not in self._levels_db:
             level_db = grating_lobe_db(self.sonar, self.view, lobe_m, self.width_m, self.window)
             self._levels_db[lobe_m] = min(level_db, 0.0)
-        return self._levels_db[lobe_m]
+        level_db = self._levels_db[lobe_m]
+        return level_db if math.isfinite(level_db) else None
 
     @cached_property
     def _levels_db(self) -> dict[float, float]:

@@ -17,6 +17,7 @@ from clsas.measures.limits_common import (
     NO_CENTRES,
     NO_ELEMENT,
     NO_INTERVAL,
+    NO_LOBES,
     NO_PINGS,
     NO_RANGE,
     NO_RECORD,
@@ -254,7 +255,7 @@ def _element_lobes(survey: Survey, distance_m: float) -> Iterator[Result]:
         f"{where}.",
     )  # fmt: skip
     if lobe_m > distance_m:
-        yield "grating_lobe_db", "requires grating lobes; there are none"
+        yield "grating_lobe_db", NO_LOBES
     elif (level_db := survey.lobe_db(lobe_m)) is None:
         yield "grating_lobe_db", NO_PINGS if not survey.is_moving else UNSEEN
     else:
@@ -274,7 +275,7 @@ def _ping_lobes(survey: Survey) -> Iterator[Result]:
         "Gaps and errors that repeat with every ping cause lobes at multiples of this.",
     )  # fmt: skip
     if (level_db := survey.lobe_db(lobe_m)) is None:
-        yield "ping_lobe_db", UNSEEN
+        yield "ping_lobe_db", NO_LOBES if survey.width_m is not None else UNSEEN
     else:
         yield result(
             "ping_lobe_db", level_db, "[26]",

@@ -154,6 +154,8 @@ def grating_lobe_db(
     equal phase differ by half a wavelength from one to the next. Wide bands therefore smear it. The
     level is the largest found at all places where the lobe may lie.
 
+    The level is minus infinity if the lobe would lie beyond end-fire.
+
     Parameters
     ----------
     sonar : Sonar
@@ -170,6 +172,8 @@ def grating_lobe_db(
     seen = seen.of(np.abs(seen.patterns) > 1e-3 * np.abs(seen.patterns).max())
     tx, rx = seen.tx_m, seen.rx_m
     points_m = _lobe_positions_m(sonar, seen, lobe_m, width_m)
+    if not len(points_m):
+        return -np.inf
     points_m = points_m[:: -(-len(points_m) * len(tx) // _MOST_WORK)]
     range_m = bistatic_range_m(seen.point_m, tx, rx)
     parts_m = np.array_split(points_m, -(-len(points_m) * len(tx) // _MOST_TABLE))

@@ -343,6 +343,22 @@ def test_a_result_reads_well(wide):
         assert each.consequence or each.limit is None
 
 
+def test_unusual_geometries():
+    one = Sonar(Pulse(100e3, 20e3, 1e-3), [[0, 0, 0]])
+    rising = Track.straight([0, 0, 0], [0, 0, 0.1], 81, 1)
+    assert clsas.limits(one, rising, range_m=(10, 20))["azimuth_width_m"].value < 0.05
+    slow = Track.straight([0, 0, 0], [0.1, 0, 0], 81, 1e-3)
+    found = clsas.limits(Sonar.edgetech(), slow, range_m=(0, 20))
+    assert "beyond end-fire" in found.missing["ping_lobe_db"]
+    assert "longer apart than the pulse" in found.missing["unambiguous_range_m"]
+    assert "above 0 m" in found.missing["phase_centre_error_m"]
+    level = Track.straight([-4, 0, 0], [0.1, 0, 0], 81, 1)
+    ahead = clsas.limits(one, level, clsas.Grid.plane((20, 30, 11), (0, 0, 1)))
+    assert "several places" in ahead.missing["azimuth_width_m"]
+    with pytest.raises(ValueError, match="grid must not have its middle at a phase centre"):
+        clsas.limits(one, level, clsas.Grid.plane((-1, 1, 3), (-1, 1, 3)))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
