@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from clsas.inspection.result import Inspection, PhaseSign
     from clsas.measures.assessment import assess, survey_lines
     from clsas.measures.assessment_result import Assessment, Effect
+    from clsas.measures.limits_result import Limit, Limits
     from clsas.measures.quality import measure_point
+    from clsas.measures.survey_limits import limits
     from clsas.measures.tradeoff import tradeoff
     from clsas.measures.tradeoff_result import Tradeoff
     from clsas.mosaics.mosaic import Mosaic, Patch, mosaic
@@ -70,6 +72,8 @@ __all__ = [
     "Image",
     "Imager",
     "Inspection",
+    "Limit",
+    "Limits",
     "Micronavigation",
     "Mosaic",
     "Patch",
@@ -99,6 +103,7 @@ __all__ = [
     "from_full_matrix",
     "from_phase_history",
     "inspect",
+    "limits",
     "list_devices",
     "load",
     "measure_point",
@@ -144,7 +149,9 @@ _MODULES = {
     "inspection.result": "Inspection PhaseSign",
     "measures.assessment": "assess survey_lines",
     "measures.assessment_result": "Assessment Effect",
+    "measures.limits_result": "Limit Limits",
     "measures.quality": "measure_point",
+    "measures.survey_limits": "limits",
     "measures.tradeoff": "tradeoff",
     "measures.tradeoff_result": "Tradeoff",
     "mosaics.mosaic": "Mosaic Patch mosaic",

@@ -42,6 +42,7 @@ _GROUPS = {
     },
     "Measures": {
         "quality": ("measures", "Measure the contrast, a point or the error of an image."),
+        "limits": ("limits", "Show the limits of a survey: sampling, speed, resolution."),
         "assess": ("assess", "Show which effects an image needs, and what each costs."),
         "tradeoff": ("measures", "Measure time and error of one image at many tolerances."),
     },

@@ -146,4 +146,4 @@ def warn_of_sampling(scene: SceneFile, grid: clsas.Grid | None = None) -> None:
     if scene.sonar is None or scene.track is None or grid is None:
         return
     for finding in clsas.check_sampling(scene.sonar, scene.track, grid):
-        warn(finding.message)
+        warn(f"{finding.message}. See clsas limits {scene.name}")

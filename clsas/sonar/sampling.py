@@ -19,9 +19,8 @@ from clsas.sonar.beam import BeamWindow
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Track, channels
 
-# Relative excess of the spacing that is tolerated. A sway of centimetres changes the spacing a
-# little.
-_SLACK = 0.01
+SLACK = 0.01
+"""Relative excess of a spacing that is tolerated: a sway of centimetres changes it a little."""
 
 
 @dataclass(frozen=True)
@@ -147,11 +146,18 @@ def check_sampling(
     corners = None
     if grid is not None:
         validate.instance("grid", grid, Grid)
-        corners = _corners_m(grid)
+        corners = corners_of(grid)
     tx, rx = _antennas_m(sonar, track)
-    limit = _spacing_limit(sonar, beam, element_length_m, wavelength_m)
+    spacing = measure_spacing(
+        sonar,
+        phase_centres_m(tx, rx),
+        corners,
+        beam=beam,
+        element_length_m=element_length_m,
+        wavelength_m=wavelength_m,
+    )
     ranges = None if corners is None else bistatic_range_m(corners[:, None], tx, rx)
-    found = _check_spacing(limit, phase_centres_m(tx, rx), corners, ranges)
+    found = _check_spacing(spacing, ranges)
     if isinstance(sonar, Sonar) and isinstance(track, Track) and ranges is not None:
         found += _check_ping_rate(sonar, track, ranges)
     return found
@@ -210,28 +216,68 @@ def _spacing_limit(
     return _SpacingLimit(wavelength)
 
 
-def _check_spacing(
-    known: _SpacingLimit, centres: NDArray, corners: NDArray | None, ranges: NDArray | None
-) -> list[Finding]:
-    course = _course(centres)
-    gaps = np.diff(np.sort(centres @ course))
+@dataclass(frozen=True)
+class Spacing:
+    """Largest gap between neighbouring phase centres along the track, and the largest allowed.
+
+    `reason` completes the sentence "phase centres should be at most so far apart".
+    """
+
+    wavelength_m: float
+    spacing_m: float
+    limit_m: float
+    reason: str
+
+    @property
+    def is_kept(self) -> bool:
+        """True if the gap exceeds the limit by no more than sway explains."""
+        # With a sway of centimetres the principal direction differs a little from the course.
+        return self.spacing_m <= self.limit_m * (1 + SLACK)
+
+
+def measure_spacing(
+    survey: Sonar | RangeLines,
+    centres_m: NDArray[np.float64],
+    corners_m: NDArray[np.float64] | None,
+    *,
+    beam: BeamWindow | None = None,
+    element_length_m: float | None = None,
+    wavelength_m: float | None = None,
+) -> Spacing:
+    """Return the spacing of phase centres, and its limit; see `check_sampling`.
+
+    Parameters
+    ----------
+    survey, beam, element_length_m, wavelength_m
+        As for `check_sampling`.
+    centres_m : float64 [channels, 3]
+    corners_m : float64 [corners, 3] or None
+        Corners of the grid.
+    """
+    known = _spacing_limit(survey, beam, element_length_m, wavelength_m)
+    along = course(centres_m)
+    gaps = np.diff(np.sort(centres_m @ along))
     spacing = float(gaps.max(initial=0.0))
     limit, reason = known.spacing_m, known.reason
-    if corners is not None and not known.of_element:
-        way = corners[:, None] - centres
+    if corners_m is not None and not known.of_element:
+        way = corners_m[:, None] - centres_m
         distance = np.linalg.norm(way, axis=-1)
-        sine = np.divide(way @ course, distance, out=np.zeros_like(distance), where=distance > 0)
+        sine = np.divide(way @ along, distance, out=np.zeros_like(distance), where=distance > 0)
         spread = float(np.ptp(sine, axis=0).max())
         of_grid = known.wavelength_m / (2 * spread) if spread else np.inf
         if of_grid > limit or not reason:
             limit, reason = of_grid, " to keep grating lobes off the grid"
-    # With a sway of centimetres the principal direction differs a little from the course.
-    if spacing <= limit * (1 + _SLACK):
+    return Spacing(known.wavelength_m, spacing, limit, reason)
+
+
+def _check_spacing(found: Spacing, ranges: NDArray | None) -> list[Finding]:
+    if found.is_kept:
         return []
+    spacing, limit, reason = found.spacing_m, found.limit_m, found.reason
     where = ""
     if ranges is not None:
         near, far = ranges.min(), ranges.max()
-        lobes = [grating_lobe_m(known.wavelength_m, spacing, distance) for distance in (near, far)]
+        lobes = [grating_lobe_m(found.wavelength_m, spacing, distance) for distance in (near, far)]
         where = (
             f". Expect grating lobes {lobes[0]:.4g} m to {lobes[1]:.4g} m beside every "
             f"target (at the ranges of the grid's corners, {near:.4g} m to {far:.4g} m)"
@@ -308,12 +354,12 @@ def grating_lobe_m(wavelength_m: float, spacing_m: float, range_m: float) -> flo
     return validate.positive("range_m", range_m, "m") * wavelength / (2 * spacing)
 
 
-def _course(centres: NDArray[np.float64]) -> NDArray[np.float64]:
+def course(centres: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the unit vector along which the phase centres extend farthest."""
     return np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)[2][0]
 
 
-def _corners_m(grid: Grid) -> NDArray[np.float64]:
+def corners_of(grid: Grid) -> NDArray[np.float64]:
     """Return the corners of a plane, or of the box around any other grid, [n, 3]."""
     if grid.is_planar:
         ends = (slice(None, None, max(1, count - 1)) for count in grid.shape)

@@ -325,7 +325,8 @@ class Sonar:
         """Return the Edgetech SAS on HUGIN (Ødegaard 2004, chapter 6).
 
         It has 6 receivers with a total length of 1.2012 m at 125 kHz, and a bandwidth of 15 kHz.
-        The resolution is 10 cm by 10 cm. The thesis gives neither the pulse nor the transmitter.
+        They resolve 5 cm in range (c/2B) and 10 cm in azimuth (L/2); the thesis quotes a
+        theoretical resolution of 10 cm by 10 cm. It gives neither the pulse nor the transmitter.
         The chirp of 5 ms, and a transmitter as long as a receiver in the middle of the array, are
         choices.
         """

@@ -20,13 +20,14 @@ from clsas.exact.backprojection import form_exactly
 from clsas.files.hdf5 import save
 from clsas.files.scene_files import SceneFile, built_in_scene, read_scene
 from clsas.measures.quality import PointResponse, measure_point
+from clsas.measures.resolution import expected_resolution_m
 from clsas.opencl.device import Device, open_device
 from clsas.signal.compression import compress
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate
 from clsas.sonar.sampling import check_sampling
-from clsas.sonar.system import Sonar, element_pattern
-from clsas.sonar.track import Track, channels
+from clsas.sonar.system import Sonar
+from clsas.sonar.track import Track
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -211,7 +212,8 @@ class _Demo:
             f"{pulse.carrier_hz / 1e6:g} MHz, {pulse.bandwidth_hz / 1e3:g} kHz",
         )
         for finding in check_sampling(sonar, track, grid):
-            self.report("", f"note: {finding.message}")
+            file = self.out / "scene.toml"
+            self.report("", f"note: {finding.message}. See clsas limits {file}")
 
     def report_point(
         self,
@@ -241,33 +243,3 @@ class _Demo:
                 f"{1e3 * expected:.2f} mm; {rule} mm), PSLR {max(cut.pslr_db):.1f} dB, "
                 f"ISLR {cut.islr_db:.1f} dB",
             )
-
-
-def expected_resolution_m(
-    sonar: Sonar, track: Track, point_m: NDArray[np.float64]
-) -> tuple[float, float]:
-    """Return the theoretical -3 dB widths of a point in azimuth and range.
-
-    The response along an axis is the Fourier transform of the spectrum along it. In azimuth the
-    spectrum is the two-way element pattern at the spatial frequency (sin theta_tx + sin
-    theta_rx)/lambda of each channel. In range it is |P(f)|^2, that of the matched pulse, at 2 f/c.
-    """
-    tx, rx, _ = channels(sonar, track)
-    sines = [(point_m - end)[:, 0] / np.linalg.norm(point_m - end, axis=1) for end in (tx, rx)]
-    gain = np.ones(len(tx))
-    for size, sine in zip((sonar.tx_length_m, sonar.rx_length_m), sines, strict=True):
-        if size is not None:
-            gain *= element_pattern(size, sine, sonar.pulse.carrier_hz, sonar.sound_speed_m_s)
-    pulse = sonar.pulse
-    frequency = np.linspace(-0.5, 0.5, 4001) * pulse.bandwidth_hz
-    return (
-        _width(sum(sines) / sonar.wavelength_m, gain),
-        _width(2 * frequency / sonar.sound_speed_m_s, np.abs(pulse.spectrum(frequency)) ** 2),
-    )
-
-
-def _width(cycles_per_m: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
-    """Return the full width at half power of |sum weight exp(j 2 pi cycles_per_m u)| at u = 0."""
-    offset = np.linspace(0, 1 / np.ptp(cycles_per_m), 2001)
-    response = np.abs(np.exp(2j * np.pi * np.multiply.outer(offset, cycles_per_m)) @ weight)
-    return 2 * float(np.interp(-0.5, -((response / response[0]) ** 2), offset))

@@ -24,6 +24,7 @@ from clsas import cli
 from clsas.cli import images
 from clsas.core import validate
 from clsas.files.scene_files import built_in_scene, read_scene
+from clsas.measures.resolution import expected_resolution_m
 from clsas.planning import costs
 from clsas.trials import cases, demo
 
@@ -95,7 +96,7 @@ def test_results_in_json(made):
     assert (point["x_m"], point["y_m"]) == pytest.approx((0, 20), abs=1e-3)
     assert "offset_m" not in point["range"]
     scene = read_scene(folder / "scene.toml")
-    azimuth_m, _ = demo.expected_resolution_m(scene.sonar, scene.track, np.array([0, 20.0, 0]))
+    azimuth_m, _ = expected_resolution_m(scene.sonar, scene.track, np.array([0, 20.0, 0]))
     assert point["azimuth"]["resolution_m"] == pytest.approx(azimuth_m, rel=0.02)
     # Hamming's 1.3 c/2B, and a little more along the ground.
     assert point["range"]["resolution_m"] == pytest.approx(1.3 * 0.0125, rel=0.1)
@@ -402,13 +403,43 @@ def test_a_broken_sampling_limit_is_a_warning(made, tmp_path):
     sparse.write_text(EXAMPLE.replace("spacing_m = 0.02", "spacing_m = 0.04"))
     _, stderr = run("simulate", sparse, "-o", tmp_path / "echoes.h5")
     assert re.fullmatch(
-        r"Warning: phase centres are up to 20 mm apart .* grating lobes .*\n", stderr
+        r"Warning: phase centres are up to 20 mm apart .* grating lobes .*\. See clsas limits .*\n",
+        stderr,
     )
     lines = made[0] / "lines.h5"
     image = "image", lines, "--scene", sparse, "-o", tmp_path / "image.h5"
     assert run(*image)[1] == ""  # that of the scene's own grid was told when it was simulated
     _, stderr = run(*image, *GRID)
     assert stderr.startswith("Warning: phase centres are up to 20 mm")
+
+
+def test_limits_of_a_scene(tmp_path):
+    scene = tmp_path / "scene.toml"
+    scene.write_bytes(built_in_scene("thesis_wide_beam"))
+    text, stderr = run("limits", scene)
+    assert stderr == ""
+    assert "distance per ping          0.528 m    at most 0.528 m   yes" in text
+    result = run_json("limits", scene)
+    assert result["exceeded"] == ["phase_centre_spacing_m", "doppler_bandwidth_hz"]
+    assert result["missing"] == {}
+    spacing = result["results"]["phase_centre_spacing_m"]
+    assert spacing["value"] == pytest.approx(8.25e-3)
+    del spacing["value"]
+    assert spacing == {
+        "unit": "m", "limit": 7.5e-3, "side": "most", "kept": False, "equation": "[27], [29]"
+    }  # fmt: skip
+
+
+def test_limits_of_scenes_with_missing_and_wrong_parts(tmp_path):
+    scene = tmp_path / "scene.toml"
+    scene.write_text('[sonar]\npreset = "edgetech"\n')
+    text, _ = run("limits", scene)
+    assert "range (c/2B)" in text
+    assert "distance per ping, overlap of pings, speed" in text
+    scene.write_text(EXAMPLE[EXAMPLE.index("[grid]") : EXAMPLE.index("[image]")])
+    assert "missing table [sonar]" in run("limits", scene, code=1)[1]
+    scene.write_text(EXAMPLE.replace("ping_interval_s", "ping_intervals"))
+    assert "ping_intervals" in run("limits", scene, code=1)[1]
 
 
 @pytest.mark.slow
@@ -757,17 +788,6 @@ def test_demo_writes_over_no_other_files(tmp_path, monkeypatch):
     assert "overwrite echoes.h5" in run("demo", "--out", out, code=1)[1]
     del before[out / "scene.toml"]
     assert {file: file.read_bytes() for file in out.iterdir()} == before
-
-
-@pytest.mark.slow
-def test_expected_resolution_of_a_plain_aperture():
-    """Without beams and far off, lambda R/(2 L) and c/(2 B), 0.886 of them at -3 dB."""
-    pulse = clsas.Pulse(carrier_hz=1e5, bandwidth_hz=5e3, duration_s=0.1)
-    sonar = clsas.Sonar(pulse, [[0.0, 0.0, 0.0]])
-    track = clsas.Track.straight([-5, 0, 0], [1, 0, 0], 1001, 0.01)
-    azimuth_m, range_m = demo.expected_resolution_m(sonar, track, np.array([0, 1000.0, 0]))
-    assert azimuth_m == pytest.approx(0.8859 * 0.015 * 1000 / (2 * 10.01), rel=1e-3)
-    assert range_m == pytest.approx(0.8859 * 1500 / (2 * 5e3), rel=0.02)
 
 
 def test_ctrl_c_while_a_command_is_loaded_ends_with_130(monkeypatch):

@@ -122,6 +122,7 @@ def results(folder: Path) -> dict[str, Call]:
     return {
         "Assessment.describe": Call(assessed.describe, {}),
         "Calibration.describe": Call(found.describe, {}),
+        "Limits.describe": Call(clsas.limits(s.sonar, s.track, s.grid).describe, {}),
         "Inspection.describe": Call(clsas.inspect(s.lines, s.grid).describe, {}),
         "Tradeoff.describe": Call(traded.describe, {}),
         "Tradeoff.save_csv": Call(traded.save_csv, {"path": folder / "out.csv"}),

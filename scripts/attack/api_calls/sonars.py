@@ -213,6 +213,21 @@ def sonars(folder: Path) -> dict[str, Call]:
                 "oversampling": 2.0,
             },
         ),
+        "limits": Call(
+            clsas.limits,
+            {
+                "sonar": s.sonar,
+                "track": s.track,
+                "grid": s.grid,
+                "beam": s.beam,
+                "range_m": (10.0, 60.0),
+                "window": "hann",
+                "pointing": clsas.Pointing(),
+                "element_pattern": True,
+                "motion_in_flight": False,
+            },
+            accepts=dict.fromkeys(("track", "grid", "beam", "range_m", "pointing"), optional),
+        ),
         "check_sampling": Call(
             clsas.check_sampling,
             {
