@@ -24,6 +24,7 @@ COLUMNS = {
     "section_4_2": {"form", "total", "backprojection"},
     "section_4_3": {"eq. 45", "measured", "loss dB"},
     "section_5_2_1": {"eq. 45", "measured", "seconds"},
+    "section_7_1": {"per pixel", "speed-up", "error dB", "chosen"},
 }
 
 
@@ -38,7 +39,9 @@ def test_script_runs(script, tmp_path):
     if script == "figures_39_45":
         clsas.save(tmp_path / "lines.h5", _points_beside_a_track())
         options += ["--lines", tmp_path / "lines.h5"]
-    if {"seconds"} <= COLUMNS[script] or script == "section_4_2":
+    if script == "section_7_1":
+        options += ["--sweep", "receivers per ping"]
+    if {"seconds"} <= COLUMNS[script] or script in ("section_4_2", "section_7_1"):
         options += ["--repeats", "1"]
     done = subprocess.run(
         [sys.executable, FOLDER / f"{script}.py", *options], capture_output=True, text=True
