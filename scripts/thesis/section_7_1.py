@@ -99,8 +99,8 @@ class System:
 
     @property
     def channels(self) -> int:
-        """Number of phase centres, in whole pings."""
-        return self.receivers * max(round(self.track_m / self.spacing_m / self.receivers), 1)
+        """Number of phase centres, in two pings or more."""
+        return self.receivers * max(round(self.track_m / self.spacing_m / self.receivers), 2)
 
     @property
     def beam(self) -> clsas.BeamWindow | None:
