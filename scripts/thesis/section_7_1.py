@@ -189,8 +189,9 @@ def pixel_sizes(system: System) -> Iterator[tuple[str, System]]:
     """Yield the system with pixels of other sizes, in the same scene."""
     for factor in (0.5, 1, 2, 4):
         finer = round(system.pixels / factor)
-        yield f"{system.pixel * factor:g}", replace(
-            system, pixel=system.pixel * factor, pixels=finer
+        yield (
+            f"{system.pixel * factor:g}",
+            replace(system, pixel=system.pixel * factor, pixels=finer),
         )
 
 
