@@ -393,7 +393,7 @@ def _unit_vectors(name: str, vectors: NDArray[np.float64]) -> NDArray[np.float64
     """Return vectors scaled to length 1. Those that have it already are returned bit for bit."""
     largest = np.abs(vectors).max(axis=1, keepdims=True)
     if not largest.all():
-        raise ValueError(f"{name} must not have a direction of length zero")
+        raise ValueError(f"{name} must not have a vector of length 0")
     scaled = vectors / largest  # avoids overflow and underflow in the norm
     length = np.linalg.norm(scaled, axis=1, keepdims=True)
     if np.abs(length * largest - 1).max() < _UNIT:

@@ -27,6 +27,7 @@ _CHANNELS = 16  # sampled channels that reach the grid
 _SEARCHED = 4096  # channels among which those that reach the grid are searched
 _LEAST_ACROSS = 0.1  # part of the look direction across the track, below which it has no side
 _STRAIGHT = 0.1  # width of a track over its length, or over its distance from the grid
+_NARROW_M = 1e-6  # width of a track that only rounding makes wider than zero
 _ALIGNED = 0.05  # sine of the angle of a track to x or y up to which a mirrored plane is aligned
 
 
@@ -40,21 +41,30 @@ class _Mirror:
         A point of the plane.
     normal : float64 [3]
         Horizontal unit vector across the plane, towards the side where the elements look.
+    width_m : float
+        Width of the track, metres.
     """
 
     point_m: NDArray[np.float64]
     normal: NDArray[np.float64]
+    width_m: float
 
     def image_of(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the mirror images of points, [..., 3]."""
         distance_m = (points_m - self.point_m) @ self.normal
         return points_m - 2 * distance_m[..., None] * self.normal
 
-    def aligned(self) -> _Mirror:
-        """Return the plane turned parallel to x or y if it nearly is."""
-        nearest = np.rint(self.normal)
-        is_near = np.abs(self.normal - nearest).max() <= _ALIGNED
-        return _Mirror(self.point_m, nearest) if is_near else self
+    def rounded(self) -> _Mirror:
+        """Return the plane at a position rounded to the width of the track, for people to read.
+
+        It is also turned parallel to x or y if it nearly is.
+        """
+        point_m, normal = self.point_m, np.rint(self.normal)
+        if self.width_m > _NARROW_M:
+            point_m = point_m.round(-math.ceil(math.log10(self.width_m)))
+        if np.abs(self.normal - normal).max() > _ALIGNED:
+            normal = self.normal
+        return _Mirror(point_m, normal, self.width_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +187,7 @@ def _mirror(lines: RangeLines, some: NDArray[np.int64], range_m: float) -> _Mirr
     width_m = float(np.ptp(offsets_m @ across))
     if width_m > _STRAIGHT * max(float(np.ptp(offsets_m @ axes[0])), range_m):
         return None
-    return _Mirror(point_m, np.append(across, 0.0))
+    return _Mirror(point_m, np.append(across, 0.0), width_m)
 
 
 def side_of(lines: RangeLines, direction: NDArray[np.float64]) -> str:
@@ -220,7 +230,7 @@ def _described(lines: RangeLines, grid: Grid, mirror: _Mirror, share: float) -> 
     message += f". Pixels there only show the mirror image of the {side} side"
     remedy = f"keep the grid on the {side} side"
     if share >= 0.5:
-        remedy = f"on the {side} side, the same grid is {_mirrored(grid, mirror.aligned())}"
+        remedy = f"on the {side} side, the same grid is {_mirrored(grid, mirror.rounded())}"
     return Behind(share, message, remedy)
 
 
