@@ -171,5 +171,5 @@ def moved(
     )
     look = lines.look_direction
     if look is not None:
-        look = turn[ping].apply(look)
+        look = turn[ping].apply(look.copy())  # SciPy takes no read-only arrays
     return replace(lines, tx_m=tx_m, rx_m=rx_m, look_direction=look)
