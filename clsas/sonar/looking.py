@@ -1,8 +1,8 @@
 """Sides of the track: where the elements look, and which pixels of a grid lie behind them.
 
-Ranges from a straight track do not tell port from starboard: every pixel has the same ranges as its
-mirror image about the vertical plane through the track. Only the elements, which neither transmit
-nor receive behind their face, tell which of the two an echo came from.
+Ranges from a straight track do not distinguish port from starboard: every pixel has the same ranges
+as its mirror image about the vertical plane through the track. Only the elements determine from
+which of the two an echo came, because they neither transmit nor receive behind their face.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from clsas.core.lines import RangeLines, antennas_of, some_channels
 MIRRORED = 0.01
 """Least share of a grid behind the elements that is reported."""
 
-# Plain choices, unless stated otherwise. The sampled pixels and channels take a millisecond.
+# Plain choices. A grid on the right side takes less than a millisecond, on the wrong one some.
 _PIXELS = 1024  # sampled pixels
-_CHANNELS = 16  # sampled channels that reach the grid
+_CHANNELS = 64  # sampled channels that reach the grid
 _SEARCHED = 4096  # channels among which those that reach the grid are searched
+_HEADINGS = 100  # least pings of a track over the pings that a heading is averaged over
 _LEAST_ACROSS = 0.1  # part of the look direction across the track, below which it has no side
 _STRAIGHT = 0.1  # width of a track over its length, or over its distance from the grid
 _NARROW_M = 1e-6  # width of a track that only rounding makes wider than zero
@@ -55,7 +56,7 @@ class _Mirror:
         return points_m - 2 * distance_m[..., None] * self.normal
 
     def rounded(self) -> _Mirror:
-        """Return the plane at a position rounded to the width of the track, for people to read.
+        """Return the plane at a position rounded to a power of ten above the width of the track.
 
         It is also turned parallel to x or y if it nearly is.
         """
@@ -114,8 +115,8 @@ def behind(
     if lines.look_direction is None:
         return None
     last_m = lines.last_range_m if last_range_m is None else last_range_m
-    some = _reaching(lines, grid, last_m)
     points_m = _sampled(grid)
+    some = _reaching(lines, points_m, last_m)
     if not some.size:
         return None
     in_front = _in_front(lines, some, points_m)
@@ -132,11 +133,13 @@ def behind(
     return _described(lines, grid, mirror, share) if share >= MIRRORED else None
 
 
-def _reaching(lines: RangeLines, grid: Grid, last_m: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return a few channels whose lines are long enough to reach the grid."""
+def _reaching(
+    lines: RangeLines, points_m: NDArray[np.float64], last_m: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Return a few channels whose lines are long enough to reach a box around points."""
     searched = some_channels(lines.channels, _SEARCHED)
     centres_m = (lines.tx_m[searched] + lines.rx_m[searched]) / 2
-    low_m, high_m = grid.bounds_m
+    low_m, high_m = points_m.min(axis=0), points_m.max(axis=0)
     outside_m = np.maximum(np.maximum(low_m - centres_m, centres_m - high_m), 0)
     near = searched[np.linalg.norm(outside_m, axis=1) <= last_m[searched]]
     return near[some_channels(len(near), _CHANNELS)] if near.size else near
@@ -204,14 +207,16 @@ def side_of(lines: RangeLines, direction: NDArray[np.float64]) -> str:
         "port", "starboard" or "both sides"; "" if the directions point neither way, or the platform
         does not move.
     """
-    starts, centres_m = lines.ping_starts, lines.ping_centres_m
-    if len(starts) < 2:
-        return ""
-    heading = np.gradient(centres_m[:, :2], axis=0)
-    port = np.stack([-heading[:, 1], heading[:, 0]], axis=-1)
-    to_port = np.einsum("pi,pi->p", port, np.broadcast_to(direction, lines.tx_m.shape)[starts, :2])
+    places_m = lines.ping_centres_m[:, :2]
+    ping = np.arange(len(places_m))
+    apart = len(places_m) // _HEADINGS + 1
+    heading = places_m[np.minimum(ping + apart, ping[-1])] - places_m[np.maximum(ping - apart, 0)]
+    some = some_channels(lines.channels, _SEARCHED)
+    of_channel = heading[lines.ping_numbers[some]]
+    port = np.stack([-of_channel[:, 1], of_channel[:, 0]], axis=-1)
+    to_port = np.einsum("ci,ci->c", port, np.broadcast_to(direction, lines.tx_m.shape)[some, :2])
     to_port = to_port[np.abs(to_port) > _LEAST_ACROSS * np.linalg.norm(port, axis=1)]
-    if 2 * len(to_port) < len(starts):
+    if 2 * len(to_port) < len(some):
         return ""
     if (share := float((to_port > 0).mean())) > 1 - _LEAST_ACROSS:
         return "port"
@@ -230,31 +235,32 @@ def _described(lines: RangeLines, grid: Grid, mirror: _Mirror, share: float) -> 
     message += f". Pixels there only show the mirror image of the {side} side"
     remedy = f"keep the grid on the {side} side"
     if share >= 0.5:
-        remedy = f"on the {side} side, the same grid is {_mirrored(grid, mirror.rounded())}"
+        remedy = _mirrored(grid, mirror.rounded())
     return Behind(share, message, remedy)
 
 
 def _mirrored(grid: Grid, mirror: _Mirror) -> str:
-    """Return the mirror image of a grid: options of the command line if it has axes, else words."""
+    """Return advice to use the mirror image of a grid, as options of commands if it has axes."""
     if not grid.is_planar:
         (x_m, y_m, _), (across_x, across_y, _) = mirror.point_m, mirror.normal
         return (
-            f"its mirror image about the vertical plane through ({x_m:.6g}, {y_m:.6g}) m with the "
+            f"mirror the grid about the vertical plane through ({x_m:.6g}, {y_m:.6g}) m with the "
             f"normal ({across_x:.4g}, {across_y:.4g})"
         )
     origin_m, *steps_m = grid.vectors_m
     rows, columns = grid.shape
     if grid.has_axes and np.abs(mirror.normal).max() == 1:
         height = f" --z={origin_m[2]:.10g}" if origin_m[2] else ""
-        return f"{_option(grid, mirror, 0, columns)} {_option(grid, mirror, 1, rows)}{height}"
+        x, y = (_option(grid, mirror, axis, n) for axis, n in enumerate((columns, rows)))
+        return f"use the mirrored grid, {x} {y}{height}"
     vectors_m = [mirror.image_of(origin_m)]
     vectors_m += [step - 2 * (step @ mirror.normal) * mirror.normal for step in steps_m]
     origin, row_step, column_step = (
         "[" + ", ".join(f"{value:.8g}" for value in vector + 0.0) + "]" for vector in vectors_m
     )
     return (
-        f"origin_m = {origin}, row_step_m = {row_step}, column_step_m = {column_step}, "
-        f"shape = [{rows}, {columns}]"
+        f"use the mirrored grid, origin_m = {origin}, row_step_m = {row_step}, "
+        f"column_step_m = {column_step}, shape = [{rows}, {columns}]"
     )
 
 

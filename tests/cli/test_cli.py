@@ -229,7 +229,7 @@ def test_a_grid_on_the_wrong_side_is_a_warning_with_the_options_meant(made, tmp_
     image, axes = ("image", folder / "lines.h5", "-o", tmp_path / "image.h5"), ("--x=-1:1:21",)
     _, warning = run(*image, *axes, "--y=-20.5:-19.5:21", *method)
     assert warning.count("the whole grid lies to starboard of the track") == 1
-    (meant,) = re.findall(r"the same grid is (--x=\S+\s+--y=\S+)", warning)
+    (meant,) = re.findall(r"Use the mirrored grid,\s+(--x=\S+\s+--y=\S+)", warning)
     assert meant.split() == ["--x=-1:1:21", "--y=19.5:20.5:21"]
     assert run(*image, *meant.split(), *method)[1] == ""
 

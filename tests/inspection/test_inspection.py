@@ -85,7 +85,7 @@ def test_a_grid_behind_the_elements_is_found(lines):
     finding = clsas.inspect(lines, mirrored)["grid_behind"]
     assert (finding.value, finding.limit) == (1.0, 0.01)
     assert finding.message.startswith("the whole grid lies to starboard of the track")
-    assert finding.remedy == "on the port side, the same grid is --x=1:3:100 --y=18:20.5:120"
+    assert finding.remedy == "use the mirrored grid, --x=1:3:100 --y=18:20.5:120"
     unknown = clsas.inspect(replace(lines, look_direction=None), mirrored)
     assert "grid_behind" not in unknown
 

@@ -92,7 +92,7 @@ def test_every_imager_warns_once_of_the_wrong_side_and_names_the_grid_meant(line
     assert heard(lambda: WAYS[way](lines, PORT)) == []
     assert heard(lambda: WAYS[way](lines, STARBOARD)) == [
         "the whole grid lies to starboard of the track, but the elements look to port. Pixels "
-        "there only show the mirror image of the port side. On the port side, the same grid is "
+        "there only show the mirror image of the port side. Use the mirrored grid, "
         "--x=-0.5:0.5:41 --y=19.5:20.5:41"
     ]
 
@@ -109,7 +109,7 @@ def test_a_sonar_that_looks_to_starboard_warns_of_port():
     assert np.linalg.norm(turned.look_direction, axis=1) == pytest.approx(1)
     (message,) = heard(lambda: looking.warn_behind(turned, PORT))
     assert "lies to port of the track, but the elements look to starboard" in message
-    assert message.endswith("the same grid is --x=-0.5:0.5:41 --y=-20.5:-19.5:41")
+    assert message.endswith("Use the mirrored grid, --x=-0.5:0.5:41 --y=-20.5:-19.5:41")
     assert heard(lambda: looking.warn_behind(turned, STARBOARD)) == []
 
 
@@ -119,14 +119,14 @@ def test_the_mirrored_grid_follows_from_the_track_and_keeps_height_and_step():
         geometry(track_m, [0, 1, 0]), clsas.Grid.plane((1, 2, 5), (-14, -34, 101), -7.5)
     )
     assert found.share == 1
-    assert found.remedy.endswith("is --x=1:2:5 --y=20:40:101 --z=-7.5")
+    assert found.remedy.endswith("use the mirrored grid, --x=1:2:5 --y=20:40:101 --z=-7.5")
 
 
 def test_the_mirrored_grid_is_rounded_to_the_sway_of_the_track():
     sway_m = 0.03 * np.sin(np.arange(50))[:, None] * [0, 1.0, 0]
     track_m = along_x(50, 0.05) + sway_m + [0, 2.012, 0]
     found = looking.behind(geometry(track_m, [0, 1, 0]), STARBOARD)
-    assert found.remedy.endswith("is --x=-0.5:0.5:41 --y=23.5:24.5:41")
+    assert found.remedy.endswith("use the mirrored grid, --x=-0.5:0.5:41 --y=23.5:24.5:41")
 
 
 def test_along_y_the_columns_are_mirrored():
@@ -134,7 +134,7 @@ def test_along_y_the_columns_are_mirrored():
     lines = geometry(track_m, [-1, 0, 0])  # heads along y, and port is -x
     found = looking.behind(lines, clsas.Grid.plane((120, 130, 11), (0, 2, 3)))
     assert "to starboard of the track, but the elements look to port" in found.message
-    assert found.remedy.endswith("is --x=70:80:11 --y=0:2:3")
+    assert found.remedy.endswith("use the mirrored grid, --x=70:80:11 --y=0:2:3")
 
 
 def test_across_the_axes_the_mirrored_plane_is_given_by_its_steps():
@@ -144,7 +144,7 @@ def test_across_the_axes_the_mirrored_plane_is_given_by_its_steps():
     there = clsas.Grid.plane((10, 12, 21), (-30, -28, 21))
     found = looking.behind(geometry(track_m, port), there)
     assert found.remedy.endswith("shape = [21, 21]")
-    _, table = found.remedy.split("same grid is ")  # in the notation of a scene file
+    _, table = found.remedy.split("use the mirrored grid, ")  # in the notation of a scene file
     grid = clsas.Grid.oriented(**tomllib.loads(f"grid = {{{table}}}")["grid"])
     assert looking.behind(geometry(track_m, port), grid) is None
     distance_m = [each.positions_m() @ port for each in (grid, there)]
@@ -159,7 +159,7 @@ def test_other_grids_are_mirrored_in_words(lines, kind):
     found = looking.behind(lines, grid)
     assert found.share == 1
     plane = r"the vertical plane through \(\S+ 0\) m with the normal \(-?0, 1\)$"
-    assert re.search(f"its mirror image about {plane}", found.remedy)
+    assert re.search(f"^mirror the grid about {plane}", found.remedy)
 
 
 @pytest.mark.parametrize(("low_m", "percent"), [(-0.1, None), (-5, 17), (-25, 50), (-50, 67)])
@@ -265,6 +265,16 @@ def test_sides_follow_from_the_heading(side):
     other = {"port": "starboard", "starboard": "port"}.get(side, side)
     back = lines.select(slice(None, None, -1))
     assert looking.side_of(back, back.look_direction) == other
+
+
+def test_receivers_of_a_ping_may_look_to_both_sides():
+    assert looking.side_of(both_sides(), both_sides().look_direction) == "both sides"
+
+
+def test_noise_of_the_positions_does_not_change_the_side():
+    noise_m = np.random.default_rng(1).normal(0, 0.01, (1000, 3))
+    lines = geometry(along_x(1000, 0.01) + noise_m, [0, 1, 0])
+    assert looking.side_of(lines, lines.look_direction) == "port"
 
 
 def test_a_circle_has_a_side_too():
