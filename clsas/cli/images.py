@@ -35,6 +35,7 @@ from clsas.opencl.device import Device, KernelTimes, open_device
 from clsas.planning.request import WORST_TOLERANCE_DB
 from clsas.plans.factorization import UNREACHED, ExactImage
 from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
+from clsas.sonar.looking import warn_behind
 
 _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is reported
 
@@ -227,6 +228,7 @@ def _exactly(
         warned = chosen.method.reason == UNREACHED
     preparation = prepare(lines, grid, device=device, beam=beam, **request)
     if chosen is None:  # otherwise the plan has warned
+        warn_behind(lines, grid)
         preparation.warn_of_ambiguity()
     interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
     return _Formed(

@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import conditioning, pings, reprs, validate
 
-_PER_CHANNEL = ("first_range_m", "tx_m", "rx_m", "rx_velocity_m_s")
+_PER_CHANNEL = ("first_range_m", "tx_m", "rx_m", "rx_velocity_m_s", "look_direction")
 GOLDEN = (np.sqrt(5) - 1) / 2
 """Golden ratio minus 1. Modulo 1, its multiples fill [0, 1) evenly, but never in regular steps."""
+
+_UNIT = 1e-12  # error of a unit vector's length, far above rounding
 
 SAMPLED_CHANNELS = 128
 """Number of channels that represent all in estimates of geometry and coverage. Half or twice as
@@ -49,6 +51,11 @@ class RangeLines:
     rx_velocity_m_s : array_like of float, shape [channels, 3] or [3], optional
         Velocity of the receivers while the sound travels, metres per second. None means
         stop-and-hop.
+    look_direction : array_like of float, shape [channels, 3] or [3], optional
+        Direction in which the beam of each channel looks (x, y, z): the normal of the elements'
+        face. Vectors of any length are stored as unit vectors. None means that the direction is
+        unknown, or that the elements look to all sides. It does not change images, but imagers
+        warn if pixels lie behind the elements.
 
     Raises
     ------
@@ -56,8 +63,8 @@ class RangeLines:
         If an argument has the wrong type. This includes real samples, which have no phase.
     ValueError
         If shapes disagree, an array is empty, a value is NaN or infinite, a step or speed is not
-        positive, the carrier is negative, a receiver is not slower than the waves, or the largest
-        sample is too large or too small for complex64.
+        positive, the carrier is negative, a receiver is not slower than the waves, a direction has
+        length zero, or the largest sample is too large or too small for complex64.
 
     See Also
     --------
@@ -95,6 +102,7 @@ class RangeLines:
     carrier_hz: float
     sound_speed_m_s: float
     rx_velocity_m_s: NDArray[np.float64] | None = None
+    look_direction: NDArray[np.float64] | None = None
 
     if TYPE_CHECKING:  # the constructor converts array_like arguments
 
@@ -108,6 +116,7 @@ class RangeLines:
             carrier_hz: float,
             sound_speed_m_s: float,
             rx_velocity_m_s: ArrayLike | None = None,
+            look_direction: ArrayLike | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -362,8 +371,9 @@ def checked_channels(received: Any, start: str) -> dict[str, Any]:
     channels = received.samples.shape[0]
     shapes: dict[str, tuple[int, ...]] = {start: (channels,)}
     shapes |= {"tx_m": (channels, 3), "rx_m": (channels, 3)}
-    if received.rx_velocity_m_s is not None:
-        shapes["rx_velocity_m_s"] = (channels, 3)
+    for name in ("rx_velocity_m_s", "look_direction"):
+        if getattr(received, name) is not None:
+            shapes[name] = (channels, 3)
     checked: dict[str, Any] = {
         name: validate.array(name, getattr(received, name), np.float64, shape, broadcast=True)
         for name, shape in shapes.items()
@@ -374,7 +384,23 @@ def checked_channels(received: Any, start: str) -> dict[str, Any]:
     if "rx_velocity_m_s" in checked:
         fastest_m_s = float(np.linalg.norm(checked["rx_velocity_m_s"], axis=1).max())
         validate.number("the speed of rx_velocity_m_s", fastest_m_s, "m/s", below=speed_m_s)
+    if "look_direction" in checked:
+        checked["look_direction"] = _unit_vectors("look_direction", checked["look_direction"])
     return checked
+
+
+def _unit_vectors(name: str, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return vectors scaled to length 1. Those that have it already are returned bit for bit."""
+    largest = np.abs(vectors).max(axis=1, keepdims=True)
+    if not largest.all():
+        raise ValueError(f"{name} must not have a vector of length 0")
+    scaled = vectors / largest  # avoids overflow and underflow in the norm
+    length = np.linalg.norm(scaled, axis=1, keepdims=True)
+    if np.abs(length * largest - 1).max() < _UNIT:
+        return vectors
+    scaled /= length
+    scaled.flags.writeable = False
+    return scaled
 
 
 def some_channels(count: int, most: int = SAMPLED_CHANNELS) -> NDArray[np.int64]:

@@ -18,6 +18,7 @@ from clsas.signal.ambiguity import BEST_DB, ambiguity
 from clsas.signal.spectrum import OUTSIDE, line_energy, measure_spectrum, occupied_band
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches
+from clsas.sonar.looking import warn_behind
 from clsas.sonar.simplify import simplify
 
 BEST_ACCURACY_DB = BEST_DB
@@ -85,7 +86,8 @@ def backproject(
     -----
     ClsasWarning
         If no pixel lies in the beam and within the range of any line, so that the image is zero. If
-        the image may miss `accuracy_db`, because the grid reaches ends of lines that do not fade,
+        pixels lie behind the elements, where they can only show mirror images. If the image may
+        miss `accuracy_db`, because the grid reaches ends of lines that do not fade,
         or because the band of the lines fills the whole sampled band.
 
     See Also
@@ -143,6 +145,7 @@ def backproject(
     )
     if accumulate is not None:
         check_accumulate(accumulate, grid, beam)
+    warn_behind(lines, grid)
     preparation.warn_of_ambiguity()
     image = execute(preparation, progress=progress)
     if accumulate is None:

@@ -18,6 +18,7 @@ from clsas.exact.migration import migrate
 from clsas.exact.straight_track import Aspects, Band, StraightTrack, aspects_of, band_of, straighten
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches, warn_unreached
+from clsas.sonar.looking import warn_behind
 
 _STRAIGHT = 1e-3  # wavelengths, up to which errors of range cause no warning
 
@@ -66,7 +67,8 @@ def wavenumber(
     -----
     ClsasWarning
         If the track is not straight and monostatic. The warning names the remaining range errors.
-        If the lines do not contribute to the image.
+        If the lines do not contribute to the image, or pixels lie behind the elements, where they
+        can only show mirror images.
 
     See Also
     --------
@@ -137,6 +139,7 @@ def wavenumber(
         along = None if beam is None else beam.directions(lines)
         warn_unreached(lines, grid, beam, along)
         return Image(np.zeros(grid.shape, np.complex64), grid)
+    warn_behind(lines, grid)
     _warn_bent(lines, grid, track, aspects, band, motion_compensation)
     on_line = replace(track, along_m=track.along_m[visible], shift_m=track.shift_m[visible])
     return Image(migrate(lines.select(visible), on_line, aspects, band, workers), grid)

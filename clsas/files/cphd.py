@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -30,9 +30,13 @@ from clsas.signal.phase_history import from_phase_history
 
 SPEED, ORIGIN = "clsas.sound_speed_m_s", "clsas.origin_m"
 """Names of the collection parameters with which a CPHD file describes sonar data."""
+LOOK = "clsas.look_direction"
+"""Name of the added parameter of every vector that stores where the elements look."""
 
 START = b"CPHD/"
 _LONGEST_XML = 64 << 20  # bytes; arbitrary, since even thousands of parameters take less than 1 MiB
+_VELOCITIES, _PLATFORMS = ("TxVel", "RcvVel"), ("TxPlatform", "RcvPlatform")
+_ALIKE = 0.5  # least cosine between the directions of two antennas that look to the same side
 _BYTES = 24  # per sample while a signal becomes lines: as read, as complex64, and a working copy
 
 
@@ -72,6 +76,8 @@ def read_cphd(
         One line per vector with a signal. Positions are relative to the reference point of the
         image area (IARP), with x and y along the axes of the image area and z normal to them. If
         the reference surface is not a plane, x points east, y north and z up at the IARP.
+        `look_direction` is that of the file if clsas wrote it. Otherwise it is horizontal and
+        perpendicular to the velocity, on the file's side of the track (SideOfTrack).
 
     Raises
     ------
@@ -140,6 +146,7 @@ def read_cphd(
                 signal *= vectors["AmpSF"].astype(np.float32)[:, None]
             if collection.sign == 1:
                 np.conj(signal, out=signal)
+            look = _look_direction(tree, vectors, collection)
     if collection.domain == "FX":
         try:
             lines = _lines_of_fx(signal, vectors, collection, window, oversampling)
@@ -148,7 +155,7 @@ def read_cphd(
     else:
         with _defects(path):
             lines = _lines_of_toa(signal, vectors, collection)
-    return checked_positions(path, lines)
+    return checked_positions(path, replace(lines, look_direction=look))
 
 
 @contextmanager
@@ -224,7 +231,7 @@ class _Collection:
     """Properties common to all vectors of a file.
 
     Positions in Earth-centred coordinates are converted to local ones: relative to `centre_m`,
-    along the rows of `axes`, plus `origin_m`.
+    along the rows of `axes`, plus `origin_m`. `is_own` is True for files that clsas wrote.
     """
 
     domain: str
@@ -233,6 +240,7 @@ class _Collection:
     axes: NDArray[np.float64]
     origin_m: NDArray[np.float64]
     speed_m_s: float
+    is_own: bool
 
     @classmethod
     def read(cls, tree: Any) -> _Collection:
@@ -251,6 +259,7 @@ class _Collection:
             axes=axes,
             origin_m=_vector(own.get(ORIGIN, "0 0 0").split()),
             speed_m_s=validate.positive("its speed", float(own.get(SPEED, speed_of_light)), "m/s"),
+            is_own=SPEED in own,
         )
 
     @property
@@ -308,6 +317,41 @@ def _usable(path: Path, vectors: NDArray) -> NDArray[np.bool_]:
             "order. They are in the order of the file"
         )
     return usable
+
+
+def _look_direction(
+    tree: Any, vectors: NDArray, collection: _Collection
+) -> NDArray[np.float64] | None:
+    """Return where the antennas look at every vector, in local coordinates; None if unknown.
+
+    In files that clsas wrote, only the added parameter counts: those without it state the left side
+    whatever the true one is. Otherwise, the antennas look horizontally to the side of the track
+    that the file states. If transmitter and receiver look in different directions, that of both is
+    unknown.
+    """
+    if LOOK in (vectors.dtype.names or ()):
+        look = vectors[LOOK].astype(np.float64) @ collection.axes.T
+        return look if np.isfinite(look).all() and look.any(axis=1).all() else None
+    geometry = tree["ReferenceGeometry"]
+    if collection.is_own:
+        return None
+    velocity = [vectors[name].astype(np.float64) @ collection.axes.T for name in _VELOCITIES]
+    if "Monostatic" in geometry:
+        sides = [geometry["Monostatic"]["SideOfTrack"]] * 2
+    else:
+        sides = [geometry["Bistatic"][name]["SideOfTrack"] for name in _PLATFORMS]
+    looks = [_beside(*pair) for pair in zip(velocity, sides, strict=True)]
+    if not np.all(np.einsum("ci,ci->c", *looks) > _ALIKE):  # also if one is NaN
+        return None
+    return looks[0] + looks[1]
+
+
+def _beside(velocity: NDArray[np.float64], side: str) -> NDArray[np.float64]:
+    """Return horizontal unit vectors to the left ("L") or right of velocities; NaN at rest."""
+    aside = np.stack([-velocity[:, 1], velocity[:, 0], 0 * velocity[:, 0]], axis=1)
+    with np.errstate(invalid="ignore"):
+        aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    return aside if side == "L" else -aside
 
 
 def _complex(signal: NDArray) -> NDArray[np.complex64]:

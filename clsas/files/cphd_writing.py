@@ -13,7 +13,7 @@ from scipy.constants import speed_of_light
 from clsas.core import validate
 from clsas.core.atomic import replacing
 from clsas.core.lines import RangeLines
-from clsas.files.cphd import ORIGIN, SPEED, sarkit_cphd
+from clsas.files.cphd import LOOK, ORIGIN, SPEED, sarkit_cphd
 
 SUFFIXES = (".cphd",)
 """Suffix of CPHD files."""
@@ -37,6 +37,8 @@ _VECTOR = np.dtype(
     + [("TDTropoSRP", "f8"), ("SC0", "f8"), ("SCSS", "f8"), ("SIGNAL", "i8")]
 )
 """Parameters of a vector, in the order of the file."""
+_LOOKING_VECTOR = np.dtype([*_VECTOR.descr, (LOOK, *_POSITION)])
+"""Parameters of a vector whose look direction is known."""
 
 
 def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
@@ -67,7 +69,9 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
     The standard assumes the speed of light. Lines with another speed c are written with the same
     wavelengths and geometry: frequencies are multiplied by 299 792 458 m/s over c, so that any CPHD
     processor forms the same image. A parameter of the collection stores c. The origin is at
-    latitude and longitude 0, with x pointing east, y north and z up. Times, velocities,
+    latitude and longitude 0, with x pointing east, y north and z up. An added parameter of every
+    vector stores its look direction, and the side of the track (SideOfTrack) follows from it; if it
+    is unknown, the file states the left side, because the standard requires one. Times, velocities,
     polarization and the date are placeholders, since range lines lack them. Lines that still have
     their carrier (`carrier_hz` 0) are written with half their sample rate as the carrier, and read
     back with it.
@@ -112,7 +116,10 @@ def _vectors(lines: RangeLines, origin_m: NDArray) -> tuple[NDArray, NDArray[np.
     tx_m, rx_m = lines.tx_m - origin_m, lines.rx_m - origin_m
     along, point_m = _reference(tx_m, rx_m, lines)
     reference_m = sum(np.linalg.norm(each - point_m, axis=1) for each in (tx_m, rx_m)) / 2
-    vectors = np.zeros(lines.channels, _VECTOR)
+    look = lines.look_direction
+    vectors = np.zeros(lines.channels, _VECTOR if look is None else _LOOKING_VECTOR)
+    if look is not None:
+        vectors[LOOK] = look @ _AXES
     delay_s = 2 * reference_m / speed_of_light
     interval_s = max(_PULSE_INTERVAL_S, 1.1 * float(delay_s.max()))
     vectors["TxTime"] = interval_s * np.arange(lines.channels)
@@ -143,10 +150,10 @@ def _vectors(lines: RangeLines, origin_m: NDArray) -> tuple[NDArray, NDArray[np.
 def _reference(
     tx_m: NDArray, rx_m: NDArray, lines: RangeLines
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the track's direction, and a reference point on its left at the middle range.
+    """Return the track's direction, and a reference point beside it at the middle range.
 
     The position of the scene is unknown. Any point serves, since phases and ranges are relative to
-    it.
+    it. It lies on the side where the elements look, or on the left if that is unknown.
     """
     centres_m = (tx_m + rx_m) / 2
     middle_m = centres_m.mean(axis=0)
@@ -156,9 +163,11 @@ def _reference(
     along = along / length if length > 0.1 else np.array([1.0, 0.0, 0.0])
     if along @ (centres_m[-1] - centres_m[0]) < 0:
         along = -along
-    left = np.array([-along[1], along[0], 0.0])
+    aside = np.array([-along[1], along[0], 0.0])
+    if lines.look_direction is not None and lines.look_direction.mean(axis=0) @ aside < 0:
+        aside = -aside
     range_m = abs(float((lines.first_range_m + lines.last_range_m).mean()) / 2)
-    look = np.cos(_DEPRESSION) * left - np.sin(_DEPRESSION) * np.array([0.0, 0.0, 1.0])
+    look = np.cos(_DEPRESSION) * aside - np.sin(_DEPRESSION) * np.array([0.0, 0.0, 1.0])
     return along, middle_m + max(range_m, _NEAREST_M) * look
 
 
@@ -202,7 +211,7 @@ def _document(
     root["SceneCoordinates"] = _scene(vectors)
     root["Data"] = {
         "SignalArrayFormat": "CF8",
-        "NumBytesPVP": _VECTOR.itemsize,
+        "NumBytesPVP": vectors.dtype.itemsize,
         "NumCPHDChannels": 1,
         "Channel": [
             {
@@ -216,7 +225,7 @@ def _document(
         "NumSupportArrays": 0,
     }
     root["Channel"] = _channel(vectors)
-    root["PVP"] = _layout()
+    root["PVP"] = _layout(vectors.dtype)
     times = sarkit.compute_t_ref_from_pvps(vectors)
     root["Dwell"] = {
         "NumCODTimes": 1,
@@ -284,11 +293,13 @@ def _scene(vectors: NDArray) -> dict[str, Any]:
     }
 
 
-def _layout() -> dict[str, dict[str, Any]]:
+def _layout(vector: np.dtype) -> dict[str, Any]:
     """Return the place of every parameter within a vector, in 64-bit words."""
-    fields = _VECTOR.fields
-    assert fields is not None  # the type has names
-    return {
+    assert vector.fields is not None  # the type has names
+    places: dict[str, Any] = {
         name: {"Offset": offset // 8, "Size": dtype.itemsize // 8, "dtype": dtype}
-        for name, (dtype, offset, *_) in fields.items()
+        for name, (dtype, offset, *_) in vector.fields.items()
     }
+    if LOOK in places:
+        places["AddedPVP"] = [{"Name": LOOK, **places.pop(LOOK)}]
+    return places

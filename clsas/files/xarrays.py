@@ -30,6 +30,7 @@ _NAMES = {
     "tx_m": "Transmitter position",
     "rx_m": "Receiver position",
     "rx_velocity_m_s": "Receiver velocity",
+    "look_direction": "Look direction",
     "first_range_m": "Range of the first sample",
     "start_time_s": "Time of the first sample after transmission",
 }

@@ -29,6 +29,7 @@ from clsas.inspection.result import measured, runs
 from clsas.inspection.slips import POINTS, covered, likely_slip, ranges_m
 from clsas.signal.ambiguity import end_powers
 from clsas.signal.spectrum import NEEDED_OVERSAMPLING
+from clsas.sonar.looking import MIRRORED, behind
 from clsas.sonar.sampling import Finding, check_sampling
 
 _GAP = 1.75
@@ -394,6 +395,14 @@ def check_grid(recording: Recording) -> Iterator[Finding]:
     yield Finding("grid_outside", message, 1 - share, _OUTSIDE, remedy)
 
 
+def check_side(recording: Recording) -> Iterator[Finding]:
+    """Yield that parts of the grid lie behind the elements."""
+    grid = recording.grid
+    found = None if grid is None else behind(recording.lines, grid)
+    if found is not None:
+        yield Finding("grid_behind", found.message, found.share, MIRRORED, found.remedy)
+
+
 def check_phase_sign(recording: Recording) -> Iterator[Finding]:
     """Yield a phase of the opposite sign, if the sign can be determined."""
     sign, undetermined = recording.sign
@@ -433,6 +442,7 @@ CHECKS: tuple[Callable[[Recording], Iterator[Finding]], ...] = (
     # Ranges of the lines as given.
     check_first_range,
     check_grid,
+    check_side,
     # The sign of the phase, from images of the moving pings.
     check_phase_sign,
 )

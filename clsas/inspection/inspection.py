@@ -15,6 +15,7 @@ from clsas.opencl.device import Device, open_device
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
 from clsas.sonar.beam import BeamWindow
+from clsas.sonar.looking import side_of
 from clsas.sonar.sampling import Finding
 
 _FARTHEST_M = 1e3 * validate.FARTHEST_M  # coordinates in mm are reported, not refused
@@ -142,6 +143,7 @@ def _inspection(recording: Recording, findings: list[Finding]) -> Inspection:
         advance_m=pings.usual_step_m,
         depths_m=_span(lines.phase_centres_m[:, 2]),
         speed_m_s=speed_m_s,
+        looks="" if lines.look_direction is None else side_of(lines, lines.look_direction),
         carrier_hz=lines.carrier_hz,
         band_hz=recording.band_hz,
         oversampling=recording.spectrum.oversampling,

@@ -68,6 +68,9 @@ class Inspection:
     speed_m_s : float or None
         Median speed of the receivers. None if the lines have no velocities; they have no times
         either.
+    looks : str
+        Side of the track to which the elements look: "port", "starboard" or "both sides"; "" if it
+        is unknown, or they look along the track or straight down.
     carrier_hz : float
         Frequency that was mixed out; 0 if the lines still have their carrier.
     band_hz : (float, float)
@@ -109,6 +112,7 @@ class Inspection:
     advance_m: float
     depths_m: tuple[float, float]
     speed_m_s: float | None
+    looks: str
     carrier_hz: float
     band_hz: tuple[float, float]
     oversampling: float
@@ -187,6 +191,7 @@ class Inspection:
             ("track", f"{measured(self.track_m, 'm')} long, {advance}"),
             ("depth (z)", _span(*self.depths_m)),
             ("speed", speed),
+            ("looks", self._looks()),
             ("carrier", carrier),
             ("measured band", f"{band}, wavelength {measured(self.wavelength_m, 'm')}"),
             ("oversampling", f"{self.oversampling:.3g}"),
@@ -203,6 +208,14 @@ class Inspection:
                 ("spacing", f"{self.advance_m / self.wavelength_m:.3g} wavelengths: {angle}")
             )
         return [*rows, ("sign of phase", self._sign())]
+
+    def _looks(self) -> str:
+        if self.lines.look_direction is None:
+            return "unknown: the recording does not state the side"
+        if self.looks:
+            return f"to {self.looks}"
+        mean = ", ".join(f"{each:.2f}" for each in self.lines.look_direction.mean(axis=0) + 0.0)
+        return f"neither to port nor to starboard: mean direction ({mean})"
 
     def _sign(self) -> str:
         if self.sign is None:

@@ -25,10 +25,11 @@ from clsas.measures.shadows import DARKEST, dark_level_db
 from clsas.measures.tradeoff_result import Response, Row, Tradeoff
 from clsas.opencl.device import Device, open_device
 from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
-from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, checked_pairs
+from clsas.planning.planner import planned
+from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, Request, checked_pairs
 from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
+from clsas.sonar.looking import warn_behind
 
 TOLERANCES_DB = (-20.0, -30.0, -40.0, -50.0, -60.0, -70.0)
 STAGES = (*(((2, 2),) * count for count in range(1, 6)), ((2, 4),) * 2)
@@ -126,6 +127,7 @@ def tradeoff(
         stages = [checked_pairs(each) for each in given]
     tolerances = _checked_tolerances(tolerances_db)
     device = open_device(device)
+    warn_behind(lines, grid)
     requests = _requests(
         tolerances, study, _feasible(lines, grid, beam) if stages is None else stages
     )
@@ -230,10 +232,11 @@ def _planned(
     """Yield the planned methods, without those of a study that cannot keep the tolerance."""
     for request in requests:
         start = time.perf_counter()
-        chosen = plan(
+        asked = Request(
             lines, grid, tolerance_db=request.tolerance_db, stages=request.stages,
             taps=request.taps, depth=request.depth, beam=beam, device=device,
         )  # fmt: skip
+        chosen = planned(asked).plan
         plan_seconds = time.perf_counter() - start
         if request.taps is not None and chosen.is_exact:
             continue
@@ -245,7 +248,7 @@ def _exactly(
     accuracy_db: float, lines: RangeLines, grid: Grid, beam: BeamWindow | None, device: Device
 ) -> _Candidate:
     """Return the exact image as a candidate."""
-    chosen = plan(lines, grid, stages=[], beam=beam, device=device)
+    chosen = planned(Request(lines, grid, stages=[], beam=beam, device=device)).plan
     row = replace(_row("exact", "exact", chosen, 0.0), predicted_error_db=accuracy_db)
     form = partial(form_exactly, lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
     return _Candidate(row, form)

@@ -34,6 +34,7 @@ from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import Device
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import warn_unreached
+from clsas.sonar.looking import warn_behind
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -301,6 +302,12 @@ def mosaic(
     DeviceError
         If there is no such device.
 
+    Warns
+    -----
+    ClsasWarning
+        If no channel receives from the grid, or pixels lie behind the elements, where they can only
+        show mirror images. A source that grows is not checked.
+
     See Also
     --------
     Mosaic : The result.
@@ -350,6 +357,8 @@ def mosaic(
         wait_for_first_file(growth)
     survey = open_survey(source if isinstance(source, RangeLines) else source.resolve())
     visibility = SurveyVisibility.of(survey, beam)
+    if growth is None:
+        warn_behind(survey.geometry, grid, survey.last_range_m)
     if growth is None and not visibility.channels(grid).any():
         warn_unreached(survey.geometry, grid, beam, visibility.along, survey.span_m)
     opened = None if store is None else Store.at(validate.path("store", store))

@@ -29,6 +29,7 @@ _TAPER = 64  # samples over which a line fades where it is cut
 _MARGIN = 32  # unchanged samples between pixels and taper, for interpolation and its ringing
 _DIGESTED = 16  # lines of a file that enter its digest; all of them would take too long to read
 _SKIPPED = 64  # unused channels in a row that are read along: faster than a second read
+_LOOK = "look_direction"  # which only some files of a survey may state
 _GAP = 3.0  # a gap is a distance between pings of more than this many median distances
 
 
@@ -73,11 +74,14 @@ class Survey:
         return np.repeat(self.lengths, np.diff(self.begins))
 
     @property
+    def last_range_m(self) -> NDArray[np.float64]:
+        """Range of each channel's last sample, metres, [channels]."""
+        return self.geometry.first_range_m + (self.length - 1) * self.geometry.range_step_m
+
+    @property
     def span_m(self) -> tuple[float, float]:
         """Nearest and farthest range of all channels, metres."""
-        first_m = self.geometry.first_range_m
-        last_m = first_m + (self.length - 1) * self.geometry.range_step_m
-        return float(first_m.min()), float(last_m.max())
+        return float(self.geometry.first_range_m.min()), float(self.last_range_m.max())
 
     def digests(self, first: int = 0) -> list[str]:
         """Return digests of the geometry and samples of every part from number `first` on.
@@ -102,9 +106,7 @@ class Survey:
 
         Bounds are in metres, float64 [channels].
         """
-        first_m = self.geometry.first_range_m
-        last_m = first_m + (self.length - 1) * self.geometry.range_step_m
-        return (far_m >= first_m) & (near_m <= last_m)
+        return (far_m >= self.geometry.first_range_m) & (near_m <= self.last_range_m)
 
     def extent(
         self, visible: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
@@ -285,8 +287,11 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
                     f"{path}: {name} must equal that of the survey's first file, {theirs:g}, got "
                     f"{ours:g}"
                 )
-        for name in geometry.per_channel.keys() ^ found[0].per_channel.keys():
+        different = geometry.per_channel.keys() ^ found[0].per_channel.keys()
+        for name in different - {_LOOK}:
             raise ValueError(f"{path}: {name} must be in all files of the survey or in none")
+    if any(each.look_direction is None for each in found):  # unknown for some is unknown for all
+        found = [replace(each, look_direction=None) for each in found]
     entries = sum(each.size for part in found for each in part.per_channel.values())
     validate.memory(f"the {begins[-1]} channels of source", 8 * (entries + 2 * begins[-1]))
     of_channels: dict[str, Any] = {

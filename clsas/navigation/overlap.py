@@ -169,4 +169,7 @@ def moved(
         turn[ping].apply(each - reference_m) + reference_m + shift_m
         for each in (lines.tx_m, lines.rx_m)
     )
-    return replace(lines, tx_m=tx_m, rx_m=rx_m)
+    look = lines.look_direction
+    if look is not None:
+        look = turn[ping].apply(look.copy())  # SciPy takes no read-only arrays
+    return replace(lines, tx_m=tx_m, rx_m=rx_m, look_direction=look)

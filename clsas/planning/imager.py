@@ -22,6 +22,7 @@ from clsas.planning.request import Request
 from clsas.plans.plan import Plan
 from clsas.signal.spectrum import FEW_CHANNELS, MEASURED_CHANNELS, power_outside
 from clsas.sonar.beam import BeamWindow
+from clsas.sonar.looking import warn_behind
 
 Progress = Callable[[int, int], None]
 
@@ -151,6 +152,8 @@ class Imager:
             plan.check(lines, grid)
             self.beam = plan.beam
             self._former = former(lines, grid, plan, self.device)
+        if plan is None:  # otherwise clsas.plan has warned
+            warn_behind(lines, grid)
         self._lines_digest = self.plan.lines_digest if self.plan else lines_digest(lines)
         self._warned_of_band = False
         self._checked = weakref.ref(lines)

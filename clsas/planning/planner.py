@@ -31,6 +31,7 @@ from clsas.plans.plan import Plan
 from clsas.signal.spectrum import OUTSIDE
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches, warn_unreached
+from clsas.sonar.looking import warn_behind
 from clsas.sonar.simplify import Model, simplify
 
 # `scripts/bench sensitivity` halves and doubles these; without a remark nothing changes.
@@ -113,8 +114,9 @@ def plan(
     ClsasWarning
         If the image may miss the tolerance, because the grid reaches ends of lines that do not
         fade, or because the lines' band fills the whole sampled band; if no pixel lies within the
-        range of any line and the beam, so that the image will be zero; or if the costs stored for
-        the device cannot be read, or measured ones cannot be stored.
+        range of any line and the beam, so that the image will be zero; if pixels lie behind the
+        elements, where they can only show mirror images; or if the costs stored for the device
+        cannot be read, or measured ones cannot be stored.
 
     See Also
     --------
@@ -180,6 +182,7 @@ def plan(
         depth=depth,
         full_model=full_model,
     )
+    warn_behind(lines, grid)
     return planned(request).plan
 
 

@@ -322,4 +322,4 @@ def _outcome(name: str, job: Job) -> tuple[Outcome, tuple[str, ...]]:
             messages.append(str(each.message))
         else:
             warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
-    return outcome, tuple(messages)
+    return outcome, tuple(dict.fromkeys(messages))  # images before and after share theirs

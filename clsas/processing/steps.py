@@ -20,7 +20,7 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.core.validate import warn
-from clsas.exact.backprojection import backproject
+from clsas.exact.backprojection import backproject, form_exactly
 from clsas.files.hdf5 import save
 from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
@@ -312,7 +312,7 @@ def _formed(
         return image, None
     chosen = plan(lines, grid, **request, beam=beam, device=job.device)
     if isinstance(chosen.method, ExactImage):
-        image = backproject(
+        image = form_exactly(
             lines, grid, accuracy_db=chosen.method.accuracy_db, beam=beam, device=job.device,
             progress=progress,
         )  # fmt: skip

@@ -166,6 +166,7 @@ def compress(
         carrier_hz=echoes.carrier_hz,
         sound_speed_m_s=echoes.sound_speed_m_s,
         rx_velocity_m_s=echoes.rx_velocity_m_s,
+        look_direction=echoes.look_direction,
     )
 
 

@@ -43,6 +43,8 @@ class Echoes:
     rx_velocity_m_s : array_like, [channels, 3] or [3], optional
         Velocity of the receivers while the sound travels, metres per second. None means
         stop-and-hop.
+    look_direction : array_like, [channels, 3] or [3], optional
+        Direction in which the beam of each channel looks, as for `RangeLines`.
 
     Raises
     ------
@@ -74,6 +76,7 @@ class Echoes:
     sound_speed_m_s: float
     pulse: Pulse | None = None
     rx_velocity_m_s: NDArray[np.float64] | None = None
+    look_direction: NDArray[np.float64] | None = None
 
     if TYPE_CHECKING:  # the constructor converts array_like arguments
 
@@ -88,6 +91,7 @@ class Echoes:
             sound_speed_m_s: float,
             pulse: Pulse | None = None,
             rx_velocity_m_s: ArrayLike | None = None,
+            look_direction: ArrayLike | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:

@@ -86,7 +86,8 @@ def simulate(
     Returns
     -------
     Echoes
-        Complex baseband.
+        Complex baseband. `look_direction` is that of the pointing if element patterns are applied,
+        otherwise None.
 
     Raises
     ------
@@ -139,9 +140,10 @@ def simulate(
     )  # fmt: skip
     check_size(sonar, track, range_m)
     parts = scene_parts(scene)
-    patterns = None
+    patterns, look = None, None
     if not sonar.is_omnidirectional and element_pattern:
         patterns = ElementPatterns(sonar, (pointing or Pointing.broadside()).axes(track))
+        look = np.repeat(patterns.axes[:, 1], sonar.receivers, axis=0)
     elif pointing is not None:
         why = "the sonar's elements have no sizes" if element_pattern else "element_pattern is off"
         raise ValueError(f"pointing must be left out: {why}")
@@ -181,7 +183,7 @@ def simulate(
         _add_noise(samples, float(snr_db), seed)
     return Echoes(
         samples, start, rate, pulse.carrier_hz, geometry.tx_m, geometry.rx_m, sound, pulse,
-        geometry.rx_velocity_m_s,
+        geometry.rx_velocity_m_s, look,
     )  # fmt: skip
 
 

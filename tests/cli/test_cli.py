@@ -224,6 +224,17 @@ def test_an_image_of_zeros_has_no_predicted_error(made, tmp_path, method):
     assert results["predicted_error_db"] is None
 
 
+@pytest.mark.parametrize("method", [("--tolerance-db", -40), ("--exact",)])
+def test_a_grid_on_the_wrong_side_is_a_warning_with_the_options_meant(made, tmp_path, method):
+    folder, _ = made
+    image, axes = ("image", folder / "lines.h5", "-o", tmp_path / "image.h5"), ("--x=-1:1:21",)
+    _, warning = run(*image, *axes, "--y=-20.5:-19.5:21", *method)
+    assert warning.count("the whole grid lies to starboard of the track") == 1
+    (meant,) = re.findall(r"Use the mirrored grid,\s+(--x=\S+\s+--y=\S+)", warning)
+    assert meant.split() == ["--x=-1:1:21", "--y=19.5:20.5:21"]
+    assert run(*image, *meant.split(), *method)[1] == ""
+
+
 def test_stages_that_leave_no_image_are_a_warning(made, tmp_path):
     scene = ("--scene", made[0] / "scene.toml")
     for command in (("image", "-o", tmp_path / "image.h5"), ("plan",)):

@@ -41,6 +41,16 @@ def test_one_value_stands_for_every_channel():
     np.testing.assert_array_equal(lines.rx_velocity_m_s, [[2.0, 0, 0]] * 4)
 
 
+def test_look_directions_become_unit_vectors_once():
+    lines = make(look_direction=[0, 3, -4])
+    np.testing.assert_allclose(lines.look_direction, [[0, 0.6, -0.8]] * 4, atol=1e-16)
+    assert not lines.look_direction.flags.writeable
+    again = dataclasses.replace(lines, carrier_hz=1e5)
+    assert again.look_direction.tobytes() == lines.look_direction.tobytes()
+    huge = make(look_direction=np.array([[1e300, 1e300, 0], [1e-300, 0, 0], [0, 0, 9], [1, 0, 0]]))
+    np.testing.assert_allclose(np.linalg.norm(huge.look_direction, axis=1), 1)
+
+
 def test_carrier_may_be_zero():
     assert make(carrier_hz=0).wavenumber_rad_m == 0
 
@@ -66,7 +76,7 @@ def test_it_cannot_be_changed():
     "channels", [slice(1, 3), [1, 2], np.array([False, True, True, False]), np.array([1, 2])]
 )
 def test_select(channels):
-    lines = make(rx_velocity_m_s=np.arange(12.0).reshape(4, 3))
+    lines = make(rx_velocity_m_s=np.arange(12.0).reshape(4, 3), look_direction=np.eye(4, 3) + 1)
     some = lines.select(channels)
     for field in dataclasses.fields(lines):
         before, after = getattr(lines, field.name), getattr(some, field.name)
@@ -124,6 +134,9 @@ def with_bad(shape, value):
         ({"sound_speed_m_s": np.nan}, ValueError, "sound_speed_m_s"),
         ({"rx_velocity_m_s": [1.0, 2.0]}, ValueError, "rx_velocity_m_s must have shape"),
         ({"rx_velocity_m_s": [0, 1500.0, 0]}, ValueError, "rx_velocity_m_s must be.* < 1500 m/s"),
+        ({"look_direction": "port"}, TypeError, "look_direction must be real numbers"),
+        ({"look_direction": [0.0, 1.0]}, ValueError, r"look_direction must have shape \(4, 3\)"),
+        ({"look_direction": np.eye(4, 3)}, ValueError, "look_direction must not have .* length 0"),
     ],
 )
 def test_bad_input_is_named(changes, error, words):

@@ -88,6 +88,64 @@ def test_what_was_written_passes_the_checker_and_gives_the_same_image(name, tmp_
     assert clsas.relative_error_db(*images) < -80
 
 
+LOOKS = {
+    "port": [0, 1, -0.2],
+    "starboard": [0.1, -1, -0.2],
+    "both": np.tile([[0, 1.0, 0], [0, -1.0, 0]], (30, 1)),
+    "unknown": None,
+}
+
+
+@pytest.mark.parametrize("name", LOOKS)
+def test_the_look_direction_is_kept_and_states_the_side_of_the_track(name, tmp_path):
+    lines = replace(sonar_lines(), look_direction=LOOKS[name])
+    path = tmp_path / "lines.cphd"
+    write_cphd(path, lines)
+    assert findings(path) == {}
+    again = read_cphd(path)
+    if name == "unknown":  # the file has to state a side, which is none
+        assert again.look_direction is None
+    else:
+        np.testing.assert_allclose(again.look_direction, lines.look_direction, atol=1e-15)
+    side = b"R" if name == "starboard" else b"L"
+    assert b"<SideOfTrack>" + side + b"</" in path.read_bytes()
+    unknown = (replace(each, look_direction=None) for each in (again, lines))  # GRID is to port
+    images = [clsas.backproject(each, GRID, accuracy_db=-80) for each in unknown]
+    assert clsas.relative_error_db(*images) < -80
+
+
+@pytest.mark.parametrize("bistatic", [True, False])
+@pytest.mark.parametrize(("side", "look"), [(b"L", 1.0), (b"R", -1.0)])
+def test_antennas_of_a_foreign_file_look_to_its_side_of_the_track(tmp_path, bistatic, side, look):
+    path = tmp_path / "pass.cphd"
+    foreign(path, bistatic=bistatic)
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"<SideOfTrack>L<", b"<SideOfTrack>" + side + b"<"))
+    np.testing.assert_allclose(
+        read_cphd(path).look_direction, np.tile([0, look, 0], (47, 1)), atol=1e-12
+    )
+
+
+def at_rest(vectors):
+    vectors["TxVel"] = 0
+
+
+def opposite(vectors):
+    vectors["RcvVel"] *= -1
+
+
+def without_velocity(vectors):
+    vectors["TxVel"][7] = np.nan
+
+
+@pytest.mark.parametrize("change", [at_rest, opposite, without_velocity])
+def test_without_one_direction_of_motion_the_side_is_unknown(tmp_path, change):
+    path = tmp_path / "pass.cphd"
+    foreign(path)
+    change_vectors(path, change)
+    assert read_cphd(path).look_direction is None
+
+
 def test_a_radar_sees_the_wavelengths_of_the_sonar(tmp_path):
     """Another processor assumes the speed of light: the file must focus without our parameter."""
     lines = sonar_lines()

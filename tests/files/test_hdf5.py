@@ -44,6 +44,12 @@ def objects():
         "image of points": Image(complex_noise(random, 7), Grid.points(noise(7, 3))),
         "lines": RangeLines(samples, noise(4), 1 / 3, tx_m, rx_m, 1e6 / 3, 1500.1),
         "moving lines": RangeLines(samples, 40, 0.1, tx_m, rx_m, 0, 1500, noise(4, 3)),
+        "looking lines": RangeLines(
+            samples, 40, 0.1, tx_m, rx_m, 0, 1500, look_direction=noise(4, 3)
+        ),
+        "looking echoes": Echoes(
+            samples, 0.1, 1e5, 1e6, tx_m, rx_m, 1500, look_direction=[0.1, 1, 0.2]
+        ),
         "echoes": Echoes(
             samples, 0.1, 1e5 / 3, 1e6, tx_m, rx_m, 1500, Pulse(1e6, 1e5 / 3, 1e-3, "down")
         ),

@@ -1,4 +1,5 @@
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -94,7 +95,9 @@ def test_xarray_positions_are_the_grids(name):
 
 def test_xarray_of_lines():
     lines = OBJECTS["moving lines"]
-    data = to_xarray(lines)
+    data = to_xarray(replace(lines, look_direction=[0, 1, 0]))
+    assert data.look_direction.dims == ("channel", "axis")
+    assert data.look_direction.attrs == {"long_name": "Look direction", "units": "1"}
     assert data.samples.dims == ("channel", "sample")
     assert data.tx_m.dims == ("channel", "axis")
     assert data.rx_velocity_m_s.attrs["units"] == "m s-1"

@@ -80,6 +80,31 @@ def test_a_clean_recording_has_no_findings(lines, echoes, platform):
     assert repr(found).endswith("monostatic, findings: none)")
 
 
+def test_a_grid_behind_the_elements_is_found(lines):
+    mirrored = clsas.Grid.plane((1.0, 3.0, 100), (-20.5, -18.0, 120))
+    finding = clsas.inspect(lines, mirrored)["grid_behind"]
+    assert (finding.value, finding.limit) == (1.0, 0.01)
+    assert finding.message.startswith("the whole grid lies to starboard of the track")
+    assert finding.remedy == "use the mirrored grid, --x=1:3:100 --y=18:20.5:120"
+    unknown = clsas.inspect(replace(lines, look_direction=None), mirrored)
+    assert "grid_behind" not in unknown
+
+
+@pytest.mark.parametrize(
+    ("look", "looks", "row"),
+    [
+        ([0, 1, -0.3], "port", "to port"),
+        ([0.1, -1, 0], "starboard", "to starboard"),
+        ([0, 0, -1], "", "neither to port nor to starboard: mean direction (0.00, 0.00, -1.00)"),
+        (None, "", "unknown: the recording does not state the side"),
+    ],
+)
+def test_the_side_that_the_elements_look_to_is_reported(lines, look, looks, row):
+    found = clsas.inspect(replace(lines, look_direction=look))
+    assert found.looks == looks
+    assert re.search(rf"^looks +{re.escape(row)}$", found.describe(), re.M)
+
+
 def dead(samples):
     samples[5:7] = 0
     samples[100] *= 0.01

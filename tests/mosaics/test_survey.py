@@ -11,7 +11,7 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.exact.backprojection import backproject
-from clsas.files.hdf5 import FileFormatError, save
+from clsas.files.hdf5 import FileFormatError, load, save
 from clsas.mosaics.survey import END, files_of, has_ended, largest_gap_m, open_files, open_survey
 
 GRID = Grid.plane((-3, 3, 61), (30, 90, 121))
@@ -138,6 +138,21 @@ def test_a_folder_ends_with_a_file_named_end(folder):
     (folder / END).touch()
     assert has_ended(folder)
     assert [path.name for path in files_of(folder)] == ["0.h5", "1.h5", "2.h5"]
+
+
+def test_a_look_direction_is_known_if_every_file_states_it(folder):
+    for path in files_of(folder)[:2]:
+        save(path, replace(load(path), look_direction=[0, 1, 0]))
+    assert open_survey(folder).geometry.look_direction is None
+    first = open_files(files_of(folder)[:2])
+    np.testing.assert_array_equal(first.geometry.look_direction, np.tile([0, 1, 0], (51, 1)))
+    assert open_files(files_of(folder), first).geometry.look_direction is None
+    digests = open_survey(folder).digests()
+    save(folder / "2.h5", replace(load(folder / "2.h5"), look_direction=[0, 1, 0]))
+    survey = open_survey(folder)
+    np.testing.assert_array_equal(survey.geometry.look_direction, np.tile([0, 1, 0], (120, 1)))
+    assert survey.digests() == digests  # a mosaic goes on, since its pixels stay
+    np.testing.assert_array_equal(survey.last_range_m, LINES.last_range_m)
 
 
 def test_errors(folder, tmp_path):

@@ -392,6 +392,8 @@ def test_louder_lines_are_the_same_lines():
     lines, _ = made(straight)
     louder = dataclasses.replace(lines, samples=2 * lines.samples)
     assert lines_digest(louder) == lines_digest(lines)
+    looking = dataclasses.replace(lines, look_direction=[0, 1, 0])
+    assert lines_digest(looking) == lines_digest(lines)
 
 
 def test_other_grids_have_other_digests():

@@ -18,6 +18,7 @@ def data(folder: Path) -> dict[str, Call]:
     part = slice(2, 10, 2)
     points = clsas.Grid.points(grid.positions_m().reshape(-1, 3))
     axis = (0.0, 1.0, 5)
+    unset = {"rx_velocity_m_s": ("None",), "look_direction": ("None",)}
     return {
         "Grid": Call(
             clsas.Grid,
@@ -55,8 +56,9 @@ def data(folder: Path) -> dict[str, Call]:
         "Grid.window": Call(grid.window, {"rows": part, "columns": slice(1, 3)}),
         "RangeLines": Call(
             clsas.RangeLines,
-            fields(lines) | {"rx_velocity_m_s": np.ones((40, 3))},
-            accepts={"rx_velocity_m_s": ("None",), "samples": ("an Image",)},
+            fields(lines)
+            | {"rx_velocity_m_s": np.ones((40, 3)), "look_direction": np.ones((40, 3))},
+            accepts=unset | {"samples": ("an Image",)},
         ),
         "RangeLines.select": Call(lines.select, {"channels": np.array([1, 5, 30])}),
         "RangeLines.high_passed": Call(lines.high_passed, {"cutoff_hz": 95e3}),
@@ -87,8 +89,9 @@ def data(folder: Path) -> dict[str, Call]:
         "Image.to_xarray": Call(image.to_xarray, {}),
         "Echoes": Call(
             clsas.Echoes,
-            fields(s.echoes) | {"rx_velocity_m_s": np.ones((40, 3))},
-            accepts={"rx_velocity_m_s": ("None",), "pulse": ("None",), "samples": ("an Image",)},
+            fields(s.echoes)
+            | {"rx_velocity_m_s": np.ones((40, 3)), "look_direction": np.ones((40, 3))},
+            accepts=unset | {"pulse": ("None",), "samples": ("an Image",)},
         ),
         "Replica": Call(
             clsas.Replica, {"samples": np.exp(1j * np.arange(40.0)), "sample_rate_hz": 4e4}
