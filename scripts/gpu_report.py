@@ -23,7 +23,6 @@ PARTS = {
     "Devices": [PYTHON, "-m", "clsas", "devices"],
     "Self test": [PYTHON, "-m", "clsas", "selftest", "--device", "{device}"],
     "Tests": [PYTHON, "-m", "pytest", "-q", "--durations=10"],
-    "Calibration": [PYTHON, "-m", "clsas", "measure-costs", "--device", "{device}"],
     "Tuning": [PYTHON, "scripts/bench", "tuning", "--device", "{device}"],
     "Exact imaging": [PYTHON, "scripts/bench", "speed", "--device", "{device}"],
     "Factorized imaging": [PYTHON, "scripts/bench", "factorized", "--device", "{device}"],

@@ -26,7 +26,7 @@ hypothesis.settings.load_profile("clsas")
 def stored_costs(tmp_path_factory):
     """A cache folder of the tests' own, with default costs stored for every device.
 
-    So plans depend neither on measured times nor on the user's calibration, also in the processes
+    So plans depend neither on measured times nor on what the user has stored, also in the processes
     that tests start.
     """
     with pytest.MonkeyPatch.context() as patch:

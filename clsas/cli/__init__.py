@@ -48,7 +48,6 @@ _GROUPS = {
     },
     "Machine": {
         "devices": ("machine", "List OpenCL devices, and show which one is used and why."),
-        "measure-costs": ("machine", "Measure what imaging costs on a device, for planning."),
         "selftest": ("selftest", "Test the accuracy of a device, in about a minute."),
         "bench": ("measures", "Time benchmark cases, and measure their errors."),
         "demo": ("machine", "Simulate, image and measure the thesis's wide-beam case."),
@@ -58,7 +57,7 @@ _COMMANDS = {name: entry for group in _GROUPS.values() for name, entry in group.
 # What to do instead of a command of an earlier version.
 _RENAMED = {
     "calibrate": (
-        "The command 'calibrate' is now 'measure-costs': it measures a device. To calibrate a "
+        "There is no command 'calibrate'. 'devices --measure' measures a device. To calibrate a "
         "sonar, use 'known-points', or the step 'calibrate' of 'process'."
     ),
 }

@@ -1,8 +1,7 @@
-"""Commands for a new machine: devices, measure-costs, demo."""
+"""Commands for a new machine: devices, demo."""
 
 from __future__ import annotations
 
-from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +10,7 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.outputs import print_json, printable, progress_bar, report, say
+from clsas.cli.outputs import print_json, printable, progress_bar, say
 from clsas.cli.parameters import File, need_matplotlib
 from clsas.opencl.device import choose, open_device
 from clsas.trials import demo as demonstration
@@ -21,8 +20,12 @@ if TYPE_CHECKING:
 
 
 @click.command()
+@click.option(
+    "--measure", is_flag=True,
+    help="First measure the costs of the device that is used again, which takes 0.3 to 0.6 s.",
+)  # fmt: skip
 @options.as_json
-def devices(as_json: bool) -> None:
+def devices(measure: bool, as_json: bool) -> None:
     """List OpenCL devices, and show which one is used and why.
 
     Plans predict times from the costs of a device; their origin and age are listed too.
@@ -30,9 +33,11 @@ def devices(as_json: bool) -> None:
     \b
     Example:  CLSAS_DEVICE=0 clsas devices
     """
-    from clsas.planning import costs
+    from clsas.planning import costs, scaling
 
     used, reason = choose()
+    if measure:
+        scaling.scaled(open_device(used.index))
     found = clsas.list_devices()
     known = {info.index: costs.load(info) for info in found}
     if as_json:
@@ -61,42 +66,9 @@ def _origin(known: KnownCosts) -> str:
     """Return the origin of costs and their age, in words."""
     if known.source == "default":
         return "defaults; the first plan with a tolerance measures the device for 0.3 to 0.6 s"
-    how = {
-        "scaled": "defaults, scaled by a short measurement",
-        "calibrated": "measured by `clsas measure-costs`",
-    }
     days = (datetime.now(UTC) - datetime.fromisoformat(known.measured)).days
     age = "today" if days < 1 else f"{days} day{'s' * (days > 1)} ago"
-    return f"{how[known.source]}, on {known.measured[:10]} ({age})"
-
-
-@click.command("measure-costs")
-@options.device
-@options.as_json
-def measure_costs(device: str | None, as_json: bool) -> None:
-    """Measure what imaging costs on a device, for planning.
-
-    The costs of all steps of imaging are measured in about a minute, and stored for later plans.
-    They are not stored if the times vary too much, as on a busy machine.
-
-    \b
-    Example:  clsas measure-costs --device 0
-    """
-    from clsas.planning import costs
-    from clsas.planning.calibration import calibrate as measure
-
-    opened = open_device(device)
-    with progress_bar("measuring costs") as progress:
-        found = measure(opened, progress=progress)
-    stored = costs.load(opened).costs == found
-    parts = "".join(f"\n{getattr(found, part.name):>12.4g}  {part.name}" for part in fields(found))
-    report(
-        as_json,
-        f"{opened.info.label}, {'' if stored else 'not '}stored in "
-        f"{printable(costs.path())}{parts}",
-        device=opened.info.label, driver=opened.info.driver, file=costs.path(), stored=stored,
-        costs=found,
-    )  # fmt: skip
+    return f"defaults, scaled by a short measurement on {known.measured[:10]} ({age})"
 
 
 @click.command()

@@ -102,8 +102,7 @@ class KnownCosts:
     ----------
     costs : Costs
     source : str
-        "given" by the caller; "calibrated" by `clsas measure-costs`; "scaled" from the defaults by
-        a short measurement; or "default".
+        "given" by the caller; "scaled" from the defaults by a short measurement; or "default".
     measured : str
         Time of the measurement, UTC, in ISO 8601; "" without one.
     """
@@ -152,8 +151,8 @@ def load(device: Device | DeviceInfo) -> KnownCosts:
         return default
 
 
-def save(device: Device, costs: Costs, source: CostSource = "calibrated") -> Path:
-    """Store the measured costs of a device, and return the path of the file.
+def save(device: Device, costs: Costs) -> Path:
+    """Store the costs of a device that were scaled to it, and return the path of the file.
 
     The file is replaced as a whole, so that another process reads either the old or the new one.
 
@@ -168,7 +167,7 @@ def save(device: Device, costs: Costs, source: CostSource = "calibrated") -> Pat
     except (OSError, ValueError):
         stored = {}  # whoever reads the file is warned
     measured = datetime.now(UTC).isoformat(timespec="seconds")
-    stored[key(device.info)] = {"source": source, "measured": measured, "costs": asdict(costs)}
+    stored[key(device.info)] = {"source": "scaled", "measured": measured, "costs": asdict(costs)}
     with replacing(file) as temporary:
         temporary.write_text(json.dumps(stored, indent=1))
     return file
@@ -198,9 +197,9 @@ def _known(table: dict[str, Any]) -> KnownCosts:
     """Return costs from their stored table; raise an error if `save` did not write it."""
     names = [field.name for field in fields(Costs)]
     costs = {name: validate.number(name, table["costs"][name], "ns") for name in names}
-    if table["source"] not in ("scaled", "calibrated") or not table["measured"]:
-        raise ValueError("costs must be scaled or calibrated, at a time")
-    return KnownCosts(Costs(**costs), table["source"], table["measured"])
+    if table["source"] != "scaled" or not table["measured"]:
+        raise ValueError("costs must be scaled, at a time")
+    return KnownCosts(Costs(**costs), "scaled", table["measured"])
 
 
 def _reason(error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""Costs of a device that was not calibrated: defaults, scaled by a measurement of 0.3 to 0.6 s.
+"""Costs of a device: defaults, scaled by a measurement of 0.3 to 0.6 s.
 
 Devices differ mostly in the speed of each kernel, and hosts in their speed as a whole. Costs of the
 same kernel keep their default proportions. Three small images are therefore enough to determine a
@@ -143,7 +143,7 @@ def _scaled_once(device: Device, path: Path) -> KnownCosts:
     """Return the default costs scaled to a device, and store them in the file `path`."""
     costs = measure(device).of(stored.defaults(device))
     try:
-        stored.save(device, costs, "scaled")
+        stored.save(device, costs)
     except OSError as error:
         validate.warn(
             f"costs measured on {device.info.label} cannot be stored, so that every process "

@@ -20,7 +20,6 @@ from clsas.planning.former import former
 from clsas.planning.visibility_model import VisibilityModel
 from clsas.plans.plan import Plan
 from clsas.plans.predictions import Work
-from clsas.sonar.beam import BeamWindow
 
 _SOUND_M_S = 1500.0
 _CARRIER_HZ, _SAMPLE_RATE_HZ, _BAND = 120e3, 37.5e3, 0.8
@@ -43,8 +42,6 @@ class TimedImage:
         Forms the image.
     expected : Plan or Exact
         Prediction of the image.
-    tiled : bool
-        True if pixels lie in tiles of a plane.
     seconds : list of float
         Times of the runs.
     kernels : list of dict
@@ -53,7 +50,6 @@ class TimedImage:
 
     form: Callable[[], object]
     expected: Plan | Exact
-    tiled: bool
     seconds: list[float] = field(default_factory=list)
     kernels: list[dict[str, float]] = field(default_factory=list)
 
@@ -80,31 +76,16 @@ class TimedImage:
         return min(sum(each.get(name, 0.0) for name in names) for each in self.kernels)
 
     @property
-    def elsewhere(self) -> float:
-        """Least time outside the kernels of stages and pixels, seconds: mostly the host's."""
-        return max(min(self.seconds) - self.in_stages - self.in_pixels, 1e-6)
-
-    @property
     def in_host(self) -> float:
         """Least time of a run without its kernels, seconds."""
         runs = zip(self.seconds, self.kernels, strict=True)
         return min(seconds - sum(kernels.values()) for seconds, kernels in runs)
 
     @property
-    def scatter(self) -> float:
-        """Log ratio of the best times of even and odd runs."""
-        return math.log(min(self.seconds[::2]) / min(self.seconds[1::2]))
-
-    @property
     def repeats(self) -> bool:
         """True if the kernels take the same time, in all, in the two shortest of several runs."""
         shortest_s, next_s = sorted(sum(each.values()) for each in self.kernels)[:2]
         return next_s < (1 + _REPEATED) * shortest_s
-
-    @property
-    def is_weighted(self) -> bool:
-        """True for an exact image with a beam."""
-        return isinstance(self.expected, Exact) and self.expected.weighted
 
     def work(self, names: Sequence[str]) -> list[float]:
         """Return the amounts of work to which costs of some names apply."""
@@ -157,17 +138,13 @@ def with_relief(grid: Grid) -> Grid:
     return grid.with_height(_RELIEF_M / 2 * rows[:, None] * columns)
 
 
-def exact_image(
-    device: Device, lines: RangeLines, grid: Grid, beam: BeamWindow | None = None
-) -> TimedImage:
+def exact_image(device: Device, lines: RangeLines, grid: Grid) -> TimedImage:
     """Return an exact image to be timed."""
-    expected = expect(VisibilityModel.of(lines, grid, beam), EXACT_DB, device)
-    form = partial(form_exactly, lines, grid, device=device, accuracy_db=EXACT_DB, beam=beam)
-    return TimedImage(form, expected, expected.tiled)
+    expected = expect(VisibilityModel.of(lines, grid, None), EXACT_DB, device)
+    form = partial(form_exactly, lines, grid, device=device, accuracy_db=EXACT_DB)
+    return TimedImage(form, expected)
 
 
 def planned_image(device: Device, lines: RangeLines, grid: Grid, chosen: Plan) -> TimedImage:
     """Return an image by a plan to be timed as a first one: nothing is kept from run to run."""
-    return TimedImage(
-        lambda: former(lines, grid, chosen, device).form(lines), chosen, grid.is_planar
-    )
+    return TimedImage(lambda: former(lines, grid, chosen, device).form(lines), chosen)

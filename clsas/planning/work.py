@@ -1,4 +1,4 @@
-"""Counts of operations, which the search, predictions and the calibration share."""
+"""Counts of operations, which the search, predictions and the scaling of costs share."""
 
 from __future__ import annotations
 

@@ -214,8 +214,8 @@ class Prediction:
     device : str
         Device to which the times apply.
     cost_source : str
-        Origin of the costs from which times follow: "given", "calibrated" on the device, "scaled"
-        to it by a short measurement, or "default".
+        Origin of the costs from which times follow: "given"; "scaled" to the device by a short
+        measurement; "calibrated" by an earlier version of clsas; or "default".
     costs_measured : str
         Time of that measurement, UTC, in ISO 8601; "" without one.
     stages : tuple of Stage

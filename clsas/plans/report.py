@@ -12,13 +12,10 @@ _HEADINGS = (
 )  # fmt: skip
 _COSTS = {
     "given": "costs that were given.",
-    "calibrated": "costs that `clsas measure-costs` measured on this device{when}.",
-    "scaled": (
-        "default costs, scaled to this device by a short measurement{when}; `clsas measure-costs` "
-        "measures each of them."
-    ),
+    "calibrated": "costs that an earlier version of clsas measured on this device{when}.",
+    "scaled": "default costs, scaled to this device by a short measurement{when}.",
     "default": (
-        "default costs, which were not measured on this device; `clsas measure-costs` does that."
+        "default costs, which were not scaled to this device; `clsas devices --measure` does that."
     ),
 }
 

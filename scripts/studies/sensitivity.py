@@ -34,9 +34,8 @@ from clsas.trials import cases
 ROOMS = ("planning", "factorized", "aperture", "exact")
 MODULES = ("clsas.signal.spectrum", "clsas.signal.ambiguity", "clsas.signal.interpolation")
 FIXED = {
-    "clsas.planning.calibration": "measures costs, which are given for the cases",
-    "clsas.planning.scaling": "as calibration",
-    "clsas.planning.timed_images": "as calibration",
+    "clsas.planning.scaling": "measures costs, which are given for the cases",
+    "clsas.planning.timed_images": "as scaling",
     "clsas.exact.checks": "limits of input",
     "clsas.exact.reference": "the float64 reference",
     "clsas.exact.wavenumber": "another imager, which has its own tool",

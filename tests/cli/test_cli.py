@@ -25,7 +25,9 @@ from clsas.cli import images
 from clsas.core import validate
 from clsas.files.scene_files import built_in_scene, read_scene
 from clsas.measures.resolution import expected_resolution_m
+from clsas.opencl.device import choose
 from clsas.planning import costs
+from clsas.planning.scaling import Scale
 from clsas.trials import cases, demo
 
 pytest.importorskip("matplotlib")
@@ -342,20 +344,24 @@ def test_tradeoff_of_a_built_in_case(monkeypatch):
     assert (seen[1][2]["beam"].width_deg, seen[1][2]["beam"].shape) == (1.0, "hann")
 
 
-def test_costs_are_measured(monkeypatch):
-    measured = costs.Costs(pixel_ns=0.7)
-    monkeypatch.setattr("clsas.planning.calibration.calibrate", lambda device, progress: measured)
-    assert not run_json("measure-costs", "--device", 0)["stored"]
-    assert ", not stored in " in run("measure-costs", "--device", 0)[0]
-    monkeypatch.setattr(costs, "load", lambda device: costs.KnownCosts(measured, "calibrated"))
-    result = run_json("measure-costs", "--device", 0)
-    assert result["stored"]
-    assert result["costs"]["pixel_ns"] == 0.7
-    assert result["file"] == str(costs.path())
-    text, _ = run("measure-costs", "--device", 0)
-    assert result["device"] in text
-    assert str(costs.path()) in text
-    assert re.search(r"^ +0\.7  pixel_ns$", text, re.MULTILINE)
+def test_costs_are_measured_again(monkeypatch, tmp_path):
+    """The device in use, and no other, even if its costs are known."""
+    monkeypatch.setenv("CLSAS_CACHE", str(tmp_path))
+    measured = []
+
+    def measure(device):
+        measured.append(device.info.index)
+        return Scale(*(2.0 for _ in dataclasses.fields(Scale)))
+
+    monkeypatch.setattr("clsas.planning.scaling.measure", measure)
+    assert {each["source"] for each in run_json("devices")["costs"].values()} == {"default"}
+    assert not measured
+    result = run_json("devices", "--measure")
+    used = result["used"]
+    assert measured == [used]
+    assert result["costs"][str(used)]["source"] == "scaled"
+    known = costs.load(clsas.list_devices()[used])
+    assert known.costs.pixel_ns == pytest.approx(2 * costs.defaults(choose()[0]).pixel_ns)
 
 
 def test_an_image_tells_its_kernels_times(made, tmp_path):
@@ -379,10 +385,10 @@ def test_devices(monkeypatch):
     infos = clsas.list_devices()
     result = run_json("devices")
     assert [device["name"] for device in result["devices"]] == [info.name for info in infos]
-    assert {each["source"] for each in result["costs"].values()} == {"calibrated"}
+    assert {each["source"] for each in result["costs"].values()} == {"scaled"}
     assert result["costs_file"] == str(costs.path())
     text, _ = run("devices")
-    costs_of = r"^   costs: measured by `clsas measure-costs`, on \d{4}-\d\d-\d\d \(today\)$"
+    costs_of = r"^   costs: defaults, scaled by a short measurement on \d{4}-\d\d-\d\d \(today\)$"
     assert re.search(costs_of, text, re.MULTILINE)
     assert f"Costs are stored in {costs.path()}" in text
     assert all(info.label in text and info.driver in text for info in infos)
@@ -622,7 +628,7 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (["quality", "image.h5", "--png", "new.png"], 2, "require --near"),
         (["bench", "bp-nothing"], 2, "'bp-nothing' is not one of bp-thesis, "),
         (["imagine"], 2, "No such command 'imagine'. Did you mean 'image'?"),
-        (["calibrate"], 2, "'calibrate' is now 'measure-costs'"),
+        (["calibrate"], 2, "'devices --measure' measures a device"),
         (["image", "lines.h5", *GRID, "--tolerence-db", "-40"], 2, "'--tolerance-db'"),
         (["--trace", "devices"], 2, "Did you mean '--traceback'?"),
     ],
@@ -984,7 +990,7 @@ def test_help_lists_every_command_once_on_a_line_in_four_groups():
 @pytest.mark.parametrize(
     ("typed", "expected"),
     [
-        (["m"], ["mosaic", "measure-costs"]),
+        (["mo"], ["mosaic"]),
         (["--tr"], ["--traceback"]),
         (["image", "--tol"], ["--tolerance-db", "--tolerance-wavelengths"]),
         (["process", "--step", "f"], ["focus"]),

@@ -71,7 +71,7 @@ def test_costs_of_no_measurement_are_ignored(cache, platform, field, value):
     stored = json.loads(cache.read_text())
     next(iter(stored.values()))[field] = value
     cache.write_text(json.dumps(stored))
-    with pytest.warns(ClsasWarning, match="must be scaled or calibrated"):
+    with pytest.warns(ClsasWarning, match="must be scaled, at a time"):
         assert costs.load(platform).source == "default"
 
 
@@ -118,7 +118,7 @@ def test_a_plan_asks_for_what_is_stored(cache):
     costs.save(open_device(), EXACT_IS_SLOW)
     stored = plan(lines, grid, tolerance_db=-40)
     given = plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
-    origin = {"cost_source": "calibrated", "costs_measured": stored.prediction.costs_measured}
+    origin = {"cost_source": "scaled", "costs_measured": stored.prediction.costs_measured}
     given = dataclasses.replace(given, prediction=dataclasses.replace(given.prediction, **origin))
     assert stored.to_json() == given.to_json()
 

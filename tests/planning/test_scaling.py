@@ -10,7 +10,6 @@ from factorizing import EXACT_IS_SLOW, made, straight
 from clsas.core.validate import ClsasWarning
 from clsas.opencl.device import open_device
 from clsas.planning import costs, scaling
-from clsas.planning.calibration import calibrate
 from clsas.planning.costs import Costs
 from clsas.planning.planner import plan
 from clsas.planning.scaling import GROUPS, Scale
@@ -53,7 +52,7 @@ def test_the_first_plan_measures_and_later_ones_read_what_it_stored(cache, measu
     assert stored.source == "scaled"
     assert stored.costs == costs.defaults(open_device())
     assert plan(*scene(), **REQUEST).to_json() == first.to_json()
-    costs.save(open_device(), EXACT_IS_SLOW, "scaled")
+    costs.save(open_device(), EXACT_IS_SLOW)
     assert plan(*scene(), **REQUEST).exact_seconds > 10 * first.exact_seconds
     assert len(measured) == 1
 
@@ -121,20 +120,6 @@ def test_another_version_of_clsas_measures_anew(cache, measured, monkeypatch):
     assert costs.load(open_device()).source == "default"
 
 
-def test_a_calibration_replaces_scaled_costs(cache, measured, monkeypatch):
-    plan(*scene(), **REQUEST)
-    module = "clsas.planning.calibration."
-    monkeypatch.setattr(module + "_SIZES", ((200, 128), (400, 96)))
-    monkeypatch.setattr(module + "_SMALL_SIZES", ((50, 32), (100, 64)))
-    monkeypatch.setattr(module + "_ROUNDS", 2)
-    for name in ("_MOST_SCATTER", "_MOST_MISFIT"):  # whatever else this machine does
-        monkeypatch.setattr(module + name, 100.0)
-    found = calibrate()
-    assert costs.load(open_device()).costs == found
-    assert plan(*scene(), **REQUEST).prediction.cost_source == "calibrated"
-    assert len(measured) == 1
-
-
 @pytest.mark.parametrize("content", ["", "[]", '{"KEY": {"pixel_ns": 0.5}}', '{"KEY": 5}'])
 def test_a_broken_or_foreign_file_is_reported_and_measured_again(cache, measured, content):
     cache.parent.mkdir()
@@ -191,11 +176,12 @@ def test_images_whose_times_do_not_repeat_are_timed_for_longer(platform, monkeyp
     def run(image, device):
         for _ in range(20_000):
             next(clock)
-        name = type(image.expected).__name__ + " off the plane" * (not image.tiled)
+        tiled = getattr(image.expected, "tiled", True)  # the planned image lies on a plane
+        name = type(image.expected).__name__ + " off the plane" * (not tiled)
         runs[name] += 1
         image.seconds.append(0.02)
         times = dict.fromkeys(("upsample_lines", "stage", "backproject_tiles"), 0.005)
-        image.kernels.append(times if image.tiled else {"backproject_points": 0.01 * runs[name]})
+        image.kernels.append(times if tiled else {"backproject_points": 0.01 * runs[name]})
 
     monkeypatch.setattr(scaling.TimedImage, "run", run)
     monkeypatch.setattr(scaling.time, "perf_counter", lambda: 1e-6 * next(clock))

@@ -448,24 +448,16 @@ def test_it_says_whether_times_are_of_this_device(chosen, monkeypatch, tmp_path)
     monkeypatch.setenv("CLSAS_CACHE", str(tmp_path))
     usual = plan(lines, grid, stages=[])
     assert usual.prediction.cost_source == "default"
-    words = (
-        "Times follow from default costs, which were not measured on this device; `clsas measure"
-    )
+    words = "Times follow from default costs, which were not scaled to this device; `clsas devices"
     assert words in usual.describe()
     device = open_device()
-    costs.save(device, costs.defaults(device), "scaled")
+    costs.save(device, costs.defaults(device))
     scaled = plan(lines, grid, tolerance_db=-50)
     day = scaled.prediction.costs_measured[:10]
     words = (
         f"Times follow from default costs, scaled to this device by a short measurement on {day}"
     )
     assert words in scaled.describe()
-    costs.save(device, costs.defaults(device))
-    measured = plan(lines, grid, tolerance_db=-50)
-    assert measured.prediction.cost_source == "calibrated"
-    words = f"costs that `clsas measure-costs` measured on this device on {day}"
-    assert words in measured.describe()
-    assert "default costs" not in measured.describe()
     given = plan(lines, grid, tolerance_db=-50, costs=costs.Costs())
     assert "Times follow from costs that were given." in given.describe()
     assert Plan.from_json(scaled.to_json()).prediction.cost_source == "scaled"

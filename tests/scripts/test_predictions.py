@@ -41,7 +41,7 @@ def test_the_title_tells_device_and_costs():
     device = open_device()
     day = costs.load(device).measured[:10]
     driver = re.escape(device.info.driver)
-    words = rf"{driver}, \d+ compute units: costs that `clsas measure-costs` .* on {day}"
+    words = rf"{driver}, \d+ compute units: default costs, scaled to this device by .* on {day}"
     assert re.search(words, predictions.title(device))
 
 
