@@ -115,7 +115,7 @@ class Grid:
             if any(getattr(self, name) is not None for name in (*plane, "height_m")):
                 raise ValueError("points_m must stand alone: it excludes a plane and heights")
             put("points_m", (*shape, 3))
-            self._check_bounds()
+            self._check_bounds("points_m")
             return
         if len(shape) != 2:
             raise ValueError(f"shape of a plane must be (rows, columns), got {shape}")
@@ -124,15 +124,16 @@ class Grid:
         _check_steps(*self.vectors_m[1:], shape)
         if self.height_m is not None:
             put("height_m", shape)
-        self._check_bounds()
+        self._check_bounds(", ".join(plane) + ", height_m" * (self.height_m is not None))
 
-    def _check_bounds(self) -> None:
+    def _check_bounds(self, names: str) -> None:
+        """Raise ValueError if fields of some names put a pixel too far from the origin."""
         with np.errstate(over="ignore", invalid="ignore"):
             farthest_m = float(np.abs(self.bounds_m).max())
         if not farthest_m <= validate.FARTHEST_M:
             raise ValueError(
                 f"pixels must lie within {validate.FARTHEST_M:g} m of the origin along each axis, "
-                f"got one at {farthest_m:g} m"
+                f"got one at {farthest_m:g} m by {names}"
             )
 
     def __repr__(self) -> str:
@@ -161,7 +162,7 @@ class Grid:
         """
         x_start, x_step, columns = _axis("x", x)
         y_start, y_step, rows = _axis("y", y)
-        origin = [x_start, y_start, validate.number("z", z, "m")]
+        origin = [x_start, y_start, _coordinate("z", z)]
         return cls.oriented(origin, [0, y_step, 0], [x_step, 0, 0], (rows, columns))
 
     @classmethod
@@ -445,6 +446,11 @@ class Grid:
         return (rows,)
 
 
+def _coordinate(name: str, value: float) -> float:
+    """Return a coordinate in metres; raises TypeError or ValueError."""
+    return validate.number(name, value, "m", least=-validate.FARTHEST_M, most=validate.FARTHEST_M)
+
+
 def _axis(name: str, axis: tuple[float, float, int]) -> tuple[float, float, int]:
     """Return start, step and count of a (start, stop, count) axis."""
     try:
@@ -453,8 +459,7 @@ def _axis(name: str, axis: tuple[float, float, int]) -> tuple[float, float, int]
         raise TypeError(
             f"{name} must be (start m, stop m, count), got {validate.shown(axis)}"
         ) from None
-    start = validate.number(f"{name} start", start, "m")
-    stop = validate.number(f"{name} stop", stop, "m")
+    start, stop = _coordinate(f"{name} start", start), _coordinate(f"{name} stop", stop)
     count = validate.count(f"{name} count", count)
     validate.memory(f"{name} count", 8 * count)
     if count == 1:
@@ -464,7 +469,7 @@ def _axis(name: str, axis: tuple[float, float, int]) -> tuple[float, float, int]
             )
         return start, 0.0, count
     step = (stop - start) / (count - 1)
-    if step == 0 or not math.isfinite(step):  # the distance may exceed float64
+    if step == 0:
         raise ValueError(
             f"{name} must start and stop at different positions, got {count} pixels from {start} m "
             f"to {stop} m"

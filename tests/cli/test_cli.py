@@ -556,7 +556,7 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (
             ["image", "lines.h5", *GRID, "-o", "new.h5", "--png", "a", "--dynamic-range-db", "-5"],
             2,
-            "dynamic_range_db must be finite and > 0 dB, got -5",
+            "dynamic_range_db must be finite and > 0 and <= 2000 dB, got -5",
         ),
         (
             ["image", "lines.h5", "--x", "0:1:1000000", "--y", "0:1:1000000", "-o", "new.h5"],

@@ -1,4 +1,3 @@
-import csv
 import dataclasses
 import json
 from importlib.machinery import SourceFileLoader
@@ -7,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stored_tables import printed
 from studies import tables
 
 from clsas.sonar.beam import BeamWindow
@@ -105,14 +105,13 @@ def test_scaling_fits_exponents_and_writes_them(monkeypatch, tmp_path, capsys):
         return {"device": "abacus", "driver": "1.0", "speedup": 10 * n, **times, **figures}
 
     monkeypatch.setattr(bench, "run_factorized", measured)
-    tables.scaling(None, 1024, tmp_path / "s.csv", tmp_path / "s.png")
+    tables.scaling(None, 1024, tmp_path / "s.png")
     told = capsys.readouterr().out
     assert "N^2.00 (factorized), N^3.00 (exact)" in told
-    assert "| 1024 | 1.6 | 64 |" in told
-    with open(tmp_path / "s.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["N"] for row in rows] == ["256", "512", "1024"]
-    assert float(rows[1]["exact_s"]) == 8
+    ((header, rows),) = printed(told)
+    assert [row[0] for row in rows] == ["256", "512", "1024"]
+    assert [float(row[header.index("factorized_s")]) for row in rows] == [0.1, 0.4, 1.6]
+    assert [float(row[header.index("exact_s")]) for row in rows] == [1, 8, 64]
     assert (tmp_path / "s.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -19,7 +19,8 @@ from clsas.core.extras import is_installed
 from clsas.planning.costs import Costs
 
 RESULTS = (
-    "Assessment", "Autofocus", "Calibration", "Effect", "Finding", "Inspection", "Micronavigation",
+    "Assessment", "Autofocus", "Calibration", "Effect", "Finding", "Inspection", "Limit", "Limits",
+    "Micronavigation",
     "Mosaic", "Patch", "PhaseSign", "Plan", "Processed", "Tradeoff",
 )  # fmt: skip
 """Classes whose constructors check nothing, since only clsas calls them."""
