@@ -25,8 +25,8 @@ from clsas.planning.costs import Costs
 from clsas.sonar.system import line_array
 
 TOLERANCE_DB = -40.0
-POINTS = 200
-WORK = 1.2e10  # most pairs of pixels and channels of a case: an exact image of 7 s
+POINTS = 50
+WORK = 6e9  # most pairs of pixels and channels of a case: an exact image of 4 to 8 s
 LINES = 3e8  # most samples of all lines of a case
 EXACT_IS_SLOW = Costs(pixel_ns=1e4, point_ns=1e4)  # so that every image is factorized
 
