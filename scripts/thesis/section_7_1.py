@@ -28,6 +28,7 @@ TOLERANCE_DB = -40.0
 POINTS = 50
 WORK = 6e9  # most pairs of pixels and channels of a case: an exact image of 4 to 8 s
 LINES = 3e8  # most samples of all lines of a case
+PER_SPEED_UP = 35.0  # channels per pixel for each time by which factorized images are faster
 EXACT_IS_SLOW = Costs(pixel_ns=1e4, point_ns=1e4)  # so that every image is factorized
 
 
@@ -293,23 +294,31 @@ def main() -> None:
 
 
 def draw(rows: Sequence[dict[str, object]], sweeps: Sequence[str], out: chapter5.Output) -> None:
-    """Draw the speed-up over the channels per pixel, a panel for each sweep."""
+    """Draw the speed-up over the channels per pixel, or over what is varied at equal ones."""
     figure = chapter5.figure(11, 6.5)
-    panels = np.ravel(figure.subplots(2, 3, sharex=True, sharey=True))
+    panels = np.ravel(figure.subplots(2, 3, sharey=True))
     for sweep, axes in zip(sweeps, panels, strict=False):
+        per_pixel = sweep in ("beam width", "range over aperture")
+        ticks = set()
         for system in SYSTEMS:
             some = [r for r in rows if (r["varied"], r["system"]) == (sweep, system.name)]
-            axes.loglog(
-                [float(r["per pixel"]) for r in some],
-                [float(r["speed-up"]) for r in some],
-                "o-",
-                label=system.name,
-                markersize=4,
-            )
+            x = [float(r["per pixel"] if per_pixel else str(r["value"]).split()[0]) for r in some]
+            if sweep == "carrier":
+                x = [each / system.carrier_hz for each in x]
+            ticks |= set(x)
+            speed_up = [float(r["speed-up"]) for r in some]
+            axes.loglog(x, speed_up, "o-", label=system.name, markersize=4)
+        if per_pixel:
+            channels = np.array([PER_SPEED_UP, 100 * PER_SPEED_UP])
+            axes.loglog(channels, channels / PER_SPEED_UP, "k--", label=f"N/{PER_SPEED_UP:g}")
+        else:
+            axes.set_xticks(sorted(ticks), [f"{each:g}" for each in sorted(ticks)])
+            axes.minorticks_off()
         axes.axhline(1.0, color="grey", linestyle=":")
         axes.set_title(f"varied: {sweep}", fontsize="medium")
+        label = "carrier over the system's own" if sweep == "carrier" else sweep
+        axes.set_xlabel("N, channels whose beam touches a pixel" if per_pixel else label)
         axes.grid(alpha=0.3)
-    figure.supxlabel("Channels whose beam touches a pixel")
     figure.supylabel("Time of the exact image over that of the factorized one, both at -40 dB")
     panels[0].legend(fontsize="small")
     chapter5.save(figure, out, "section_7_1", dpi=90)
