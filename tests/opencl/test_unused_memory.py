@@ -5,8 +5,12 @@ from functools import cache
 import numpy as np
 import pyopencl as cl
 import pytest
+from dense import scene
+from factorizing import EXACT_IS_SLOW
 
 from clsas.opencl.device import Device
+from clsas.planning.factorize import factorize
+from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import extremes, selftest
 from clsas.trials.extremes import along_x
@@ -55,4 +59,20 @@ def test_what_unused_memory_holds_does_not_matter(name, imager, asked_db, device
     found = selftest.form(imager, known, asked_db, device).pixels
     assert filled
     assert known.error_db(found) <= asked_db
+    assert found.tobytes() == wanted.tobytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tolerance_db", [-25, -60])
+@pytest.mark.parametrize("name", ["helix", "planar"])
+def test_nor_does_it_for_a_sheet_of_channels(name, tolerance_db, platform, poison):
+    """Stages of sheets add to lines that they have set to zero themselves."""
+    lines, grid = scene(name)
+    options = {"tolerance_db": tolerance_db, "device": platform, "costs": EXACT_IS_SLOW}
+    chosen = plan(lines, grid, **options)
+    assert chosen.factorization.aperture.shape == "sheet"
+    wanted = factorize(lines, grid, chosen, device=platform).pixels
+    filled = poison()
+    found = factorize(lines, grid, chosen, device=platform).pixels
+    assert filled
     assert found.tobytes() == wanted.tobytes()
