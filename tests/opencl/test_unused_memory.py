@@ -65,14 +65,13 @@ def test_what_unused_memory_holds_does_not_matter(name, imager, asked_db, device
 @pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-25, -60])
 @pytest.mark.parametrize("name", ["helix", "planar"])
-def test_nor_does_it_for_a_sheet_of_channels(name, tolerance_db, platform, poison):
+def test_nor_does_it_for_a_sheet_of_channels(name, tolerance_db, poison):
     """Stages of sheets add to lines that they have set to zero themselves."""
     lines, grid = scene(name)
-    options = {"tolerance_db": tolerance_db, "device": platform, "costs": EXACT_IS_SLOW}
-    chosen = plan(lines, grid, **options)
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=EXACT_IS_SLOW)
     assert chosen.factorization.aperture.shape == "sheet"
-    wanted = factorize(lines, grid, chosen, device=platform).pixels
+    wanted = factorize(lines, grid, chosen).pixels
     filled = poison()
-    found = factorize(lines, grid, chosen, device=platform).pixels
+    found = factorize(lines, grid, chosen).pixels
     assert filled
     assert found.tobytes() == wanted.tobytes()
