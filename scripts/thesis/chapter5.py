@@ -43,6 +43,13 @@ GUARD_M = 25e-3  # distance from the point beyond which a side lobe counts as fa
 WIDTH, PSLR_DB, LOSS_DB = 1.2, 3.0, 3.0  # how much worse than the exact image a usable one may be
 
 
+def square(side_m: float, pixels: int, nearest_m: float) -> clsas.Grid:
+    """Return the pixels of a square beside the middle of the track, from a range on."""
+    half = (side_m - side_m / pixels) / 2
+    middle = nearest_m + side_m / 2
+    return clsas.Grid.plane((-half, half, pixels), (middle - half, middle + half, pixels))
+
+
 @dataclass(frozen=True)
 class Scene:
     """Reflectors, their lines and their image.
@@ -72,11 +79,7 @@ class Scene:
     @cached_property
     def grid(self) -> clsas.Grid:
         """Grid of the image."""
-        half = (self.side_m - SIDE_M / PIXELS) / 2
-        middle = NEAREST_M + self.side_m / 2
-        return clsas.Grid.plane(
-            (-half, half, self.pixels), (middle - half, middle + half, self.pixels)
-        )
+        return square(self.side_m, self.pixels, NEAREST_M)
 
     @property
     def point_m(self) -> tuple[float, float]:

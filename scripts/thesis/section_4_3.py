@@ -43,11 +43,7 @@ class NearScene:
     @cached_property
     def grid(self) -> clsas.Grid:
         """Grid of the image."""
-        half = (self.side_m - SIDE_M / PIXELS) / 2
-        middle = NEAREST_M + self.side_m / 2
-        return clsas.Grid.plane(
-            (-half, half, self.pixels), (middle - half, middle + half, self.pixels)
-        )
+        return chapter5.square(self.side_m, self.pixels, NEAREST_M)
 
     def lines(self, positions_m: np.ndarray, amplitudes: np.ndarray) -> clsas.RangeLines:
         """Return the lines of some points."""

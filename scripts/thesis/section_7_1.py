@@ -55,6 +55,8 @@ class System:
         Receivers per ping, as far apart as two phase centres.
     aperture_m : float or None
         Length of the track, if it is shorter than the beam would allow.
+    azimuth_m : float or None
+        Size of a pixel along azimuth, if it does not follow from the resolution.
     """
 
     name: str
@@ -68,6 +70,7 @@ class System:
     pixel: float = 0.5
     receivers: int = 1
     aperture_m: float | None = None
+    azimuth_m: float | None = None
 
     @property
     def wavelength_m(self) -> float:
@@ -90,8 +93,9 @@ class System:
     @property
     def sides_m(self) -> tuple[float, float]:
         """Extent of the scene in azimuth and in range."""
-        along_m, across_m = (self.pixels * self.pixel * each_m for each_m in self.resolutions_m)
-        return along_m, min(across_m, 1.6 * self.range_m)
+        azimuth_m, across_m = (self.pixel * each_m for each_m in self.resolutions_m)
+        along_m = self.pixels * (self.azimuth_m or azimuth_m)
+        return along_m, min(self.pixels * across_m, 1.6 * self.range_m)
 
     @property
     def track_m(self) -> float:
@@ -140,7 +144,7 @@ class System:
 
     @property
     def is_possible(self) -> bool:
-        """True if the scene lies in front of the track and the case is not too large."""
+        """True if the image and the lines are not too large."""
         along_m, across_m = self.sides_m
         far_m = math.hypot(self.range_m + across_m / 2, (self.track_m + along_m) / 2)
         extent = 2.5 * self.bandwidth_hz * (far_m - self.range_m + across_m / 2) / self.speed_m_s
@@ -204,28 +208,12 @@ def receivers(system: System) -> Iterator[tuple[str, System]]:
 
 def frequencies(system: System) -> Iterator[tuple[str, System]]:
     """Yield the system at other frequencies, all else but the resolution in azimuth the same."""
-    size = system.pixel * system.resolutions_m[0]
+    azimuth_m = system.pixel * system.resolutions_m[0]
     for factor in (0.25, 0.5, 1, 2, 4):
-        other = replace(system, carrier_hz=factor * system.carrier_hz)
-        if other.carrier_hz > other.bandwidth_hz:
-            yield f"{other.carrier_hz:.3g} Hz", _FixedPixels(**vars_of(other), azimuth_m=size)
-
-
-def vars_of(system: System) -> dict[str, object]:
-    """Return the fields of a system."""
-    return {name: getattr(system, name) for name in System.__dataclass_fields__}
-
-
-@dataclass(frozen=True)
-class _FixedPixels(System):
-    """A system whose pixels measure `azimuth_m` along azimuth, whatever its resolution."""
-
-    azimuth_m: float = 0.0
-
-    @property
-    def sides_m(self) -> tuple[float, float]:
-        """Extent of the scene in azimuth and in range."""
-        return self.pixels * self.azimuth_m, super().sides_m[1]
+        carrier_hz = factor * system.carrier_hz
+        if carrier_hz > system.bandwidth_hz:
+            other = replace(system, carrier_hz=carrier_hz, azimuth_m=azimuth_m)
+            yield f"{carrier_hz:.3g} Hz", other
 
 
 SWEEPS: dict[str, Callable[[System], Iterator[tuple[str, System]]]] = {
