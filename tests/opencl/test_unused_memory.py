@@ -6,7 +6,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 from dense import scene
-from factorizing import EXACT_IS_SLOW
+from factorizing import EXACT_IS_SLOW, changed
 
 from clsas.opencl.device import Device
 from clsas.planning.factorize import factorize
@@ -66,7 +66,7 @@ def test_what_unused_memory_holds_does_not_matter(name, imager, asked_db, device
 @pytest.mark.parametrize("tolerance_db", [-25, -60])
 @pytest.mark.parametrize("name", ["helix", "planar"])
 def test_nor_does_it_for_a_sheet_of_channels(name, tolerance_db, poison):
-    """Stages of sheets add to lines that they have set to zero themselves."""
+    """Lines between stages are zero when they are made; the next test is about those."""
     lines, grid = scene(name)
     chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=EXACT_IS_SLOW)
     assert chosen.factorization.aperture.shape == "sheet"
@@ -75,3 +75,15 @@ def test_nor_does_it_for_a_sheet_of_channels(name, tolerance_db, poison):
     found = factorize(lines, grid, chosen).pixels
     assert filled
     assert found.tobytes() == wanted.tobytes()
+
+
+@pytest.mark.parametrize("tolerance_db", [-40, -60])
+def test_lines_that_an_earlier_batch_left_do_not_matter(tolerance_db):
+    """Stages of sheets add to lines that they set to zero, which roots formed before have used."""
+    lines, grid = scene("helix")
+    chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=EXACT_IS_SLOW)
+    assert chosen.factorization.aperture.shape == "sheet"
+    assert chosen.factorization.roots_at_once > 1
+    one_by_one = changed(chosen, roots_at_once=1, roots_prepared=1)
+    wanted = factorize(lines, grid, chosen).pixels
+    assert factorize(lines, grid, one_by_one).pixels.tobytes() == wanted.tobytes()
