@@ -292,9 +292,11 @@ def _surfaces(offset_m: NDArray[np.float64]) -> Iterator[_Surface]:
     if length_m[1] <= _FLAT * length_m[0]:
         return
     yield _Surface(axes)
+    # Channels in a plane form no ring. Around an axis in this plane they appear at two angles only,
+    # and a sheet that is fitted to both collapses to a curve between them.
+    if length_m[2] <= _FLAT * length_m[0]:
+        return
     for order in ((0, 1, 2), (1, 2, 0)):
-        if length_m[order[2]] <= _FLAT * length_m[0]:
-            continue
         # The circle of least squares: x^2 + y^2 = 2 a x + 2 b y + c.
         turned = axes[list(order)]
         one, other, _ = turned @ offset_m.T

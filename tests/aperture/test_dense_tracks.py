@@ -46,6 +46,14 @@ def test_a_closed_ring_meets_at_its_cut():
     np.testing.assert_allclose(ends_m[0], ends_m[1], atol=1e-5)
 
 
+def test_a_sheet_of_two_headings_in_a_plane_is_flat_and_as_wide_everywhere():
+    passes = [np.linspace([-1, y, 0], [1, y + 0.4, 0], 200) for y in (-0.5, 0.5)]
+    found = sheet(lines_at(np.concatenate(passes)), WAVELENGTH)
+    along, across = np.meshgrid(np.linspace(0, 1, 30), np.linspace(0, 1, 5))
+    width_m = np.linalg.norm(found.sheet.sideways_m(along, across), axis=-1)
+    assert width_m.min() > 0.9 * width_m.max()
+
+
 def test_channels_on_a_line_have_no_sheet():
     tx_m = np.linspace([0, 0, 0], [5, 1, 0], 400)
     assert sheet(lines_at(tx_m), WAVELENGTH) is None

@@ -9,6 +9,7 @@ from judging import images_of
 MISSED = (
     ("beam's edge", 40979, -30),
     ("dense, narrow, apart", 2131, -40),
+    ("dense, narrow, apart", 9007, -50),
     ("apart, narrow", 5025, -20),
     ("apart, narrow", 5061, -15),
     ("moving", 5008, -20),
