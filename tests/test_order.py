@@ -25,6 +25,7 @@ def generators(tree):
                     yield statement.lineno
 
 
+@pytest.mark.slow
 def test_no_module_shares_a_random_generator():
     found = [
         f"{path.relative_to(TESTS)}:{line}"

@@ -138,6 +138,7 @@ print({sorted(optional)}, [n for n in {sorted(optional)} if importlib.util.find_
     assert told.stderr.startswith("Error: click is not installed, and is needed for the command")
 
 
+@pytest.mark.slow
 def test_images_of_arrays_need_numpy_scipy_and_pyopencl_alone():
     done = in_core(IMAGING)
     assert done.returncode == 0, done.stderr
@@ -169,6 +170,7 @@ for name in clsas.__all__:
     assert "'zarr>=" in said["mosaic"]
 
 
+@pytest.mark.slow
 def test_calls_say_what_to_install():
     calls = {
         "plan.to_json()": "pydantic is not installed, and is needed for plans as JSON: ",

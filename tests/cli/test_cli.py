@@ -226,6 +226,7 @@ def test_an_image_of_zeros_has_no_predicted_error(made, tmp_path, method):
     assert results["predicted_error_db"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [("--tolerance-db", -40), ("--exact",)])
 def test_a_grid_on_the_wrong_side_is_a_warning_with_the_options_meant(made, tmp_path, method):
     folder, _ = made
@@ -237,6 +238,7 @@ def test_a_grid_on_the_wrong_side_is_a_warning_with_the_options_meant(made, tmp_
     assert run(*image, *meant.split(), *method)[1] == ""
 
 
+@pytest.mark.slow
 def test_stages_that_leave_no_image_are_a_warning(made, tmp_path):
     scene = ("--scene", made[0] / "scene.toml")
     for command in (("image", "-o", tmp_path / "image.h5"), ("plan",)):
@@ -430,6 +432,7 @@ def test_a_broken_sampling_limit_is_a_warning(made, tmp_path):
     assert stderr.startswith("Warning: phase centres are up to 20 mm")
 
 
+@pytest.mark.slow
 def test_limits_of_a_scene(tmp_path):
     scene = tmp_path / "scene.toml"
     scene.write_bytes(built_in_scene("thesis_wide_beam"))

@@ -140,6 +140,7 @@ def test_processes_of_this_machine(made, tmp_path):
     np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.slow
 def test_a_folder_that_has_ended(made, tmp_path):
     folder = tmp_path / "survey"
     folder.mkdir()

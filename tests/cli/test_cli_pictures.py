@@ -41,6 +41,7 @@ def test_the_suffix_decides_the_format(folder, option, name, start):
     assert (folder / name).read_bytes().startswith(start)
 
 
+@pytest.mark.slow
 def test_levels_and_colours_of_an_image(folder, figures):
     run("image", "lines.h5", *GRID, "-o", "a.h5", "--picture", "a.png", "--dynamic-range-db", 30)
     run(
@@ -72,6 +73,7 @@ def test_bad_levels_and_colours_are_refused_before_any_work(folder, options, wor
     assert {path.name for path in folder.iterdir()} == {"lines.h5", "scene.toml"}
 
 
+@pytest.mark.slow
 def test_borders_of_patches_on_request(folder, figures):
     pytest.importorskip("zarr")
     command = ("mosaic", "scene.toml", "--lines", "lines.h5", "--patches", "2x3")
@@ -80,6 +82,7 @@ def test_borders_of_patches_on_request(folder, figures):
     assert [len(figure.axes[0].get_lines()) for figure in figures] == [0, 3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["image", "mosaic"])
 def test_grids_of_scene_files(folder, command):
     """Slanted planes and height maps, as the library makes them."""

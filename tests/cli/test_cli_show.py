@@ -93,6 +93,7 @@ def test_every_kind_is_drawn_beside_its_file(folder, figures, name, kind, axes, 
     assert any(bar in text for text in names) if bar else not any("dB" in text for text in names)
 
 
+@pytest.mark.slow
 def test_a_recording_of_another_kind_is_drawn(folder, figures):
     pytest.importorskip("sarkit")
     clsas.save("lines.cphd", LINES)
@@ -113,6 +114,7 @@ def test_axes_are_in_metres_and_equal_lengths_look_equal(folder, figures):
     assert level.max() == 0
 
 
+@pytest.mark.slow
 def test_levels_and_colours(folder, figures):
     run("image.h5", "--db", 30, "--percentile", 50, "--colours", "sonar")
     run("lines.h5", "--dynamic-range-db", 40, "--percentile", 90, "--colour-map", "gray")
@@ -137,6 +139,7 @@ def test_an_image_of_zeros_is_drawn_at_every_percentile(folder):
     assert Path("zero.png").exists()
 
 
+@pytest.mark.slow
 def test_the_part_around_a_position(folder, figures):
     run("image.h5", "--near", "0.5,20.5", "--extent-m", 0.2)
     run("image.h5", "--near", "0.5,20.5,0", "--extent-m", 0.2)
@@ -185,6 +188,7 @@ def store(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_mosaic_and_a_part_of_it(store, figures):
     assert run(store, "--json")
     assert store.with_name("image.png").read_bytes().startswith(b"\x89PNG")
@@ -196,6 +200,7 @@ def test_a_mosaic_and_a_part_of_it(store, figures):
     assert "must not lie in the store" in run(store, "-o", store / "a.png", code=2)
 
 
+@pytest.mark.slow
 def test_a_mosaic_is_read_patch_by_patch(store, monkeypatch):
     """So one larger than memory is drawn as well."""
     read, sizes = clsas.Store.read, []

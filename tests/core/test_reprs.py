@@ -130,6 +130,7 @@ def test_plans_are_short_however_many_filters_they_have():
             assert cell.strip() in page
 
 
+@pytest.mark.slow
 def test_everything_that_comes_with_a_result_is_short():
     grid = clsas.Grid.plane(x=(-0.1, 0.1, 101), y=(42.4, 42.6, 101))
     track = clsas.Track.straight((-2.376, 0, 0), (2, 0, 0), 10, 0.264)

@@ -29,7 +29,7 @@ def small(platform):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["plane", "points"])
 def test_an_image_in_bands_is_the_same_bit_for_bit(platform, small, kind):
-    grid = patch(1.3, 42, 100, 90)
+    grid = patch(1.3, 42, 50, 45)
     lines = thesis_lines(grid, APERTURE[::16])
     if kind == "points":
         grid = Grid.points(grid.positions_m())

@@ -148,6 +148,7 @@ def test_leaves_are_visible_from_wherever_they_are_alone():
 # Shifts and phases of raw channels
 
 
+@pytest.mark.slow
 def test_references_are_ranges_and_phases(wide):
     lines, resampling = wide.lines, wide.factorization.resampling
     sector = sector_of(wide, wide.division.roots[:3])

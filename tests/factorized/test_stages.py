@@ -405,6 +405,7 @@ def test_spikes_keep_the_tolerance(wild, tolerance_db):
     assert relative_error_db(factorize(lines, grid, chosen), reference) <= tolerance_db
 
 
+@pytest.mark.slow
 def test_a_height_map_is_its_points(platform):
     lines, grid = made(hills)
     points = Grid.points(np.random.default_rng(0).permutation(grid.positions_m().reshape(-1, 3)))
@@ -418,6 +419,7 @@ def test_a_height_map_is_its_points(platform):
     assert relative_error_db(of_points[order], of_map[same]) <= -57
 
 
+@pytest.mark.slow
 def test_a_flat_height_map_is_a_plane(platform):
     lines, grid = made(straight)
     flat = grid.with_height(np.zeros(grid.shape))
@@ -659,6 +661,7 @@ def test_faint_echoes_next_to_strong_ones_are_kept(platform):
 # Plans that are reused
 
 
+@pytest.mark.slow
 def test_a_plan_from_text_gives_the_same_image(platform):
     chosen = planned(arc, -50)
     again = Plan.from_json(chosen.to_json())

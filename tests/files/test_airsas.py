@@ -98,6 +98,7 @@ def test_points_focus_where_they_are(still, point_m):
     assert peak == pytest.approx(1.0, abs=0.06)
 
 
+@pytest.mark.slow
 def test_a_drifting_temperature_is_made_good(tmp_path, still):
     drifting = clsas.load(scene(tmp_path, drift_c=6.0, header=False))
     steady, found = (image_of(each).pixels for each in (clsas.load(still), drifting))

@@ -289,6 +289,7 @@ def test_the_command_converts_both_ways_and_images(tmp_path, capsys):
     assert run("convert", tmp_path / "lines.h5", tmp_path / "lines.h5") == 2
 
 
+@pytest.mark.slow
 def test_without_sarkit_the_message_says_how_to_install_it(tmp_path):
     (tmp_path / "pass.cphd").write_bytes(b"CPHD/1.1.0\n" + bytes(200))
     program = f"""

@@ -119,6 +119,7 @@ def geometries(imager):
     return (straight, *{"exact": (anywhere,), "factorized": (array,)}.get(imager.name, ()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("bound", "geometry"), pairs(geometries))
 def test_imaging_is_the_adjoint_of_simulation(bound, geometry):
     """<A x, y> = <x, A^H y>, with A from amplitudes to lines of a flat band.
@@ -155,6 +156,7 @@ def test_imaging_is_the_adjoint_of_simulation(bound, geometry):
     assert abs(left - right) <= 10 ** (bound[0].asked_db / 20) * size
 
 
+@pytest.mark.slow
 @every_imager
 def test_a_point_keeps_its_amplitude_and_phase(bound):
     amplitude = 3 * np.exp(1.1j)

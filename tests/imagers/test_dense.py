@@ -61,6 +61,7 @@ def test_an_image_keeps_its_tolerance(name, tolerance_db):
     assert_keeps(chosen, relative_error_db(factorize(*scene(name), chosen), exact(name)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-25, -40])
 def test_errors_on_a_sheet_are_predicted_within_3_db(tolerance_db):
     """Filters of few taps err with a bias that adds up from stage to stage; others do not."""
@@ -69,6 +70,7 @@ def test_errors_on_a_sheet_are_predicted_within_3_db(tolerance_db):
     assert abs(error_db - chosen.predicted_error_db) < 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["jittered helix", "planar", "passes"])
 def test_so_it_does_off_the_plane_and_with_separate_or_moving_receivers(name, kind):
@@ -92,6 +94,7 @@ def on_carrier(name):
     return lines_over(grid, tx, carrier_hz=0.0, step_m=348.9 / 2e5, **band), grid
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-50, -60])
 @pytest.mark.parametrize("name", ["rings", "helix"])
 def test_rings_and_helices_keep_their_tolerance_on_their_carrier(name, tolerance_db):
@@ -103,6 +106,7 @@ def test_rings_and_helices_keep_their_tolerance_on_their_carrier(name, tolerance
     assert error_db <= chosen.predicted_error_db
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["helix", "passes"])
 def test_the_oracle_agrees(name):
     """Random pixels against sums in float64 that share nothing with the imagers."""
@@ -205,11 +209,13 @@ def test_virtual_channels_are_as_many_as_predicted(name):
         assert stage.channels == pytest.approx(counts[counts > 0].mean(), rel=0.25)
 
 
+@pytest.mark.slow
 def test_turns_of_a_helix_that_lie_above_each_other_are_held_in_half_precision():
     """Many channels at the same angle are no crowd: each is in a row of its own."""
     assert planned("helix", -40).half_precision == open_device().info.half_precision
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["helix", "planar", "passes"])
 def test_channels_may_be_shuffled(name):
     lines, grid = scene(name)
@@ -223,6 +229,7 @@ def test_channels_may_be_shuffled(name):
     assert relative_error_db(image, factorize(lines, grid, ordered)) <= -57
 
 
+@pytest.mark.slow
 def test_a_plan_holds_the_shape_of_the_aperture():
     for name in ("helix", "passes"):
         lines, grid = scene(name)
@@ -246,6 +253,7 @@ def test_a_plan_of_another_shape_is_refused(name, shape):
         factorize(line, grid, changed(chosen, aperture=aperture))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "beam"),
     [
@@ -272,6 +280,7 @@ def test_memory_is_as_predicted(name, beam, monkeypatch):
             assert used <= 1.02 * chosen.memory_bytes + (1 << 16)
 
 
+@pytest.mark.slow
 def test_samples_that_no_pixel_needs_are_not_upsampled():
     lines, grid = scene("helix")
     longer = dataclasses.replace(
@@ -283,6 +292,7 @@ def test_samples_that_no_pixel_needs_are_not_upsampled():
     assert relative_error_db(factorize(longer, grid, chosen), exact("helix")) < -39.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "permute"), [(1, False), (4, False), (8, True)])
 @pytest.mark.parametrize("name", ["helix", "passes"])
 def test_devices_of_any_width_agree(name, width, permute):

@@ -64,6 +64,7 @@ def moved(lines, change):
     return replace(lines, tx_m=position_m, rx_m=position_m)
 
 
+@pytest.mark.slow
 def test_a_clean_recording_has_no_findings(lines, echoes, platform):
     found = clsas.inspect(lines, GRID, beam=BEAM, device=platform)
     assert found.findings == ()
@@ -90,6 +91,7 @@ def test_a_grid_behind_the_elements_is_found(lines):
     assert "grid_behind" not in unknown
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("look", "looks", "row"),
     [
@@ -136,6 +138,7 @@ SAMPLES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("defect", SAMPLES)
 def test_defects_of_samples_are_found(lines, defect):
     plant, wanted, words = SAMPLES[defect]
@@ -145,6 +148,7 @@ def test_defects_of_samples_are_found(lines, defect):
         assert word in found.describe()
 
 
+@pytest.mark.slow
 def test_the_remedy_of_a_background_leaves_nothing_to_find(lines):
     found = clsas.inspect(with_samples(lines, common).without_background("median"))
     assert names(found) == []
@@ -170,6 +174,7 @@ def test_a_constant_of_the_recorder_is_found_on_its_frequency():
     assert "offset" not in clsas.inspect(cleaned)
 
 
+@pytest.mark.slow
 def test_echoes_are_clipped_where_their_parts_are(echoes):
     samples = np.array(echoes.samples)
     ceiling = 0.4 * np.abs(samples[7].real).max()
@@ -196,6 +201,7 @@ def test_quantised_samples_are_not_clipped():
     assert levels_of(strong, magnitudes=False)[1].all()
 
 
+@pytest.mark.slow
 def test_a_receiver_that_is_dead_in_every_ping_is_named(lines):
     def weaken(samples):
         samples[2::4] *= 0.01
@@ -216,6 +222,7 @@ def halting(position_m):
     return position_m
 
 
+@pytest.mark.slow
 def test_pings_taken_standing_still(lines):
     found = clsas.inspect(moved(lines, halting))
     assert "still_pings" in found
@@ -227,6 +234,7 @@ def test_pings_taken_standing_still(lines):
     assert "still_pings" not in clsas.inspect(remedied)
 
 
+@pytest.mark.slow
 def test_a_long_halt_hides_what_the_moving_pings_show(lines, platform):
     """The remedy of the finding brings the targets back."""
 
@@ -244,6 +252,7 @@ def test_a_long_halt_hides_what_the_moving_pings_show(lines, platform):
     assert remedied_db == pytest.approx(clean_db, abs=0.1)
 
 
+@pytest.mark.slow
 def test_jitter_of_a_halt_is_no_motion(lines):
     def change(position_m):
         position_m = halting(position_m)
@@ -259,6 +268,7 @@ def test_gaps(lines):
     assert found["gaps"].value == pytest.approx(21 * ADVANCE_M)
 
 
+@pytest.mark.slow
 def test_pings_out_of_order(lines):
     order = np.arange(PINGS)
     order[[80, 82]] = 82, 80
@@ -268,6 +278,7 @@ def test_pings_out_of_order(lines):
     assert "sort the pings by time" in found["order"].remedy
 
 
+@pytest.mark.slow
 def test_shuffled_pings_are_out_of_order_and_nothing_else(lines):
     shuffled = lines.select(np.random.default_rng(0).permutation(PINGS))
     assert names(clsas.inspect(shuffled)) == ["order"]
@@ -278,6 +289,7 @@ def test_shuffled_pings_are_out_of_order_and_nothing_else(lines):
     assert shuffled.without_still_pings() is shuffled
 
 
+@pytest.mark.slow
 def test_noisy_positions_are_no_halts_and_no_gaps(lines):
     for jitter_m, wanted in ((0.01, ["order"]), (0.002, [])):
         noise_m = np.random.default_rng(0).normal(0, jitter_m, (PINGS, 3))
@@ -286,6 +298,7 @@ def test_noisy_positions_are_no_halts_and_no_gaps(lines):
         assert noisy.without_still_pings() is noisy
 
 
+@pytest.mark.slow
 def test_transmitters_that_alternate_fore_and_aft():
     """The receivers advance evenly, while phase centres jump to and fro."""
     platform_m = 0.1 * np.arange(60)
@@ -303,6 +316,7 @@ def test_positions_that_are_missing(lines):
     assert "all 200 pings were taken at one position" in found["still_pings"].message
 
 
+@pytest.mark.slow
 def test_ends_that_do_not_fade(lines):
     cut = replace(
         lines, samples=lines.samples[:, 160:300],
@@ -314,6 +328,7 @@ def test_ends_that_do_not_fade(lines):
     assert names(clsas.inspect(cut.tapered_ends(0.2))) == []
 
 
+@pytest.mark.slow
 def test_a_band_that_is_not_sampled_finely_enough(lines):
     coarse = replace(lines, samples=lines.samples[:, ::2], range_step_m=2 * lines.range_step_m)
     found = clsas.inspect(coarse)
@@ -321,12 +336,14 @@ def test_a_band_that_is_not_sampled_finely_enough(lines):
     assert found["oversampling"].value < 1.05
 
 
+@pytest.mark.slow
 def test_a_band_beyond_its_carrier(lines):
     found = clsas.inspect(replace(lines, range_step_m=lines.range_step_m / 1000))
     assert found["band"].value == pytest.approx(30e6, rel=0.05)
     assert "check units: range_step_m in metres" in found["band"].remedy
 
 
+@pytest.mark.slow
 def test_spacing_against_beam_grid_and_element(lines):
     sparse = lines.select(slice(None, None, 2))
     found = clsas.inspect(sparse, beam=BEAM)
@@ -427,6 +444,7 @@ def in_khz(lines, middle_hz, share=1.0):
     return replace(lines, samples=narrow.samples * np.exp(2j * np.pi * turns), carrier_hz=100.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("middle_hz", [0.0, 2.0, -40.0, 100.0, 300.0, -1000.0])
 def test_a_carrier_in_khz_is_found_wherever_the_band_is(lines, middle_hz):
     """The middle of a band about 0 Hz is chance, and so would be the wavelength there."""
@@ -440,6 +458,7 @@ def test_a_carrier_in_khz_is_found_wherever_the_band_is(lines, middle_hz):
     assert "carrier_hz in Hz (not kHz)" in narrow["advance"].remedy
 
 
+@pytest.mark.slow
 def test_echoes_before_their_transmission(lines, five_points):
     """Echoes at negative ranges are reported, but not lines that are silent there."""
     found = clsas.inspect(replace(lines, first_range_m=-5.0))
@@ -471,6 +490,7 @@ def test_a_grid_partly_beyond_the_lines(lines):
     assert "choose another grid" in found["grid_outside"].remedy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grid", [None, GRID])
 def test_a_phase_of_the_opposite_sign(lines, grid, platform):
     conjugate = replace(lines, samples=lines.samples.conj())
@@ -564,6 +584,7 @@ def test_a_track_about_the_scene_needs_a_grid(lines):
     assert "a grid is needed" in found.describe()
 
 
+@pytest.mark.slow
 def test_lines_of_zeros_and_short_recordings(lines):
     silent = clsas.inspect(with_samples(lines, lambda samples: samples.fill(0)))
     assert len(silent["dead_channels"].where) == PINGS
@@ -594,6 +615,7 @@ def test_samples_that_are_not_finite_are_refused_with_their_place(lines, tmp_pat
     assert "the first at [3, 120]" in result.stderr
 
 
+@pytest.mark.slow
 def test_arrays_moving_receivers_and_carriers(lines):
     tx_m = np.repeat(lines.tx_m[::2], 2, axis=0)
     rx_m = tx_m + np.tile([[0.1, 0, 0], [0.12, 0, 0]], (PINGS // 2, 1))
@@ -639,6 +661,7 @@ def test_runs_of_indices():
     assert runs(range(0, 100, 2)).endswith("22 and 38 more runs")
 
 
+@pytest.mark.slow
 def test_the_command(lines, tmp_path):
     recording, picture = tmp_path / "lines.h5", tmp_path / "lines.png"
     clsas.save(recording, moved(lines, halting))
@@ -689,6 +712,7 @@ def test_files_without_a_recording_are_refused(tmp_path):
         assert "got Image" in run.stderr
 
 
+@pytest.mark.slow
 def test_the_picture_has_units_and_marks(lines):
     pytest.importorskip("matplotlib")
     bad = moved(with_samples(lines, dead), halting).select(np.r_[0:160, 170:PINGS])

@@ -78,6 +78,7 @@ def test_the_thesis_narrow_beam_case(wreck):
     assert found.exceeded == ()
 
 
+@pytest.mark.slow
 def test_the_thesis_sensotek_case():
     """Chapter 6: 270 m at 1.5 m/s with an overlap of 1.33, 24 of 96 elements."""
     interval_s = 2 * 270 / 1500
@@ -99,6 +100,7 @@ def test_widths_are_those_that_the_demo_calls_theory(wide):
     assert 1e3 * wide["range_width_m"].value == pytest.approx(6.86, abs=0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("beam", "window"), [(None, "none"), (BeamWindow(6.0, "hann", squint_deg=1.0), "hamming")]
 )
@@ -136,6 +138,7 @@ def test_an_image_has_grating_lobes_where_they_are_predicted():
     assert "on the grid for some targets" in found["grating_lobe_m"].meaning
 
 
+@pytest.mark.slow
 def test_pings_that_leave_a_gap_cause_lobes_where_they_are_predicted():
     """An array of 8 receivers whose pings are 12 spacings apart instead of 8."""
     sonar = Sonar(Pulse(100e3, 1e3, 0.05), line_array(8, 0.1))
@@ -157,6 +160,7 @@ def test_pings_that_leave_a_gap_cause_lobes_where_they_are_predicted():
     assert amplitude.max() > 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beam", [None, BeamWindow(5.0, "hann")])
 def test_the_level_of_smeared_lobes_is_that_of_an_image(beam):
     """A band of 20 % and elements of 0.2 m lower the lobes by tens of decibels."""
@@ -174,6 +178,7 @@ def test_the_level_of_smeared_lobes_is_that_of_an_image(beam):
     assert level_db < -12
 
 
+@pytest.mark.slow
 def test_phase_centres_err_as_the_exact_geometry_does(wide):
     """Path to the point and back, for the outermost receiver, over the elements' beam."""
     apart_m, near_m = 31.5 * 16.5e-3, 40.0
@@ -190,6 +195,7 @@ def test_phase_centres_err_as_the_exact_geometry_does(wide):
     assert found["shift"].limit is None
 
 
+@pytest.mark.slow
 def test_motion_and_squint_enlarge_the_error_of_phase_centres(wide):
     error_m = wide["phase_centre_error_m"].value
     moving = clsas.limits(WIDE, TRACK, GRID, motion_in_flight=True)
@@ -246,6 +252,7 @@ def test_limits_agree_with_check_sampling(sonar, advance_m, interval_s):
             assert (found[name].value, found[name].limit) == pytest.approx(both, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_only_ranges_within_the_beam_count(wreck):
     """Corners of the grid lie 118 m from the farthest ping, but no ping sees them there."""
     scene, found = wreck
@@ -254,6 +261,7 @@ def test_only_ranges_within_the_beam_count(wreck):
     assert found["last_echo_s"].value == pytest.approx(2 * np.hypot(92, 20) / 1500 + 5e-3, rel=0.01)
 
 
+@pytest.mark.slow
 def test_recorded_ranges_must_contain_the_grid(wide):
     assert wide["recorded_from_m"].kept
     assert wide["recorded_to_m"].kept
@@ -262,6 +270,7 @@ def test_recorded_ranges_must_contain_the_grid(wide):
     assert short["recorded_to_m"].limit == pytest.approx(np.hypot(45, 2.5 + 2.64), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_coarse_pixels_miss_targets():
     coarse = clsas.limits(WIDE, TRACK, clsas.Grid.plane((-2.5, 2.5, 501), (40, 45, 1024)))
     assert "azimuth_pixel_m" in coarse.exceeded
@@ -303,6 +312,7 @@ def test_missing_parts_are_named(arguments, names, reason):
     assert found["range_resolution_m"].value == pytest.approx(7.5e-3)
 
 
+@pytest.mark.slow
 def test_every_result_is_given_or_missing(wide):
     names = set(LABELS)
     assert [each.name for each in wide.results] == list(LABELS)
@@ -343,6 +353,7 @@ def test_a_result_reads_well(wide):
         assert each.consequence or each.limit is None
 
 
+@pytest.mark.slow
 def test_unusual_geometries():
     one = Sonar(Pulse(100e3, 20e3, 1e-3), [[0, 0, 0]])
     rising = Track.straight([0, 0, 0], [0, 0, 0.1], 81, 1)

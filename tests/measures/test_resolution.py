@@ -5,6 +5,7 @@ import clsas
 from clsas.measures.resolution import azimuth_width_m, expected_resolution_m, range_width_m, view
 
 
+@pytest.mark.slow
 def test_a_plain_aperture():
     """Without beams and far off, lambda R/(2 L) and c/(2 B), 0.886 of them at -3 dB."""
     pulse = clsas.Pulse(carrier_hz=1e5, bandwidth_hz=5e3, duration_s=0.1)
@@ -17,6 +18,7 @@ def test_a_plain_aperture():
     assert range_width_m(sonar, "hamming") == pytest.approx(1.3 * 1500 / (2 * 5e3), rel=0.02)
 
 
+@pytest.mark.slow
 def test_many_channels_have_the_width_of_few():
     """More channels than are added up one by one, over the same aperture."""
     sonar = clsas.Sonar(clsas.Pulse(1e5, 5e3, 1e-3), [[0.0, 0, 0]], tx_length_m=0.2)
@@ -30,6 +32,7 @@ def test_many_channels_have_the_width_of_few():
     assert many == pytest.approx(few, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_long_tracks_do_not_shorten_the_width():
     """Side lobes of the elements extend the spectrum far beyond the main lobe."""
     sonar, point_m = clsas.Sonar.edgetech(), np.array([0, 60.0, 0])

@@ -71,6 +71,7 @@ def test_every_patch_has_its_own_pixels(exact):
     assert sorted(seen) == list(np.ndindex(2, 4))
 
 
+@pytest.mark.slow
 def test_patches_of_one_device_come_in_order(monkeypatch):
     """Even if several are finished before the caller takes the first."""
     monkeypatch.setattr(scheduling, "wait", lambda futures, timeout: set(wait(futures).done))
@@ -79,6 +80,7 @@ def test_patches_of_one_device_come_in_order(monkeypatch):
     assert patches == list(np.ndindex(6, 8))
 
 
+@pytest.mark.slow
 def test_a_store_holds_pixels_and_records(file, tmp_path, exact):
     mosaic = clsas.mosaic(file, GRID, tmp_path / "image.zarr", **REQUEST)
     assert len(mosaic) == 8
@@ -198,6 +200,7 @@ def test_a_normalising_beam(tmp_path):
         clsas.mosaic(tmp_path, GRID, **(REQUEST | {"beam": beam}))
 
 
+@pytest.mark.slow
 def test_height_maps_and_points():
     x, y = GRID.axes_m
     hill = 0.3 * np.exp(-(np.add.outer((y - 35) ** 2, x**2)))
@@ -261,6 +264,7 @@ def test_a_patch_that_no_channel_sees_is_empty_and_flagged(tmp_path):
         assert patch.record.predicted_error_db is None
 
 
+@pytest.mark.slow
 def test_missing_samples_are_flagged(file, tmp_path):
     with h5py.File(file, "r+") as lines:
         lines["samples"][20:24] = np.nan
@@ -328,6 +332,7 @@ def test_lost_pings_are_flagged():
 
 
 class TestOnceMore:
+    @pytest.mark.slow
     def test_what_the_store_has_is_not_formed_again(self, file, tmp_path, exact):
         mosaic = clsas.mosaic(file, GRID, tmp_path / "a.zarr", **REQUEST)
         running = iter(mosaic)
@@ -342,12 +347,14 @@ class TestOnceMore:
         assert not list(mosaic)
         assert relative_error_db(mosaic.image(), exact) < -65
 
+    @pytest.mark.slow
     def test_without_a_store_everything_is(self):
         mosaic = clsas.mosaic(LINES, GRID, **REQUEST)
         assert len(list(mosaic)) == len(list(mosaic)) == 8
 
 
 class TestResuming:
+    @pytest.mark.slow
     def test_what_is_finished_is_kept(self, file, tmp_path, exact):
         path = tmp_path / "image.zarr"
         running = iter(clsas.mosaic(file, GRID, path, **REQUEST))
@@ -364,6 +371,7 @@ class TestResuming:
         assert relative_error_db(Store.opened(path).image(), exact) < -65
         assert not list(clsas.mosaic(file, GRID, path, **REQUEST))
 
+    @pytest.mark.slow
     def test_the_image_has_what_was_there_and_what_was_not(self, tmp_path):
         path = tmp_path / "a.zarr"
         before = clsas.mosaic(LINES, GRID, path, **REQUEST).image()
@@ -434,6 +442,7 @@ class TestResuming:
             clsas.mosaic(change.pop("lines"), change.pop("grid"), tmp_path / "a.zarr", **change)
         assert len(Store.opened(tmp_path / "a.zarr").records()) == before
 
+    @pytest.mark.slow
     def test_a_store_without_a_finished_patch_may_be_deleted(self, tmp_path):
         """Only the user may delete it: another process may be about to write to it."""
         path = tmp_path / "a.zarr"
@@ -486,6 +495,7 @@ class TestResuming:
         with pytest.raises(ValueError, match="the range lines differ"):
             clsas.mosaic(changed, GRID, tmp_path / "a.zarr", **REQUEST)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("damage", ["removed", "cut"])
     def test_pixels_that_are_not_there_are_formed_again(self, tmp_path, damage):
         list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST))
@@ -523,6 +533,7 @@ class TestResuming:
             clsas.mosaic(LINES, GRID, tmp_path, **REQUEST)
         assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
 
+    @pytest.mark.slow
     def test_a_record_cut_off_is_formed_again(self, tmp_path):
         list(clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST))
         record = tmp_path / "a.zarr" / "patches" / "1.2" / "zarr.json"
@@ -686,6 +697,7 @@ class TestFollowing:
         assert formed[0][1] <= 800  # of 1200
         assert relative_error_db(Store.opened(path).image(), reference) < -65
 
+    @pytest.mark.slow
     def test_it_ends_when_nothing_comes(self, record, tmp_path):
         folder, add = record
         add(range(3))

@@ -30,6 +30,7 @@ def formed_elsewhere(mosaic):
     return pickle.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_a_mosaic_goes_to_another_process(platform):
     mosaic = clsas.mosaic(LINES, GRID, patches=(2, 2), device=open_device(platform.info.index))
     finished, image = formed_elsewhere(mosaic)
@@ -38,6 +39,7 @@ def test_a_mosaic_goes_to_another_process(platform):
     np.testing.assert_array_equal(image.grid.positions_m(), GRID.positions_m())
 
 
+@pytest.mark.slow
 def test_another_process_goes_on_with_the_store(tmp_path):
     clsas.save(tmp_path / "lines.h5", LINES)
     mosaic = clsas.mosaic(tmp_path / "lines.h5", GRID, tmp_path / "image.zarr", patches=(2, 2))
@@ -50,6 +52,7 @@ def test_another_process_goes_on_with_the_store(tmp_path):
     np.testing.assert_array_equal(image, clsas.Store.opened(tmp_path / "image.zarr").image())
 
 
+@pytest.mark.slow
 def test_a_mosaic_goes_to_a_worker_of_dask():
     pytest.importorskip("distributed")
     pytest.importorskip("cryptography")
@@ -61,6 +64,7 @@ def test_a_mosaic_goes_to_a_worker_of_dask():
     np.testing.assert_array_equal(image, mosaic.image())
 
 
+@pytest.mark.slow
 def test_a_mosaic_with_a_client_says_why_it_does_not_pickle(tmp_path):
     pytest.importorskip("distributed")
     pytest.importorskip("cryptography")

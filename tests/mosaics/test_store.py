@@ -116,6 +116,7 @@ def test_any_bit_of_a_record_is_found_or_plays_no_part(path, kept):
     check_repaired(path, kept)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["zarr.json", "pixels/zarr.json"])
 def test_any_bit_of_the_layout_is_found_or_plays_no_part(path, kept, name):
     chance = np.random.default_rng(2)
@@ -298,6 +299,7 @@ class TestCommand:
         assert result.stderr == f"Error: there is no mosaic: {tmp_path / 'a.zarr'}\n"
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:no pixel of the grid")
 def test_the_snippets_of_the_documentation_run_where_patches_are_unseen(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -239,6 +239,7 @@ def test_a_gap_of_the_track():
     assert abs(peak_db(found.lines, true.select(kept))) <= 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default::clsas.core.validate.ClsasWarning")
 @pytest.mark.parametrize("case", ["zeros", "beyond", "one pixel"])
 def test_nothing_to_focus_on(case):
@@ -256,6 +257,7 @@ def test_nothing_to_focus_on(case):
     np.testing.assert_array_equal(found.lines.tx_m, nominal.tx_m)
 
 
+@pytest.mark.slow
 def test_unknowns_that_cannot_be_distinguished():
     """At a single elevation angle, sway and heave change ranges alike."""
     course = (0, 0, 12.0), (STEP_M, 0, 0), PINGS, 1.0
@@ -267,6 +269,7 @@ def test_unknowns_that_cannot_be_distinguished():
         autofocus(lines, grid, unknowns=("sway", "heave"))
 
 
+@pytest.mark.slow
 def test_an_unknown_that_changes_no_range():
     _, nominal = recorded(points(), np.zeros(PINGS))
     with pytest.raises(ValueError, match="heave of 1 m changes it by"):

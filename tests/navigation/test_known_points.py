@@ -107,6 +107,7 @@ def test_every_reflector_is_focused_at_its_position(lines):
     assert np.abs(peaks_db(found.lines, lines)).max() < 0.1
 
 
+@pytest.mark.slow
 def test_no_reflector_is_focused_at_the_expense_of_others(lines):
     """The navigation drifts by 2 mm. The strongest point must not determine all corrections."""
     drift = 2e-3 * np.sin(np.arange(160) / 12)[:, None] * np.array([0, 1, 0])
@@ -172,6 +173,7 @@ def test_deviations_include_an_error_that_persists_along_the_track(lines):
     assert np.sqrt(np.mean(np.square(scaled))) > 0.2  # nor are they much too large
 
 
+@pytest.mark.slow
 def test_noise_is_no_reflector():
     """A few of many channels exceed any threshold by chance, and must not be used."""
     place_m = np.stack([0.01 * np.arange(640), np.zeros(640), np.zeros(640)], axis=1)
@@ -248,6 +250,7 @@ def test_receivers_of_an_array_that_move():
     assert (np.abs(errors(found)) < [SIZES[name] for name in UNKNOWNS]).all(), found
 
 
+@pytest.mark.slow
 def test_reflectors_are_not_mistaken_for_each_other(lines):
     """Two of the reflectors are 1.2 m apart in range, less than 50 resolution cells."""
     given = with_offsets(with_noise(lines, 40, np.random.default_rng(1)), passage(), TRUE)
@@ -287,6 +290,7 @@ def test_bad_input(lines):
         calibrate_track(silent, POINTS)
 
 
+@pytest.mark.slow
 def test_command(lines, tmp_path):
     given = with_offsets(lines, passage(), {"time_offset": 2e-4, "sound_speed": -10.0})
     source, corrected = tmp_path / "lines.h5", tmp_path / "corrected.h5"

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 import clsas
 from clsas.navigation.overlap import Array, moved
@@ -37,6 +38,7 @@ def test_known_points_keep_it():
     check(clsas.calibrate_track(late, points_m).lines, lines)
 
 
+@pytest.mark.slow
 def test_autofocus_keeps_it():
     points_m = np.random.default_rng(0).uniform([0.6, 9.5, 0], [2.4, 11, 0], (30, 3))
     sway_m = 3e-3 * np.sin(np.arange(150) / 20)

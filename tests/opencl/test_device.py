@@ -267,6 +267,7 @@ def test_kernels_are_built_once(platform):
     assert other is not kernel
 
 
+@pytest.mark.slow
 def test_nothing_is_built_for_a_kernel_that_is_there(platform, monkeypatch):
     options = OPTIONS | {"TAPS": 6}
     names = ("backproject_tiles", "expand_tiles", "backproject_points")

@@ -174,6 +174,7 @@ def test_the_table_of_bands_has_the_columns_that_kernels_read():
     assert len([name for name in columns if name.strip()]) == table.shape[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pyopencl.CompilerWarning")
 @pytest.mark.parametrize("name", OPTIONS)
 def test_parameters_are_those_that_the_compiler_finds(name, platform):

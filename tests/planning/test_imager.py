@@ -42,6 +42,7 @@ def test_later_images_are_those_of_new_imagers(scene, beam, platform):
         np.testing.assert_array_equal(imager(given).pixels, expected.pixels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [straight, hills])
 @pytest.mark.parametrize("beam", [None, BEAMS[0]], ids=["all", "beam"])
 def test_later_exact_images_are_those_of_backproject(scene, beam, platform):

@@ -523,6 +523,7 @@ def test_no_search_where_the_exact_image_is_formed_sooner(monkeypatch):
         plan(lines, grid, tolerance_db=-40, costs=Costs(), taps=(4, 4))
 
 
+@pytest.mark.slow
 def test_planning_with_a_beam_imports_nothing_slow():
     """scipy.signal takes longer to import than planning an image of any size."""
     code = """

@@ -157,6 +157,7 @@ def test_costs_that_cannot_be_stored_are_used_by_this_process(cache, measured, m
     assert len(measured) == 1
 
 
+@pytest.mark.slow
 def test_a_device_is_measured(platform):
     """Whatever the machine does meanwhile: factors are within the reach of known devices.
 

@@ -96,6 +96,7 @@ def test_labels_of_curves_and_geometry_do_not_overlap():
     check_labels(plot.range_lines(LINES, title="Lines"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("apart", [1.0, 0.1, 0.0])
 def test_labels_of_a_tradeoff_do_not_overlap(apart):
     rows = [
@@ -108,6 +109,7 @@ def test_labels_of_a_tradeoff_do_not_overlap(apart):
     check_labels(plot.tradeoff(measured, title="A case"))
 
 
+@pytest.mark.slow
 def test_the_suffix_decides_the_format(tmp_path):
     figure = plot.image_db(SPECKLE)
     for name, start in (
@@ -123,6 +125,7 @@ def test_the_suffix_decides_the_format(tmp_path):
     assert b"/Type3" not in pdf  # publishers refuse these fonts
 
 
+@pytest.mark.slow
 def test_the_same_picture_is_the_same_file(tmp_path):
     for suffix in ("png", "pdf", "svg"):
         files = [tmp_path / f"{k}.{suffix}" for k in range(2)]

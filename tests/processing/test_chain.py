@@ -204,6 +204,7 @@ def test_scene_and_folder_may_move_together(plain, tmp_path, monkeypatch):
     assert clsas.process("scene.toml").repeated == ()
 
 
+@pytest.mark.slow
 def test_a_killed_step_leaves_nothing_in_the_way(plain, monkeypatch):
     """The files of a step appear together when it is done."""
     folder, image = plain.with_suffix(""), steps_module.RUN["image"]
@@ -226,6 +227,7 @@ def test_a_killed_step_leaves_nothing_in_the_way(plain, monkeypatch):
     assert contents(folder) == before
 
 
+@pytest.mark.slow
 def test_what_was_finished_before_an_error_is_kept(scene):
     text = scene.read_text()
     scene.write_text(text + '[process.navigate]\nside = "starboard"\n')
@@ -240,6 +242,7 @@ def test_what_was_finished_before_an_error_is_kept(scene):
     assert clsas.process(scene).repeated == ("image",)
 
 
+@pytest.mark.slow
 def test_a_single_step_begins_with_the_lines_that_the_scene_corrects(scene):
     """Whether or not the corrections ran before, and whatever else the folder contains."""
     choose(scene, "inspect", "calibrate", "image")
@@ -256,6 +259,7 @@ def test_a_single_step_begins_with_the_lines_that_the_scene_corrects(scene):
     assert [step["name"] for step in record["steps"]] == ["inspect", "calibrate", "image"]
 
 
+@pytest.mark.slow
 def test_results_that_no_longer_belong_to_the_lines_are_named(scene):
     choose(scene, "calibrate", "image")
     folder = clsas.process(scene).folder
@@ -296,6 +300,7 @@ def test_usual_steps_and_warnings_of_inspection(scene):
     assert clsas.process(scene).repeated == ()  # without a warning
 
 
+@pytest.mark.slow
 def test_lines_and_echoes_in_memory(scene, tmp_path):
     lines = clsas.load(scene.parent / "lines.h5")
     choose(scene, "image")
@@ -307,6 +312,7 @@ def test_lines_and_echoes_in_memory(scene, tmp_path):
         _ = clsas.process(scene, lines=lines, steps=("calibrate",)).image
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [("image",), ("calibrate", "image")])
 def test_a_pickled_processing_holds_no_lines_of_files(scene, steps):
     choose(scene, *steps)
@@ -324,6 +330,7 @@ def test_a_pickled_processing_holds_lines_given_in_memory(scene):
     np.testing.assert_array_equal(read.lines.samples, lines.samples)
 
 
+@pytest.mark.slow
 def test_mosaic_continues(scene):
     pytest.importorskip("zarr")
     scene.write_text(scene.read_text() + "[mosaic]\npatches = [2, 2]\n")
@@ -363,6 +370,7 @@ def test_a_mosaic_of_another_recording_is_formed_anew(joining):
     assert not list(joining.with_suffix("").glob(".clsas-*"))
 
 
+@pytest.mark.slow
 def test_a_mosaic_of_other_options_is_formed_anew(joining):
     text = joining.read_text()
     for changed in ("tolerance_db = -30", "tolerance_db = -40"):
@@ -380,6 +388,7 @@ def test_a_mosaic_is_the_steps_own_from_any_working_directory(joining, monkeypat
     assert clsas.process(joining.name)["mosaic"].numbers["formed"] == 2
 
 
+@pytest.mark.slow
 def test_a_mosaic_that_the_step_did_not_make_is_not_replaced(joining, tmp_path):
     """Neither a store that existed before, nor one that took the place of the step's."""
     store = tmp_path / "elsewhere.zarr"
@@ -476,6 +485,7 @@ def test_bad_arguments(scene, tmp_path):
         clsas.process(scene, output=tmp_path / "grid.h5")
 
 
+@pytest.mark.slow
 def test_two_runs_in_one_folder_are_refused(plain, tmp_path, monkeypatch):
     """Otherwise the second would continue from the first one's lines, recorded as its own."""
     other = clsas.load(plain.parent / "lines.h5").weighted(np.full(260, 2.0))
@@ -535,6 +545,7 @@ def test_a_recording_that_changes_while_it_is_processed_is_refused(plain, tmp_pa
     assert not plain.with_suffix("").exists()
 
 
+@pytest.mark.slow
 def test_results_that_changed_since_are_not_returned(scene):
     choose(scene, "calibrate", "image")
     found = clsas.process(scene)
@@ -589,6 +600,7 @@ def test_command(scene):
     assert CliRunner().invoke(main, ["process", str(scene), "--step", "x"]).exit_code == 2
 
 
+@pytest.mark.slow
 def test_the_command_refuses_a_grid_that_no_line_reaches(plain):
     plain.write_text(
         plain.read_text().replace(

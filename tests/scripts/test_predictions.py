@@ -20,6 +20,7 @@ def small(monkeypatch):
     return case
 
 
+@pytest.mark.slow
 def test_every_request_has_a_row(small):
     device = open_device()
     rows = list(predictions.rows(device, repeats=1))

@@ -134,6 +134,7 @@ def test_many_points_are_the_sum_of_each():
     assert db(echoes.samples - closed_form(echoes, scene), echoes.samples) < -110
 
 
+@pytest.mark.slow
 def test_result_does_not_depend_on_blocks_or_threads(monkeypatch):
     rng = np.random.default_rng(6)
     scene = PointTargets(rng.uniform([-2, 38, -1], [2, 42, 1], (50, 3)))

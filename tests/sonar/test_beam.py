@@ -273,6 +273,7 @@ def test_a_window_open_on_all_sides_changes_nothing(case, device):
     assert relative_error_db(image, backproject(lines, grid, device=device, **FINE)) <= -85
 
 
+@pytest.mark.slow
 def test_pixels_at_the_antennas_and_ahead_of_them_are_finite(platform):
     """The aspect angle is undefined or 90 degrees at points on a line along the track."""
     grid = Grid.points([[0, 0, 0], [1e-3, 0, 0], [1, 0, 0], [5, 0, 0], [-5, 0, 0], [0, 3, 0]])
@@ -302,6 +303,7 @@ def test_normalising_levels_points_along_the_track(platform):
     np.testing.assert_allclose(level, 1, atol=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "y_m", "accuracy_db"),
     [("hann", 13.3, -40), ("hann", 13.3, -50), ("tukey", 18, -31), ("tukey", 26, -40)],

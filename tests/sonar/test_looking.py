@@ -97,6 +97,7 @@ def test_every_imager_warns_once_of_the_wrong_side_and_names_the_grid_meant(line
     ]
 
 
+@pytest.mark.slow
 def test_a_wavenumber_image_warns_as_well(lines):
     flat = recorded(start_m=(-1, 0, 0))
     assert heard(lambda: clsas.wavenumber(flat, PORT)) == []

@@ -57,6 +57,7 @@ def test_scaled_cases_keep_what_they_look_like_in_wavelengths():
     assert (base.x_m, base.y_m, base.beam) == (scaled.x_m, scaled.y_m, scaled.beam)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beam", [None, BeamWindow(1.5, "hann")])
 def test_factorized_against_exact(beam, monkeypatch):
     case = dataclasses.replace(SMALL, beam=beam)
@@ -115,6 +116,7 @@ def test_scaling_fits_exponents_and_writes_them(monkeypatch, tmp_path, capsys):
     assert (tmp_path / "s.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_the_table_of_factorized_cases(monkeypatch, capsys):
     monkeypatch.setattr(cases, "FACTORIZED_CASES", {"small": SMALL})
     tables.factorized([None])

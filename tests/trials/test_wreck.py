@@ -25,6 +25,7 @@ def test_shadow_lies_behind_the_wreck(shadow):
     assert 72 < ground[dark, 1].max() < 82
 
 
+@pytest.mark.slow
 def test_contrast_is_that_of_the_masks(shadow):
     grid = wreck.grid(256)
     ground, dark, _ = shadow.masks
@@ -61,6 +62,7 @@ def test_lines_are_simulated_once(monkeypatch, tmp_path):
     assert asked == [1, 1]
 
 
+@pytest.mark.slow
 def test_benchmark(monkeypatch):
     monkeypatch.setattr(wreck, "lines", lambda progress=None: few_lines())
     monkeypatch.setitem(cases.MOSAIC_CASES, "small", (128, BeamWindow(5.0, "hann")))
