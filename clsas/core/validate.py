@@ -42,7 +42,7 @@ _MOST_COUNT = 2**63 - 1
 _MOST_OVERSAMPLING = 1e4  # arbitrary, far beyond what improves any interpolation
 _MOST_CYCLES = 1e10  # of phase, which float64 still resolves to 1e-6 of a cycle
 
-# Size of arrays below which memory is not checked. Asking the system for its free memory takes
+# Size of allocations below which memory is not checked. Asking the system for its free memory takes
 # longer than such an allocation.
 _SMALL_BYTES = 1 << 20
 
@@ -357,7 +357,8 @@ def memory(name: str, size_bytes: float) -> None:
 
     Calls that allocate more than once use a `Budget`.
     """
-    Budget().take(name, size_bytes)
+    if not size_bytes <= _SMALL_BYTES:
+        Budget().take(name, size_bytes)
 
 
 def _memory_bytes() -> float:

@@ -383,6 +383,7 @@ def change_vectors(path, change):
 def test_a_signal_beyond_memory_is_refused_unread(tmp_path, monkeypatch):
     foreign(tmp_path / "pass.cphd")
     monkeypatch.setattr(validate, "_memory_bytes", lambda: 1000)
+    monkeypatch.setattr(validate, "_SMALL_BYTES", 1000)
     with pytest.raises(FileFormatError, match="is too large: reading its signal"):
         clsas.load(tmp_path / "pass.cphd")
 
