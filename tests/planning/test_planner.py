@@ -72,6 +72,23 @@ def test_a_small_image_is_backprojected():
     assert chosen.is_exact
     assert chosen.predicted_seconds == chosen.exact_seconds
     assert chosen.predicted_error_db <= -50
+    assert "Plain backprojection: it takes less time than the search" in chosen.describe()
+
+
+def test_an_exact_plan_says_how_many_channels_receive_from_a_pixel():
+    """The number is that of the pencil rule in docs/thesis-systems.md."""
+    costs = Costs(pixel_ns=10, point_ns=10, sample_ns=1e5)
+    request = {"tolerance_db": -40, "beam": BeamWindow(6, "hann"), "costs": costs}
+    text = plan(*made(straight), **request).describe()
+    found = re.search(
+        r"no factorization is faster .*\. About (\d+) channels .* from about 30 on", text
+    )
+    spacing_m = TRACK[1, 0] - TRACK[0, 0]
+    by_the_rule = 2 * 40 * np.tan(np.radians(3)) / spacing_m
+    assert float(found[1]) == pytest.approx(by_the_rule, rel=0.1)
+    # The rule was measured on planes.
+    assert "channels" not in plan(*made(hills), **request).method.reason
+    assert plan(*made(straight), stages=[]).method.reason == ""
 
 
 @pytest.mark.slow
