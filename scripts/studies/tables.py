@@ -55,6 +55,11 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         print("|", " | ".join(str(cell) for cell in row), "|", flush=True)
 
 
+def of_several(devices: Sequence[str], cell: object) -> list[object]:
+    """Return a cell of the column of devices, which a table of one device does not have."""
+    return [cell] if len(devices) > 1 else []
+
+
 def speed(devices: list[str]) -> None:
     """Print speed and errors of exact imaging of the built-in cases at -50 and -80 dB."""
     rows = []
@@ -328,11 +333,13 @@ def shadows(devices: list[str]) -> None:
                 chosen = np.abs(level_db - middle_db) <= 2.5
                 error_db = clsas.relative_error_db(image[chosen], exact[chosen])
                 errors.append(f"{error_db:.1f}")
-            rows.append([device, tolerance_db, *errors])
+            rows.append([*of_several(devices, device), f"{tolerance_db:g}", *errors])
         share = [np.mean(np.abs(level_db - middle_db) <= 2.5) for middle_db in SHADOW_LEVELS_DB]
         darkest = f"{dark_level_db(exact):.1f} dB"
-        rows.append([device, "share", "1", darkest, *(f"{each:.4f}" for each in share)])
-    header = ["device", "tolerance (dB)", "image", "darkest tenth"]
+        shares = [f"{100 * each:.2g} %" for each in share]
+        level = "level, share of the image"
+        rows.append([*of_several(devices, device), level, "", darkest, *shares])
+    header = [*of_several(devices, "device"), "tolerance dB", "image", "darkest tenth"]
     table([*header, *(f"{middle_db} dB" for middle_db in SHADOW_LEVELS_DB)], rows)
 
 
