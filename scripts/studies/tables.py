@@ -217,10 +217,9 @@ def scaling(device: str, largest: int, png_file: str | None) -> None:
         bench.run_factorized(cases.scaled(size), device=device, repeats=3 if size <= 4096 else 1)
         for size in sizes
     ]
-    # The least times are those that other work on the machine disturbs least.
     seconds = {
-        "factorized": [r["seconds"]["min"] for r in measured],
-        "exact": [r["exact_seconds"]["min"] for r in measured],
+        "factorized": [r["seconds"]["median"] for r in measured],
+        "exact": [r["exact_seconds"]["median"] for r in measured],
     }
     names = ["N", "factorized_s", "exact_s", "speedup", "plan_s", "error_db", "predicted_error_db"]
     rows = [
