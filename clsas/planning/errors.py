@@ -41,7 +41,8 @@ _FLOAT32 = 4.5e-8
 # Largest error power of a leaf over the mean of all. The error grows with the sixth power of the
 # inverse distance, and the nearest pixels may be the brightest. Images of an ultrasound array of
 # 20 mm from 6 mm on keep -40 dB with 64 too, if only the nearest 3 % of the pixels are bright; with
-# 4, no leaf of some of them is small enough.
+# 4, no leaf of some of them is small enough. Half or twice changes no scene of
+# `scripts/bench sensitivity`.
 _MOST_OF_MEAN = 16.0
 
 
