@@ -105,7 +105,8 @@ class Images:
         output = folder / "processed"
         processed = process(scene, lines=recording.given, output=output, device=device)
         tolerance_db, beam = scene.image["tolerance_db"], scene.image["beam"]
-        true = factorize(recording.true, scene.grid, tolerance_db, beam=beam, device=device)
+        grid = processed.image.grid
+        true = factorize(recording.true, grid, tolerance_db, beam=beam, device=device)
         before = load(output / "before.h5")
         assert isinstance(before, Image)
         return cls(true, before, processed.image)

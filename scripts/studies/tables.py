@@ -55,7 +55,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         print("|", " | ".join(str(cell) for cell in row), "|", flush=True)
 
 
-def of_several(devices: Sequence[str], cell: object) -> list[object]:
+def of_several(devices: Sequence[str], cell: str) -> list[str]:
     """Return a cell of the column of devices, which a table of one device does not have."""
     return [cell] if len(devices) > 1 else []
 

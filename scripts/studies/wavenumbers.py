@@ -57,8 +57,15 @@ class Scene:
         points = clsas.PointTargets(
             random.uniform(low, high, (300, 3)), random.normal(size=(300, 2)) @ [1, 1j]
         )
-        band = {"carrier_hz": 125e3, "bandwidth_hz": 15e3, "window": "hamming"}
-        return clsas.simulate_lines(track_m, track_m, points, **band), grid
+        lines = clsas.simulate_lines(
+            track_m,
+            track_m,
+            points,
+            carrier_hz=125e3,
+            bandwidth_hz=15e3,
+            window="hamming",
+        )
+        return lines, grid
 
 
 def rows(device: str | None = None, pixels: int = 512) -> Iterator[list[str]]:
@@ -81,7 +88,8 @@ def compared(scene: Scene, beam: clsas.BeamWindow, device: str | None) -> list[s
         "wavenumber": lambda: clsas.wavenumber(lines, grid, beam=beam),
         "exact": lambda: clsas.backproject(lines, grid, beam=beam, device=device),
     }
-    images, taken = {}, {name: [] for name in forms}
+    images: dict[str, clsas.Image] = {}
+    taken: dict[str, list[float]] = {name: [] for name in forms}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", clsas.ClsasWarning)
         for _ in range(_RUNS):
