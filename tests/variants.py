@@ -99,11 +99,13 @@ EVERY_VARIANT = {
 
 SOME_ELSEWHERE = {
     "test_accuracy.py::test_exact": (
-        "-flat-", "relief", "bistatic", "moving", "normalised", "far, own starts", "on carrier--",
-        "one channel",
+        "flat spectrum", "relief", "bistatic", "moving", "normalised", "lines of different starts",
+        "30 kHz on the carrier", "one channel",
     ),
     "test_accuracy.py::test_factorized": (
-        "-flat-", "relief--50", "moving--35", "beam, normalised--50", "sway--50", "closed--50",
+        "flat spectrum", "relief of 10 cm rms--50", "moving receivers--35",
+        "normalised, squint 3 degrees--50", "sway of 2 cm rms--50",
+        "closed track, 300 channels--50",
     ),
     "test_rounding.py::test_the_origin_of_coordinates_does_not_matter": (
         "thesis", "moving_over_height_map",

@@ -17,6 +17,10 @@ from clsas.planning.visibility_model import LinesModel, VisibilityModel
 from clsas.planning.work import backprojecting, upsampling
 from clsas.plans.predictions import Work
 
+WORTHWHILE_CHANNELS = 30
+"""Fewest channels per pixel with which factorized images were faster than exact ones at -40 dB.
+Images had 1024 x 1024 pixels (`scripts/thesis/section_7_1.py`, docs/thesis-systems.md)."""
+
 _LARGE = (64, 64)  # rows and columns of a subimage as large as any part of an exact image
 
 
@@ -149,3 +153,17 @@ def _memory_bytes(
         *(part_buffers(of_job, part_pixels, n, blocks) for n in visible),
     ]
     return sum(total_bytes(buffers) for buffers in lists)
+
+
+def worthwhile(model: LinesModel, exact: Exact) -> str:
+    """Return how many channels receive from a pixel, and from how many a factorization pays.
+
+    The sentence is "" for grids off a plane, and for several passes and other dense apertures: the
+    rule was not measured for them.
+    """
+    if not isinstance(model, VisibilityModel) or not model.surface.is_plane or model.track.is_dense:
+        return ""
+    return (
+        f"About {exact.visible_channels:.0f} channels receive from each pixel; factorization "
+        f"usually pays from about {WORTHWHILE_CHANNELS} on, in images of 1000 x 1000 pixels or more"
+    )

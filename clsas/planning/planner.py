@@ -19,7 +19,7 @@ from clsas.planning import costs as stored_costs
 from clsas.planning import scaling
 from clsas.planning.beam_coverage import obstacle
 from clsas.planning.costs import Costs, KnownCosts
-from clsas.planning.exact_image import Exact, expect
+from clsas.planning.exact_image import Exact, expect, worthwhile
 from clsas.planning.fastest import Outcome, fastest, off_track
 from clsas.planning.nearest_beams import nearest_plan
 from clsas.planning.prediction import MARGIN_DB, Conditions, exact_plan
@@ -39,6 +39,8 @@ _WORTH = 0.95  # of the time of an exact image, at most: less gain is within pre
 _SEARCH_S = 0.05  # that a search takes at least: 0.05 to 0.12 s on a core of 2.5 GHz
 
 _NO_EXTENT = "all channels are at one place, or there is a single pixel"
+_NOT_FASTER = "no factorization is faster within the tolerance"
+_SOON_DONE = "it takes less time than the search for a factorization"
 
 
 def plan(
@@ -262,16 +264,23 @@ def _chosen(
     exact, room = conditions.exact, conditions.memory_bytes
     if request.stages:
         return _with_given_stages(request.stages, model, conditions)
-    exact_fits, outcome = _exact_fits(request, exact), Outcome()
+    exact_fits, outcome, reason = _exact_fits(request, exact), Outcome(), _SOON_DONE
     if _worth_a_search(request, exact, conditions.costs):
         is_free = exact_fits and request.allowed is None
         to_beat_s = _WORTH * conditions.costs.seconds(exact.work) if is_free else math.inf
         outcome = _fastest_of_shapes(model, conditions, to_beat_s, request.allowed or Allowed())
         if outcome.plan is not None:
             return outcome.plan, outcome.track
+        reason = _NOT_FASTER
     if not exact_fits:
         raise _too_little_memory(min(exact.memory_bytes, outcome.least_bytes), room)
-    return exact_plan(model, conditions, outcome.obstacle), None
+    if request.stages is not None:
+        reason = ""  # it was requested
+    elif outcome.obstacle:
+        reason = outcome.obstacle
+    else:
+        reason = ". ".join(filter(None, (reason, worthwhile(model, exact))))
+    return exact_plan(model, conditions, reason), None
 
 
 def _with_given_stages(

@@ -137,7 +137,7 @@ def predicted_plan(
 
 
 def exact_plan(model: LinesModel, conditions: Conditions, reason: str) -> Plan:
-    """Return the plan of the exact image. `reason` says why it cannot be factorized, if so."""
+    """Return the plan of the exact image; `reason` is that of `ExactImage`."""
     exact = conditions.exact
     image = ExactImage(accuracy_db=exact.accuracy_db, reason=reason)
     errors = ErrorBudget(exact=power(exact.accuracy_db))

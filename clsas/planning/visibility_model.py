@@ -102,8 +102,9 @@ class VisibilityModel(LinesModel):
         Subimages of every size, on the grid's surface.
     points_m : float64 [points, 3]
         Sample points all over the grid, also near its corners.
-    nearest_m : float
-        Lower bound of the distance between pixels and channels.
+    distances_m : float64 [parts]
+        Lower bounds of the distance between channels and pixels, ascending. Each is that of an
+        equally large part of the pixels.
     root : (rows, columns) or None
         Size of the roots in which reliefs and phase rates are the largest; None for the subimages
         and the sample points alone.
@@ -114,7 +115,7 @@ class VisibilityModel(LinesModel):
     track: MeanTrack
     subimages: Subimages
     points_m: NDArray[np.float64]
-    nearest_m: float
+    distances_m: NDArray[np.float64]
     root: Side | None = None
 
     @classmethod
@@ -160,6 +161,11 @@ class VisibilityModel(LinesModel):
     def surface(self) -> Surface:
         """Positions of the grid's pixels."""
         return self.subimages.surface
+
+    @property
+    def nearest_m(self) -> float:
+        """Lower bound of the distance between any pixel and any channel."""
+        return float(self.distances_m[0])
 
     @property
     @shared
@@ -301,12 +307,12 @@ def model_of(
         track=track,
         subimages=Subimages(surface),
         points_m=sample_points_m(surface),
-        nearest_m=_nearest_m(lines, surface, track),
+        distances_m=_distances_m(lines, surface, track),
     )
 
 
-def _nearest_m(lines: RangeLines, surface: Surface, track: MeanTrack) -> float:
-    """Return a lower bound of the distance between pixels and channels."""
+def _distances_m(lines: RangeLines, surface: Surface, track: MeanTrack) -> NDArray[np.float64]:
+    """Return `VisibilityModel.distances_m`, with as many parts as there are dense points a side."""
     dense_m = points_at_m(surface, np.linspace(0, 1, _DENSE))
     # Pixels between the dense points may be closer, by half a step at most.
     steps_m = np.linalg.norm(surface.steps_m[:2], axis=1)
@@ -315,5 +321,5 @@ def _nearest_m(lines: RangeLines, surface: Surface, track: MeanTrack) -> float:
     centres_m = lines.phase_centres_m
     if track.is_dense:
         centres_m = centres_m[some_channels(len(centres_m), _NEAREST_CHANNELS)]
-    nearest_m = KDTree(dense_m).query(centres_m)[0].min() - between_m
-    return max(float(nearest_m), 1e-9)
+    distances_m = np.sort(KDTree(centres_m).query(dense_m)[0])[::_DENSE] - between_m
+    return np.maximum(distances_m, 1e-9)

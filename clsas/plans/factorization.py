@@ -28,7 +28,7 @@ class ExactImage:
     accuracy_db : float
         Relative rms error of interpolation, dB.
     reason : str
-        Reason why the image cannot be factorized, in words; "" if it can, but not faster.
+        Reason why the image is not factorized, in words; "" if an exact image was requested.
     """
 
     accuracy_db: Number

@@ -170,8 +170,8 @@ def peers_scaling(
             method = several[0].method
             grows = ""
             if not any(one.refused for one in several):
-                power = tables.exponent(sizes, [one.median for one in several])
-                grows = f"N^{power:.2f}"
+                fitted = tables.growth(sizes, [one.median for one in several])
+                grows = f"N^{fitted.exponent:.2f}"
             name = f"{method.code}, {method.words}"
             rows.append([method.kind, name, *map(_in_words, several), grows])
         tables.table(["image", "code, settings", *(f"N = {n}" for n in sizes), "for large N"], rows)

@@ -7,14 +7,22 @@ centres overlap. According to the navigation the track is straight.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
+from clsas.core.validate import ClsasWarning
+from clsas.files.formats import load
+from clsas.files.scene_files import parse_scene
 from clsas.measures.quality import measure_point
+from clsas.planning.factorize import factorize
+from clsas.processing.chain import process
 from clsas.signal.compression import compress
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.seabeds import wreck as seabed
@@ -74,6 +82,36 @@ class Recording:
     given: RangeLines
 
 
+@dataclass(frozen=True, eq=False)
+class Images:
+    """Images of a recording.
+
+    Attributes
+    ----------
+    true, given : Image
+        With the true track, and with the positions of the navigation.
+    processed : Image
+        After `clsas process` with the `SCENE`.
+    """
+
+    true: Image
+    given: Image
+    processed: Image
+
+    @classmethod
+    def of(cls, recording: Recording, folder: Path, device: str | None = None) -> Images:
+        """Return the images of a recording; `clsas process` writes its files into a folder."""
+        scene = parse_scene(SCENE.encode(), name="wreck.toml", folder=folder)
+        output = folder / "processed"
+        processed = process(scene, lines=recording.given, output=output, device=device)
+        tolerance_db, beam = scene.image["tolerance_db"], scene.image["beam"]
+        grid = processed.image.grid
+        true = factorize(recording.true, grid, tolerance_db, beam=beam, device=device)
+        before = load(output / "before.h5")
+        assert isinstance(before, Image)
+        return cls(true, before, processed.image)
+
+
 @dataclass(frozen=True)
 class Measures:
     """Measures of an image of the wreck.
@@ -129,3 +167,33 @@ def recorded(progress: Callable[[int, int], None] | None = None) -> Recording:
     lines = compress(simulate(sonar, true, targets, progress=progress), window="hamming")
     given = channels(sonar, Track.straight(*course))
     return Recording(lines, replace(lines, tx_m=given.tx_m, rx_m=given.rx_m))
+
+
+COLUMNS = (
+    "image",
+    "reflector on the sand, dB",
+    "width along track, cm",
+    "width in range, cm",
+    "sand over shadow, dB",
+)
+
+
+def rows(device: str | None = None) -> Iterator[list[str]]:
+    """Yield the measures of every image, with the reflector relative to the true track's image."""
+    shadow = wreck.Shadow(wreck.scene())
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore", ClsasWarning)
+        images = Images.of(recorded(), Path(folder), device)
+    level_of_true_db = level_db(images.true)
+    for name, image in (
+        ("with the true track", images.true),
+        ("as recorded", images.given),
+        ("after `navigate`", images.processed),
+    ):
+        try:
+            found = Measures.of(image, shadow)
+            widths = [f"{100 * each:.1f}" for each in (found.azimuth_m, found.range_m)]
+        except ValueError:
+            widths = ["no peak"] * 2
+        level = f"{level_db(image) - level_of_true_db:.1f}"
+        yield [name, level, *widths, f"{shadow.contrast_db(image, POINT_M[:2]):.1f}"]

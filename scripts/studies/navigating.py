@@ -269,24 +269,52 @@ def point_against_true(
     return float(20 * np.log10(peak[0] / peak[1])), width[0] / width[1]
 
 
-VOYAGE_COLUMNS = ("track", "residual, wavelengths", "peak dB", "width")
+VOYAGES = (
+    # overlapping phase centres, periods of sway and yaw, points of speckle, bright point over them
+    (24, 200.0, 100.0, 60_000, 5.0),
+    (24, 100.0, 50.0, 60_000, 5.0),
+    (24, 200.0, 100.0, 15_000, 30.0),
+    (48, 200.0, 100.0, 30_000, 5.0),
+)
+VOYAGE_COLUMNS = (
+    "overlap",
+    "periods of sway and yaw, pings",
+    "points of speckle",
+    "bright point over them",
+    "device",
+    "coherence",
+    "residual as recorded, wavelengths",
+    "navigated",
+    "peak dB",
+    "width",
+)
 
 
 def voyage_rows(devices: Iterable[str]) -> Iterator[list[str]]:
-    """Yield rows of residual, peak and width for an unknown track, before and after."""
-    made = voyage()
-    found = navigated(made)
-    for device in devices:
-        for name, lines in (("as recorded", made.told), ("navigated", found.lines)):
-            peak_db, width = point_against_true(made, lines, device)
-            residual = residual_m(made, lines) / WAVELENGTH_M
-            coherence = f"{np.median(found.coherence):.2f}"
+    """Yield rows of residual, peak and width for `VOYAGES`, whose tracks are unknown."""
+    for overlapping, sway_pings, yaw_pings, points, bright in VOYAGES:
+        made = voyage(
+            overlapping=overlapping,
+            points=points,
+            bright=bright,
+            sway_pings=sway_pings,
+            yaw_pings=yaw_pings,
+        )
+        found = navigated(made)
+        before, after = (residual_m(made, each) / WAVELENGTH_M for each in (made.told, found.lines))
+        for device in devices:
+            peak_db, width = point_against_true(made, found.lines, device)
             yield [
-                f"{name}, {device}",
-                f"{residual:.3f}",
+                f"{overlapping}",
+                f"{sway_pings:g}, {yaw_pings:g}",
+                f"{points:_}".replace("_", " "),
+                f"{bright:g}",
+                device,
+                f"{np.median(found.coherence):.2f}",
+                f"{before:.1f}",
+                f"{after:.3f}",
                 f"{peak_db:.2f}",
                 f"{width:.3f}",
-                coherence,
             ]
 
 

@@ -11,7 +11,7 @@ import pkgutil
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import ModuleType
@@ -156,8 +156,12 @@ class Result:
     planning_s: float
 
 
-def constants(pattern: str = "") -> list[Constant]:
-    """Return all tuned constants whose module and name contain a text."""
+def constants(patterns: Sequence[str] = ("",)) -> list[Constant]:
+    """Return all tuned constants whose module and name contain one of some texts."""
+
+    def chosen(name: str) -> bool:
+        return any(pattern in name for pattern in patterns)
+
     found = []
     packages = [importlib.import_module(f"clsas.{room}") for room in ROOMS]
     names = [f"{p.__name__}.{m.name}" for p in packages for m in pkgutil.iter_modules(p.__path__)]
@@ -169,7 +173,7 @@ def constants(pattern: str = "") -> list[Constant]:
         for each in _assigned(module):
             value = getattr(module, each)
             number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if number and value and each not in fixed and pattern in f"{name}.{each}":
+            if number and value and each not in fixed and chosen(f"{name}.{each}"):
                 found.append(Constant(module, each))
     return found
 
@@ -224,7 +228,7 @@ def trials(device: Device) -> list[Trial]:
     return found
 
 
-def changes(device: Device, pattern: str = "") -> Iterator[list[str]]:
+def changes(device: Device, patterns: Sequence[str] = ("",)) -> Iterator[list[str]]:
     """Yield a row for every constant and each of two other values, with changes over all scenes.
 
     The columns are `COLUMNS`.
@@ -234,7 +238,7 @@ def changes(device: Device, pattern: str = "") -> Iterator[list[str]]:
     for scene in scenes:  # builds the kernels
         scene.run()
     usual = [_best(scene) for scene in scenes]
-    for constant in constants(pattern):
+    for constant in constants(patterns):
         name = f"{constant.module.__name__.removeprefix('clsas.')}.{constant.name}"
         for other in sorted({*constant.neighbours} - {constant.value}):
             row = [name, f"{constant.value:.4g}", f"{other:.4g}"]

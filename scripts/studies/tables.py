@@ -13,6 +13,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
 
 import clsas
 from clsas import plot
@@ -29,7 +30,8 @@ TOLERANCES_DB = {
     **dict.fromkeys(cases.DENSE_CASES, (-40.0,)),
 }
 """Tolerances for the cases of factorized imaging, dB; -50 for all others."""
-FITTED = 3  # number of the largest sizes to which exponents are fitted
+FITTED = 4  # exponents are fitted to sizes down to this fraction of the largest
+CONFIDENCE = 0.95  # of the intervals of exponents
 SHADOW_PIXELS = 1024  # along each side of the wreck's scene, 64 m x 56 m
 SHADOW_TOLERANCES_DB = (-20.0, -30.0, -40.0, -50.0, -60.0)
 SHADOW_LEVELS_DB = (
@@ -41,7 +43,8 @@ SHADOW_LEVELS_DB = (
     -20,
     -25,
 )  # level around a pixel, relative to the rms value
-SIZES = (256, 512, 1024, 2048, 4096, 8192)
+SIZES = (256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096, 6144, 8192)
+"""Numbers of channels of `scaling`, and of pixels along each side."""
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
@@ -50,6 +53,11 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     print("|", " | ".join("---" for _ in header), "|")
     for row in rows:
         print("|", " | ".join(str(cell) for cell in row), "|", flush=True)
+
+
+def of_several(devices: Sequence[str], cell: str) -> list[str]:
+    """Return a cell of the column of devices, which a table of one device does not have."""
+    return [cell] if len(devices) > 1 else []
 
 
 def speed(devices: list[str]) -> None:
@@ -202,7 +210,7 @@ def factorized(devices: list[str], names: list[str] | None = None) -> None:
 
 
 def scaling(device: str, largest: int, png_file: str | None) -> None:
-    """Print the times for N channels and N x N pixels by N, and the fitted exponents."""
+    """Print the times for N channels and N x N pixels by N, and the exponents of their growth."""
     sizes = [size for size in SIZES if size <= largest]
     measured = [
         # Large images take minutes, and their times vary little from run to run.
@@ -224,25 +232,62 @@ def scaling(device: str, largest: int, png_file: str | None) -> None:
         for size, r in zip(sizes, measured, strict=True)
     ]
     table(names, rows)
-    exponents = {name: exponent(sizes, times) for name, times in seconds.items()}
-    print(f"\n{measured[0]['device']}, {measured[0]['driver']}: for large N time grows as", end=" ")
-    print(", ".join(f"N^{value:.2f} ({name})" for name, value in exponents.items()))
+    print(f"\n{measured[0]['device']}, {measured[0]['driver']}: time grows as N to the power of\n")
+    growths = {name: growth(sizes, times) for name, times in seconds.items()}
+    table(["image", *GROWTH_COLUMNS], [[name, *each.cells] for name, each in growths.items()])
     if png_file is not None:
-        draw_scaling(sizes, seconds, exponents, measured[0]["device"], png_file)
+        draw_scaling(sizes, seconds, growths, measured[0]["device"], png_file)
 
 
-def exponent(sizes: list[int], times: list[float]) -> float:
-    """Return the exponent of N fitted to the largest sizes, since small ones have fixed costs."""
-    few = slice(-FITTED, None)
-    if len(sizes) < 2:
-        return np.nan
-    return np.polyfit(np.log(sizes[few]), np.log(times[few]), 1)[0]
+GROWTH_COLUMNS = ("exponent", f"{CONFIDENCE:.0%} interval", "sizes", "N")
+
+
+@dataclasses.dataclass(frozen=True)
+class Growth:
+    """A power of N that is fitted to times.
+
+    Attributes
+    ----------
+    exponent : float
+    half_width : float
+        Half width of its confidence interval; not a number with fewer than three sizes.
+    sizes : list of int
+        Sizes that it is fitted to.
+    """
+
+    exponent: float
+    half_width: float
+    sizes: list[int]
+
+    @property
+    def cells(self) -> list[str]:
+        """Cells of `GROWTH_COLUMNS`."""
+        ends = (self.exponent - self.half_width, self.exponent + self.half_width)
+        interval = "" if np.isnan(self.half_width) else "{:.2f} to {:.2f}".format(*ends)
+        of = f"{self.sizes[0]} to {self.sizes[-1]}"
+        return [f"{self.exponent:.2f}", interval, str(len(self.sizes)), of]
+
+
+def growth(sizes: Sequence[int], times: Sequence[float]) -> Growth:
+    """Return the power of N that fits the logarithms of times best, by least squares.
+
+    It is fitted to the largest sizes, because small images have fixed costs. Its interval is that
+    of Student's t, for errors of the logarithms that are independent and of equal variance.
+    """
+    few = [index for index, size in enumerate(sizes) if FITTED * size >= max(sizes)]
+    fitted = [sizes[index] for index in few]
+    if len(few) < 2:
+        return Growth(np.nan, np.nan, fitted)
+    found = stats.linregress(np.log(fitted), np.log([times[index] for index in few]))
+    free = len(few) - 2
+    half_width = found.stderr * stats.t.ppf((1 + CONFIDENCE) / 2, free) if free else np.nan
+    return Growth(float(found.slope), float(half_width), fitted)
 
 
 def draw_scaling(
-    sizes: list[int],
+    sizes: Sequence[int],
     seconds: dict[str, list[float]],
-    exponents: dict[str, float],
+    growths: dict[str, Growth],
     device: str,
     png_file: str,
 ) -> None:
@@ -252,7 +297,9 @@ def draw_scaling(
     figure = Figure(figsize=(7, 5), layout="constrained")
     axes = figure.subplots()
     for (name, times), marker in zip(seconds.items(), "oD", strict=True):
-        axes.loglog(sizes, times, marker=marker, label=f"{name}: N^{exponents[name]:.2f}")
+        grows = growths[name]
+        label = f"{name}: N^({grows.exponent:.2f} ± {grows.half_width:.2f})"
+        axes.loglog(sizes, times, marker=marker, label=label)
     axes.set(
         xlabel="N (channels; the image has N x N pixels)", ylabel="time of the image (s)",
         xticks=sizes, xticklabels=sizes,
@@ -285,11 +332,13 @@ def shadows(devices: list[str]) -> None:
                 chosen = np.abs(level_db - middle_db) <= 2.5
                 error_db = clsas.relative_error_db(image[chosen], exact[chosen])
                 errors.append(f"{error_db:.1f}")
-            rows.append([device, tolerance_db, *errors])
+            rows.append([*of_several(devices, device), f"{tolerance_db:g}", *errors])
         share = [np.mean(np.abs(level_db - middle_db) <= 2.5) for middle_db in SHADOW_LEVELS_DB]
         darkest = f"{dark_level_db(exact):.1f} dB"
-        rows.append([device, "share", "1", darkest, *(f"{each:.4f}" for each in share)])
-    header = ["device", "tolerance (dB)", "image", "darkest tenth"]
+        shares = [f"{100 * each:.2g} %" for each in share]
+        level = "level, share of the image"
+        rows.append([*of_several(devices, device), level, "", darkest, *shares])
+    header = [*of_several(devices, "device"), "tolerance dB", "image", "darkest tenth"]
     table([*header, *(f"{middle_db} dB" for middle_db in SHADOW_LEVELS_DB)], rows)
 
 

@@ -260,6 +260,8 @@ def main() -> None:
     chapter5.add_output(parser)
     parser.add_argument("--pixels", type=int, help="pixels along each side, instead of 1024")
     parser.add_argument("--sweep", action="append", choices=SWEEPS, help="only this sweep")
+    names = [system.name for system in SYSTEMS]
+    parser.add_argument("--system", action="append", choices=names, help="only this system")
     parser.add_argument("--repeats", type=int, default=3, help="timed runs [default: %(default)s]")
     given = parser.parse_args()
     device = open_device(given.device)
@@ -267,6 +269,8 @@ def main() -> None:
     rows = []
     for sweep in given.sweep or SWEEPS:
         for system in SYSTEMS:
+            if system.name not in (given.system or names):
+                continue
             if given.pixels:
                 system = replace(system, pixels=given.pixels)
             for value, case in SWEEPS[sweep](system):

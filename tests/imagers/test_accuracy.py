@@ -52,59 +52,67 @@ def raw(channels=96, **options):
 
 
 CASES = {
-    "flat": lambda: ultrasonic(),
-    "tilted": lambda: ultrasonic(tilt_db=-20),
-    "steps": lambda: ultrasonic(colour=steps),
-    "a line": lambda: ultrasonic(colour=line_in_the_spectrum),
+    "flat spectrum": lambda: ultrasonic(),
+    "tilted by -20 dB": lambda: ultrasonic(tilt_db=-20),
+    "bands at 0, -15 and -30 dB": lambda: ultrasonic(colour=steps),
+    "a line 20 dB above the band": lambda: ultrasonic(colour=line_in_the_spectrum),
     **{
-        f"oversampling {rate} tilted {tilt_db}": lambda rate=rate, tilt_db=tilt_db: ultrasonic(
-            oversampling=rate, tilt_db=tilt_db
+        f"oversampling {rate}, tilted by {tilt_db} dB": lambda rate=rate, tilt_db=tilt_db: (
+            ultrasonic(oversampling=rate, tilt_db=tilt_db)
         )
         for rate in (2.0, 1.4, 1.25, 1.1, 1.05)
         for tilt_db in (0, 10, -20)
     },
-    "oversampling 1.25 steps": lambda: ultrasonic(oversampling=1.25, colour=steps),
-    "oversampling 1.1 line": lambda: ultrasonic(oversampling=1.1, colour=line_in_the_spectrum),
+    "oversampling 1.25, bands at 0, -15 and -30 dB": lambda: ultrasonic(
+        oversampling=1.25, colour=steps
+    ),
+    "oversampling 1.1, a line 20 dB above the band": lambda: ultrasonic(
+        oversampling=1.1, colour=line_in_the_spectrum
+    ),
     "noise -40 dB": lambda: ultrasonic(noise=0.01),
     "noise -10 dB": lambda: ultrasonic(noise=0.3),
     "noise +10 dB": lambda: ultrasonic(noise=3.0),
-    "noise -20 dB, oversampling 1.25, tilted": lambda: ultrasonic(
+    "oversampling 1.25, tilted by 10 dB, noise -20 dB": lambda: ultrasonic(
         noise=0.1, oversampling=1.25, tilt_db=10
     ),
-    "on carrier": lambda: raw(),
+    "30 kHz on the carrier, 96 channels": lambda: raw(),
     "on carrier, 1 % offset": lambda: raw(offset=0.01),
     "on carrier, 5 % offset": lambda: raw(offset=0.05),
-    "on carrier, 10 % offset, many channels": lambda: raw(300, oversampling=12.5, offset=0.1),
+    "on carrier, 10 % offset, 300 channels": lambda: raw(300, oversampling=12.5, offset=0.1),
     "on carrier, offset larger than echoes": lambda: raw(offset=3.0),
     "on carrier, 5 % tail": lambda: raw(tail=0.05),
     "on carrier, noise": lambda: raw(noise=0.05),
-    "far": lambda: ultrasonic(origin_m=FAR),
-    "far, own starts": lambda: ultrasonic(origin_m=FAR, own_starts=True),
-    "1 kHz": lambda: at_1_khz(),
-    "10 GHz": lambda: radar(),
-    "10 GHz, far": lambda: radar(origin_m=FAR),
+    "10 000 km from the origin": lambda: ultrasonic(origin_m=FAR),
+    "10 000 km from the origin, lines of different starts": lambda: ultrasonic(
+        origin_m=FAR, own_starts=True
+    ),
+    "1 kHz, 1.5 km away": lambda: at_1_khz(),
+    "10 GHz, 8 km away": lambda: radar(),
+    "10 GHz, 10 000 km from the origin": lambda: radar(origin_m=FAR),
     "one channel": lambda: ultrasonic(channels=1),
     "two channels": lambda: ultrasonic(channels=2),
     "5000 channels": lambda: ultrasonic(channels=5000, shape=(24, 24), targets=2),
-    "sway": lambda: ultrasonic(track=along_x(160, 8.25e-3, sway_m=0.02)),
-    "closed": lambda: closed(),
-    "bistatic": lambda: array(moving=False),
-    "moving": lambda: array(moving=True),
-    "band of 0.5 %": lambda: narrow(),
-    "band of 190 %": lambda: widest(),
+    "sway of 2 cm rms": lambda: ultrasonic(track=along_x(160, 8.25e-3, sway_m=0.02)),
+    "closed track, 300 channels": lambda: closed(),
+    "array, bistatic": lambda: array(moving=False),
+    "array, moving receivers": lambda: array(moving=True),
+    "band of 0.5 % of the carrier": lambda: narrow(),
+    "band of 190 % of the carrier": lambda: widest(),
     "rings, on carrier": lambda: rings(),
-    "2 % and 10 m apart": lambda: apart(),
-    "0.5 % and 10 m apart": lambda: apart(bandwidth_hz=500),
-    "0.5 % and uneven velocities": lambda: uneven(),
+    "band of 2 %, transmitter and receiver 10 m apart": lambda: apart(),
+    "band of 0.5 %, transmitter and receiver 10 m apart": lambda: apart(bandwidth_hz=500),
+    "band of 0.5 %, uneven velocities": lambda: uneven(),
     "headings under a Hann beam": lambda: headings(),
     "headings under a Hann beam, more pixels": lambda: headings(shape=(64, 64)),
     "a loud channel off the track": lambda: loud(),
     "edge of a Hann beam": lambda: edge(),
-    "narrow band": lambda: ultrasonic(bandwidth_hz=2e4, pixel_m=(4e-3, 2e-2)),
-    "relief": lambda: ultrasonic(relief_m=0.1, track=along_x(160, 8.25e-3) + [0, 0, 20]),
-    "one target": lambda: ultrasonic(targets=1),
-    "Hann beam": lambda: ultrasonic(track=along_x(600, 0.02), beam=HANN),
-    "Hann beam, normalised": lambda: ultrasonic(
+    "band of 2 % of the carrier": lambda: ultrasonic(bandwidth_hz=2e4, pixel_m=(4e-3, 2e-2)),
+    "relief of 10 cm rms": lambda: ultrasonic(
+        relief_m=0.1, track=along_x(160, 8.25e-3) + [0, 0, 20]
+    ),
+    "one point": lambda: ultrasonic(targets=1),
+    "Hann beam, 600 channels": lambda: ultrasonic(track=along_x(600, 0.02), beam=HANN),
+    "Hann beam, 600 channels, normalised, squint 3 degrees": lambda: ultrasonic(
         track=along_x(600, 0.02),
         beam=BeamWindow(12, "hann", squint_deg=3, along=[1, 0, 0], normalise=True),
     ),
@@ -151,7 +159,15 @@ def test_factorized(name, asked_db, platform, recwarn):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["tilted", "oversampling 1.25 tilted 10", "far", "Hann beam"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "tilted by -20 dB",
+        "oversampling 1.25, tilted by 10 dB",
+        "10 000 km from the origin",
+        "Hann beam, 600 channels",
+    ],
+)
 @pytest.mark.parametrize("how", [{"accuracy_db": -60}, {"tolerance_db": -50}])
 def test_mosaic(name, how, platform):
     known = made(name)

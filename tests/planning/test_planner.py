@@ -72,6 +72,40 @@ def test_a_small_image_is_backprojected():
     assert chosen.is_exact
     assert chosen.predicted_seconds == chosen.exact_seconds
     assert chosen.predicted_error_db <= -50
+    assert "Plain backprojection: it takes less time than the search" in chosen.describe()
+
+
+def test_an_exact_plan_says_how_many_channels_receive_from_a_pixel():
+    """The number is that of the pencil rule in docs/thesis-systems.md."""
+    costs = Costs(pixel_ns=10, point_ns=10, sample_ns=1e5)
+    request = {"tolerance_db": -40, "beam": BeamWindow(6, "hann"), "costs": costs}
+    text = plan(*made(straight), **request).describe()
+    found = re.search(
+        r"no factorization is faster .*\. About (\d+) channels .* from about 30 on", text
+    )
+    spacing_m = TRACK[1, 0] - TRACK[0, 0]
+    by_the_rule = 2 * 40 * np.tan(np.radians(3)) / spacing_m
+    assert float(found[1]) == pytest.approx(by_the_rule, rel=0.1)
+    # The rule was measured on planes.
+    assert "channels" not in plan(*made(hills), **request).method.reason
+    assert plan(*made(straight), stages=[]).method.reason == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bright_m", [1.0, 0.01])
+def test_leaves_suit_most_pixels_of_a_grid_that_begins_close_to_the_track(bright_m):
+    """An array of 20 mm images from 6 to 54 mm, of which all or only the nearest are bright."""
+    grid = Grid.plane((-0.0315, 0.0315, 512), (0.006, 0.054, 512))
+    track_m, speed, step_m = along_x(256, 77e-6), 1540.0, 2e-4
+    lines = lines_over(grid, track_m, carrier_hz=5e6, step_m=step_m, speed=speed)
+    range_m = lines.first_range_m[:, None] + step_m * np.arange(lines.length)
+    lines = dataclasses.replace(lines, samples=lines.samples * (range_m < bright_m))
+    beam = BeamWindow(90, "hann")
+    chosen = plan(lines, grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
+    assert not chosen.is_exact
+    image = factorize(lines, grid, chosen)
+    exact = backproject(lines, grid, accuracy_db=-70, beam=beam)
+    assert relative_error_db(image, exact) < -40
 
 
 @pytest.mark.slow

@@ -3,9 +3,7 @@
 import pytest
 from studies import blurred_wreck
 
-import clsas
 from clsas.core.validate import ClsasWarning
-from clsas.files.scene_files import parse_scene
 from clsas.trials import wreck
 
 pytest.importorskip("matplotlib")
@@ -14,15 +12,12 @@ pytest.importorskip("matplotlib")
 @pytest.mark.slow
 def test_the_chain_restores_what_the_true_track_shows(tmp_path):
     recording = blurred_wreck.recorded()
-    scene = parse_scene(blurred_wreck.SCENE.encode(), name="wreck.toml", folder=tmp_path)
     few = pytest.warns(ClsasWarning, match="navigate: .* fewer than 8 reflectors")
     with pytest.warns(ClsasWarning, match="inspect: "), few:
-        found = clsas.process(scene, lines=recording.given, output=tmp_path / "processed")
-    beam = scene.image["beam"]
-    true = clsas.factorize(recording.true, scene.grid, -40, beam=beam)
-    before = clsas.load(tmp_path / "processed" / "before.h5")
+        images = blurred_wreck.Images.of(recording, tmp_path)
+    true, before = images.true, images.given
     shadow = wreck.Shadow(wreck.scene())
-    ideal, measured = (blurred_wreck.Measures.of(each, shadow) for each in (true, found.image))
+    ideal, measured = (blurred_wreck.Measures.of(each, shadow) for each in (true, images.processed))
     lost_db = ideal.peak_db - measured.peak_db
     assert abs(lost_db) < 1
     assert abs(ideal.contrast_db - measured.contrast_db) < 1
@@ -31,4 +26,4 @@ def test_the_chain_restores_what_the_true_track_shows(tmp_path):
     assert blurred_wreck.level_db(before) < ideal.peak_db - 6
     assert shadow.contrast_db(before, blurred_wreck.POINT_M[:2]) < ideal.contrast_db - 3
     pictures = {"navigate-track.png", "navigate-coherence.png", "before-and-after.png"}
-    assert pictures <= {path.name for path in found.folder.iterdir()}
+    assert pictures <= {path.name for path in (tmp_path / "processed").iterdir()}

@@ -52,6 +52,10 @@ def test_script_runs(script, tmp_path):
     assert COLUMNS[script] <= set(table.header)
     assert table.origin["clsas"] == clsas.__version__
     assert table.origin["command"].startswith(f"scripts/thesis/{script}.py --out")
+    if script == "figures_39_45":
+        assert [row[0] for row in stored_tables.read(tmp_path / "figure_45.csv").rows] == [
+            "1", "4", "16",
+        ]  # fmt: skip
     pictures = list(tmp_path.glob("*.png"))
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in pictures)
     assert pictures

@@ -108,12 +108,28 @@ def test_scaling_fits_exponents_and_writes_them(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(bench, "run_factorized", measured)
     tables.scaling(None, 1024, tmp_path / "s.png")
     told = capsys.readouterr().out
-    assert "N^2.00 (factorized), N^3.00 (exact)" in told
-    ((header, rows),) = printed(told)
-    assert [row[0] for row in rows] == ["256", "512", "1024"]
-    assert [float(row[header.index("factorized_s")]) for row in rows] == [0.1, 0.4, 1.6]
-    assert [float(row[header.index("exact_s")]) for row in rows] == [1, 8, 64]
+    (header, rows), (_, growths) = printed(told)
+    assert [row[0] for row in rows] == ["256", "384", "512", "768", "1024"]
+    of_octaves = [row[header.index("factorized_s")] for row in rows[::2]]
+    assert of_octaves == ["0.1", "0.4", "1.6"]
+    assert [row[header.index("exact_s")] for row in rows[::2]] == ["1", "8", "64"]
+    assert growths == [
+        ["factorized", "2.00", "2.00 to 2.00", "5", "256 to 1024"],
+        ["exact", "3.00", "3.00 to 3.00", "5", "256 to 1024"],
+    ]
     assert (tmp_path / "s.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_intervals_of_exponents_contain_the_true_one_as_often_as_they_claim():
+    random, sizes = np.random.default_rng(1), np.array([64, 256, 384, 512, 768, 1024])
+    found = [
+        tables.growth(sizes, sizes**2.5 * np.exp(0.1 * random.standard_normal(len(sizes))))
+        for _ in range(1000)
+    ]
+    covered = np.mean([abs(each.exponent - 2.5) <= each.half_width for each in found])
+    assert covered == pytest.approx(0.95, abs=0.02)
+    assert {tuple(each.sizes) for each in found} == {tuple(sizes[1:])}  # 64 has fixed costs
+    assert tables.growth([256, 512], [1.0, 4.0]).cells == ["2.00", "", "2", "256 to 512"]
 
 
 @pytest.mark.slow
