@@ -1,0 +1,165 @@
+"""Levels of a mosaic that mix patches: computed by one process when the patches are finished.
+
+Their record, the group `levels`, contains the checksums of their chunks, and a digest of those of
+the pixels from which they were computed. If patches have changed since, the digests differ, and the
+levels are computed again. The result depends on the pixels alone, so a run that is killed and
+continued leaves the same levels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.atomic import sync_folder
+from clsas.mosaics.arrays import open_array, write_values
+from clsas.mosaics.chunks import chunk_checksums
+from clsas.mosaics.documents import (
+    DamageError,
+    canonical,
+    check_own,
+    is_intact,
+    read_attributes,
+    with_checksum,
+    write_attributes,
+)
+from clsas.mosaics.levels import IN_DB, LEVELS, PixelArray, mosaic_arrays
+from clsas.mosaics.pyramid import Level, coarser, covered, in_db
+from clsas.mosaics.record import Checksums, PatchIndex
+
+_PATCHES = "patches"  # attribute with the digest of the patches
+_CHUNKS = "chunks_crc32c"  # attribute with the checksums of the chunks, by the name of the array
+
+
+def digest_of_patches(checksums: dict[PatchIndex, Checksums]) -> str:
+    """Return a digest of the pixels of the finished patches."""
+    pixels = {"{}.{}".format(*index): each["pixels"] for index, each in checksums.items()}
+    return hashlib.sha256(canonical(pixels)).hexdigest()[:16]
+
+
+def is_current(path: Path, attributes: dict[str, Any], digest: str) -> bool:
+    """Return whether the levels of a mosaic are those of its patches.
+
+    Parameters
+    ----------
+    path : Path
+        The store.
+    attributes : dict
+        Attributes of the store.
+    digest : str
+        Digest of the finished patches.
+    """
+    try:
+        stored = read_attributes(path / LEVELS)
+        found = {
+            array.name: chunk_checksums(path, array, _all_chunks(array))
+            for array in mosaic_arrays(attributes)
+        }
+    except (OSError, DamageError, ValueError):
+        return False
+    return is_intact(stored) and stored.get(_PATCHES) == digest and stored.get(_CHUNKS) == found
+
+
+def complete(
+    path: Path,
+    attributes: dict[str, Any],
+    digest: str,
+    read: Callable[[slice, slice], NDArray[np.complex64]],
+    tell: Callable[[int, int], object] | None,
+) -> None:
+    """Compute the levels of a mosaic that mix patches, and write their record.
+
+    Parameters
+    ----------
+    path : Path
+        The store.
+    attributes : dict
+        Attributes of the store.
+    digest : str
+        Digest of the finished patches.
+    read : callable
+        Called as read(rows, columns) with slices; returns pixels of the mosaic.
+    tell : callable or None
+        Called as tell(chunks computed so far, number of chunks).
+    """
+    folder = path / LEVELS
+    check_own(path, folder)
+    # Remove the old record first, so that it never stands beside new chunks.
+    if (folder / "zarr.json").exists():
+        (folder / "zarr.json").unlink()
+        sync_folder(folder)
+    arrays = mosaic_arrays(attributes)
+    by_factor = {
+        factor: [array for array in arrays if array.factor == factor]
+        for factor in sorted({array.factor for array in arrays})
+    }
+    work = [(factor, chunk) for factor, same in by_factor.items() for chunk in _all_chunks(same[0])]
+    for done, (factor, chunk) in enumerate(work, 1):
+        same = by_factor[factor]
+        window = _window(same[0], chunk)
+        level = _level(path, attributes, factor, window, read)
+        values = {"pixels": level.pixels, "amplitude": level.amplitude}
+        for array in same:
+            kind = array.name.split("/")[-1]
+            part = in_db(level.amplitude) if kind == IN_DB else values[kind]
+            write_values(path, attributes, array.name, window, part)
+        if tell is not None:
+            tell(done, len(work))
+    chunks = {array.name: chunk_checksums(path, array, _all_chunks(array)) for array in arrays}
+    write_attributes(folder, with_checksum({_PATCHES: digest, _CHUNKS: chunks}))
+
+
+def _level(
+    path: Path,
+    attributes: dict[str, Any],
+    factor: int,
+    window: tuple[slice, slice],
+    read: Callable[[slice, slice], NDArray[np.complex64]],
+) -> Level:
+    """Return a part of a level, computed from the level before or from the pixels."""
+    if factor == 1:
+        pixels = read(*window)
+        return Level(np.abs(pixels), pixels)
+    shape = attributes["inputs"]["pixels"]
+    before = factor // 2
+    finer = [
+        slice(2 * part.start, min(2 * part.stop, -(-count // before)))
+        for part, count in zip(window, shape, strict=True)
+    ]
+    weights = [
+        covered(part.start, part.stop - part.start, before, count)
+        for part, count in zip(finer, shape, strict=True)
+    ]
+    rows, columns = finer
+    if before == 1:
+        pixels = read(rows, columns)
+        level = Level(np.abs(pixels), pixels)
+    else:
+        level = Level(
+            *(
+                np.asarray(open_array(path, attributes, f"{before}x/{kind}")[rows, columns])
+                for kind in ("amplitude", "pixels")
+            )
+        )
+    return coarser(level, weights[0], weights[1])
+
+
+def _all_chunks(array: PixelArray) -> list[tuple[int, int]]:
+    counts = (
+        range(-(-count // side)) for count, side in zip(array.shape, array.chunk_shape, strict=True)
+    )
+    return list(itertools.product(*counts))
+
+
+def _window(array: PixelArray, chunk: tuple[int, int]) -> tuple[slice, slice]:
+    rows, columns = (
+        slice(i * side, min((i + 1) * side, count))
+        for i, side, count in zip(chunk, array.chunk_shape, array.shape, strict=True)
+    )
+    return rows, columns
