@@ -44,6 +44,7 @@ from clsas.mosaics.levels import (
 )
 from clsas.mosaics.metadata import (
     Checked,
+    Form,
     axes_of,
     check_group,
     checked,
@@ -136,9 +137,9 @@ def write_values(
 
 def check_metadata(path: Path, attributes: dict[str, Any]) -> None:
     """Raise a DamageError that names the array if the metadata of any array are damaged."""
-    for name in forms(attributes, has_height(path, attributes)):
+    for name, form in forms(attributes, has_height(path, attributes)).items():
         try:
-            _checked(path, attributes, name)
+            _checked(path, attributes, name, form)
         except DamageError as error:
             raise DamageError(f"{name}: {error}") from error
 
@@ -157,9 +158,9 @@ def compared(
     """
     grid, found = plane_of(attributes), {}
     axes = axes_of(attributes)
-    for name in forms(attributes, with_height):
+    for name, form in forms(attributes, with_height).items():
         try:
-            _checked(path, attributes, name)
+            _checked(path, attributes, name, form)
             if name in axes and grid is not None:
                 values_m = _values(path, attributes, name)
                 if not np.array_equal(values_m, axes[name].values_m(grid)):
@@ -228,14 +229,14 @@ def _digests(path: Path, attributes: dict[str, Any], with_height: bool) -> dict[
     }
 
 
-def _checked(path: Path, attributes: dict[str, Any], name: str) -> Checked:
+def _checked(path: Path, attributes: dict[str, Any], name: str, form: Form) -> Checked:
     """Return the metadata of an array; raise DamageError if they are damaged."""
-    form = forms(attributes, name == "height")[name]
     return checked(path, name, form, attributes.get(DIGESTS, {}).get(name))
 
 
 def _opened(path: Path, attributes: dict[str, Any], name: str, *, read_only: bool) -> zarr.Array:
-    metadata = _checked(path, attributes, name)
+    form = forms(attributes, name == "height")[name]
+    metadata = _checked(path, attributes, name, form)
     validate.memory(f"a chunk of {name} in {path}", 2 * metadata.chunk_bytes)
     files = DurableStore.of_array(path, name, metadata, read_only=read_only)
     return zarr.open_array(files, path=name, mode="r" if read_only else "r+", zarr_format=3)

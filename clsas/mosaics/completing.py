@@ -29,8 +29,8 @@ from clsas.mosaics.documents import (
     with_checksum,
     write_attributes,
 )
-from clsas.mosaics.levels import IN_DB, LEVELS, PixelArray, mosaic_arrays
-from clsas.mosaics.pyramid import Level, coarser, covered, in_db
+from clsas.mosaics.levels import LEVELS, PixelArray, mosaic_arrays
+from clsas.mosaics.pyramid import Level, coarser, covered
 from clsas.mosaics.record import Checksums, PatchIndex
 
 _PATCHES = "patches"  # attribute with the digest of the patches
@@ -104,11 +104,8 @@ def complete(
         same = by_factor[factor]
         window = _window(same[0], chunk)
         level = _level(path, attributes, factor, window, read)
-        values = {"pixels": level.pixels, "amplitude": level.amplitude}
         for array in same:
-            kind = array.name.split("/")[-1]
-            part = in_db(level.amplitude) if kind == IN_DB else values[kind]
-            write_values(path, attributes, array.name, window, part)
+            write_values(path, attributes, array.name, window, level.values_of(array))
         if tell is not None:
             tell(done, len(work))
     chunks = {array.name: chunk_checksums(path, array, _all_chunks(array)) for array in arrays}
@@ -151,10 +148,10 @@ def _level(
 
 
 def _all_chunks(array: PixelArray) -> list[tuple[int, int]]:
-    counts = (
+    rows, columns = (
         range(-(-count // side)) for count, side in zip(array.shape, array.chunk_shape, strict=True)
     )
-    return list(itertools.product(*counts))
+    return list(itertools.product(rows, columns))
 
 
 def _window(array: PixelArray, chunk: tuple[int, int]) -> tuple[slice, slice]:

@@ -122,8 +122,8 @@ class PixelArray:
     def chunks(self, index: tuple[int, int]) -> list[tuple[int, int]]:
         """Return the indices of the chunks that belong to a patch, row by row."""
         window = zip(self.window(index), self.chunk_shape, strict=True)
-        ranges = [range(part.start // side, -(-part.stop // side)) for part, side in window]
-        return list(itertools.product(*ranges))
+        rows, columns = (range(part.start // side, -(-part.stop // side)) for part, side in window)
+        return list(itertools.product(rows, columns))
 
     def touched(self, rows: slice, columns: slice) -> Iterator[tuple[int, int]]:
         """Yield the indices of the patches to which the pixels of a window belong."""

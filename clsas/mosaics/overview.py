@@ -96,7 +96,7 @@ def reduced(grid: Grid, reading: Reading, step: int) -> Image:
             blocks = (np.abs(pixels) ** 2).reshape(
                 last - first, down // factor, stop - start, across // factor
             )
-            power[first:last, start:stop] = blocks.mean(axis=(1, 3))
+            power[first:last, start:stop] = blocks.mean(axis=1).mean(axis=2)
     origin_m, row_step_m, column_step_m = grid.vectors_m
     middle_m = (down - 1) / 2 * row_step_m + (across - 1) / 2 * column_step_m
     coarse = Grid.oriented(origin_m + middle_m, row_step_m * down, column_step_m * across, shape)

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.mosaics.levels import IN_DB, PixelArray
+
 _BAND = 256  # rows that are reduced at once: a plain choice, which keeps copies small
 
 
@@ -22,6 +24,12 @@ class Level(NamedTuple):
     """Root of the mean power."""
     pixels: NDArray[np.complex64]
     """Mean of the complex pixels."""
+
+    def values_of(self, array: PixelArray) -> NDArray[np.float32] | NDArray[np.complex64]:
+        """Return the values of an array of the level: amplitudes, pixels, or amplitudes in dB."""
+        if array.name == IN_DB:
+            return _in_db(self.amplitude)
+        return self.pixels if array.name.endswith("/pixels") else self.amplitude
 
 
 class _Sums(NamedTuple):
@@ -90,7 +98,7 @@ def coarser(level: Level, rows: NDArray[np.float64], columns: NDArray[np.float64
     return _Sums(power, count * level.pixels, rows, columns).halved().level()
 
 
-def in_db(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
+def _in_db(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return amplitudes in dB, NaN where they are zero."""
     level = np.full(amplitude.shape, np.nan, np.float32)
     np.log10(amplitude, out=level, where=amplitude > 0)

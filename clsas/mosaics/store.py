@@ -11,6 +11,7 @@ import math
 import os
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -49,7 +50,7 @@ from clsas.mosaics.levels import (
 from clsas.mosaics.metadata import GROUP, has_height
 from clsas.mosaics.overview import Reading, reduced, step_of
 from clsas.mosaics.provenance import OtherInputsError, differences
-from clsas.mosaics.pyramid import in_db, levels
+from clsas.mosaics.pyramid import levels
 from clsas.mosaics.record import (
     Checksums,
     PatchIndex,
@@ -351,11 +352,7 @@ class Store:
         _arrays().write_values(self.path, attributes, first.name, (rows, columns), pixels)
         found = levels(pixels, stored_levels(attributes).of_patches)
         for array in others:
-            level, kind = found[array.factor], array.name.split("/")[-1]
-            values = {"pixels": level.pixels, "amplitude": level.amplitude}.get(kind)
-            if values is None:
-                values = in_db(level.amplitude)
-            window = array.window((row, column))
+            window, values = array.window((row, column)), found[array.factor].values_of(array)
             _arrays().write_values(self.path, attributes, array.name, window, values)
         write_attributes(folder, record.attributes(self._checksums((row, column))))
 
@@ -675,9 +672,12 @@ class Store:
         """Return a digest of the pixels of the finished patches."""
         with needed("stores of mosaics"):
             from clsas.mosaics import completing
-        pixels = self._patch_arrays[:1]
-        finished = (index for index in self._indices() if Record.read(self._folder(index)))
-        return completing.digest_of_patches({i: self._checksums(i, pixels) for i in finished})
+        checksums: dict[PatchIndex, Checksums] = {}
+        for index in self._indices():
+            with suppress(DamageError):  # such a patch is formed again
+                if found := Record.read(self._folder(index)):
+                    checksums[index] = found[1]
+        return completing.digest_of_patches(checksums)
 
     def _is_complete(self) -> bool:
         """Return whether the levels that mix patches are those of the present patches."""

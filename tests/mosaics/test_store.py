@@ -304,14 +304,14 @@ def test_the_snippets_of_the_documentation_run_where_patches_are_unseen(tmp_path
     clsas.save("lines.h5", LINES)
     text = (Path(__file__).parents[2] / "docs" / "mosaic.md").read_text()
     snippets = [s for s in re.findall(r"```python\n(.*?)```", text, re.S) if "Client" not in s]
-    assert len(snippets) == 3
+    assert len(snippets) == 5
     pytest.importorskip("xarray")
     # Few pixels, most of them beyond the track and the recorded ranges.
     small = snippets[0].replace("(0, 500, 10001)", "(0, 500, 56)")
     small = small.replace("(30, 130, 2001)", "(30, 130, 48)").replace("tol", "patches=(2, 5), tol")
     names = {"lines": LINES}
-    part = snippets[2].replace("slice(2000, 3000)", "slice(20, 30)")
-    for snippet in (small, snippets[1], part):
+    part = snippets[4].replace("slice(2000, 3000)", "slice(20, 30)")
+    for snippet in (small, *snippets[1:4], part):
         exec(snippet, names)
     records = Store.opened("image.zarr").records().values()
     assert {record.has_pixels for record in records} == {True, False}
