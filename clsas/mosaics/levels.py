@@ -161,7 +161,7 @@ def levels_of(shape: tuple[int, ...], patch_shape: tuple[int, int]) -> Levels:
     return Levels(aligned, factors[len(aligned) :])
 
 
-def aligned_side(side: int, count: int, pixels: int) -> int:
+def aligned_side(side: int, count: int, pixels: int, coarsest: int) -> int:
     """Return the side of a patch, rounded up so that as many levels as possible are of patches.
 
     Parameters
@@ -172,8 +172,10 @@ def aligned_side(side: int, count: int, pixels: int) -> int:
         Number of patches along this side, which the result keeps.
     pixels : int
         Pixels of the mosaic along this side.
+    coarsest : int
+        Factor of the coarsest level of the mosaic.
     """
-    factor = factors_of((pixels,))[-1]
+    factor = coarsest
     while factor > 1:
         rounded = math.ceil(side / factor) * factor
         if math.ceil(pixels / rounded) == count:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from clsas.core import validate
 from clsas.core.grid import Grid
-from clsas.mosaics.levels import aligned_side
+from clsas.mosaics.levels import aligned_side, factors_of
 from clsas.mosaics.record import PatchIndex
 from clsas.mosaics.visibility import SurveyVisibility
 
@@ -78,11 +78,12 @@ def choose_patch_shape(
         If not even the smallest patches fit.
     """
     side = _LARGEST_SIDE
+    coarsest = factors_of(grid.shape)[-1]
     needed = 0
     while side >= _SMALLEST_SIDE:
         # Make the patches as equal as possible, and levels end at their borders.
         height, width = (
-            aligned_side(math.ceil(n / math.ceil(n / side)), math.ceil(n / side), n)
+            aligned_side(math.ceil(n / math.ceil(n / side)), math.ceil(n / side), n, coarsest)
             for n in grid.shape
         )
         most = 0
@@ -128,5 +129,5 @@ def patch_shape_of(patches: tuple[int, int], grid: Grid) -> tuple[int, int]:
                 f"patches must all have pixels: {count} patches of {side} are too many for "
                 f"{pixels} pixels, {fewer} are enough"
             )
-        shape.append(aligned_side(side, count, pixels))
+        shape.append(aligned_side(side, count, pixels, factors_of(grid.shape)[-1]))
     return shape[0], shape[1]
