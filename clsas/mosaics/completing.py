@@ -66,6 +66,22 @@ def is_current(path: Path, attributes: dict[str, Any], digest: str) -> bool:
     return is_intact(stored) and stored.get(_PATCHES) == digest and stored.get(_CHUNKS) == found
 
 
+def damage(path: Path, attributes: dict[str, Any]) -> dict[str, str]:
+    """Read the levels of a mosaic; return the reason for each damaged array, by its name."""
+    found = {}
+    for array in mosaic_arrays(attributes):
+        try:
+            stored = open_array(path, attributes, array.name)
+        except DamageError:  # of the metadata, which are compared elsewhere
+            continue
+        try:
+            for window in (_window(array, chunk) for chunk in _all_chunks(array)):
+                _ = stored[window]
+        except ValueError:  # Zarr's message about a checksum
+            found[array.name] = "its values do not match their checksum"
+    return found
+
+
 def complete(
     path: Path,
     attributes: dict[str, Any],

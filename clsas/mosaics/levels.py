@@ -1,15 +1,16 @@
 """Levels of a mosaic: the image at 2, 4, 8, ... times the pixel spacing, for pictures and maps.
 
-Every level is a Zarr group, `2x`, `4x` and so on, with the arrays `pixels` (the mean of the complex
-pixels) and `amplitude` (the root of their mean power). The store's attributes list the groups by
-the convention *multiscales* of zarr-conventions, with the layout that GDAL writes. It is the one
-that GDAL (3.13 and later) reads as overviews, and it needs no axes of microscopy, as OME-Zarr does,
-and no tile matrix set, as drafts of GeoZarr did. To xarray and Zarr the levels are plain groups.
+Every level is a Zarr group, `2x`, `4x` and so on, with the arrays `pixels`, the mean of the complex
+pixels, and `amplitude`, the root of their mean power. The attributes of the store list these groups
+by the convention *multiscales* 0.1 of zarr-conventions, in the layout that GDAL itself writes. This
+convention was chosen because GDAL reads it as overviews, from version 3.13 on, and because it needs
+no axes of microscopy, as OME-Zarr does, and no tile matrix set, as drafts of GeoZarr did. For
+xarray and Zarr the levels are ordinary groups.
 
-A level is *of patches* if its pixels do not reach across the borders of patches, which is the case
-if the factor divides the sides of a patch. It is then written with each patch, and no two patches
-share a chunk, so that any number of processes can write at once. The other levels are *of the
-mosaic*: one process computes them when all patches are finished.
+If the factor of a level divides the sides of a patch, every pixel of the level belongs to one
+patch. Such a level is *of patches*: it is written with each patch, and no two patches share a
+chunk, so that any number of processes can write at once. The other levels are *of the mosaic*: one
+process computes them when all patches are finished (`clsas.mosaics.completing`).
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ CHUNK_SHAPE = "chunk_shape"
 
 _CONVENTION = {
     "uuid": "d35379db-88df-4056-af3a-620245f8e347",
-    "schema_url": "https://raw.githubusercontent.com/zarr-conventions/multiscales/refs/tags/v1/"
+    "schema_url": "https://raw.githubusercontent.com/zarr-conventions/multiscales/refs/tags/v0.1/"
     "schema.json",
-    "spec_url": "https://github.com/zarr-conventions/multiscales/blob/v1/README.md",
+    "spec_url": "https://github.com/zarr-conventions/multiscales/blob/v0.1/README.md",
     "name": "multiscales",
     "description": "Multiscale layout of zarr datasets",
 }
 _SMALLEST_CHUNK = 64  # pixels; a patch without a larger divisor is one chunk
-_MOST_FACTOR = 1 << 30  # of levels in the document of a store; arbitrary
+_MOST_LEVELS = 32  # in the document of a store: more than memory and disks allow
 
 
 @dataclass(frozen=True)
@@ -229,14 +230,13 @@ def are_levels(attributes: Mapping[str, Any]) -> bool:
     stored = attributes.get(LEVELS, {"of_patches": [], "of_mosaic": []})
     if not (isinstance(stored, dict) and stored.keys() == {"of_patches", "of_mosaic"}):
         return False
-    lists = list(stored.values())
-    if not all(isinstance(each, list) and all(type(n) is int for n in each) for each in lists):
+    if not all(isinstance(each, list) and len(each) <= _MOST_LEVELS for each in stored.values()):
         return False
     factors = stored["of_patches"] + stored["of_mosaic"]
     expected = [1] if factors == [1] else [2 << i for i in range(len(factors))]
     return (
         factors == expected
-        and all(factor <= _MOST_FACTOR for factor in factors)
+        and all(type(factor) is int for factor in factors)
         and all(
             side % factor == 0 or side >= count
             for factor in stored["of_patches"]

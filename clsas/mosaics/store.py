@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +25,6 @@ from clsas.core.digests import grid_digest
 from clsas.core.extras import needed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
-from clsas.mosaics.chunks import any_missing, chunk_checksums
 from clsas.mosaics.documents import (
     DIGESTS,
     DamageError,
@@ -40,7 +37,6 @@ from clsas.mosaics.documents import (
     write_attributes,
 )
 from clsas.mosaics.levels import (
-    IN_DB,
     LEVELS,
     PixelArray,
     mosaic_arrays,
@@ -49,10 +45,10 @@ from clsas.mosaics.levels import (
 )
 from clsas.mosaics.metadata import GROUP, has_height
 from clsas.mosaics.overview import Reading, reduced, step_of
+from clsas.mosaics.patch_files import PatchFiles
 from clsas.mosaics.provenance import OtherInputsError, differences
 from clsas.mosaics.pyramid import levels
 from clsas.mosaics.record import (
-    Checksums,
     PatchIndex,
     Record,
     describe_arrays,
@@ -140,7 +136,7 @@ class Store:
         Empty for a mosaic that fits on a screen, or one of an early version to which `add_levels`
         has not added any. Levels that mix patches are missing until a run has finished all patches.
         """
-        arrays = self._patch_arrays
+        arrays = list(self._files.arrays)
         if self._mosaic_arrays and self._is_complete():
             arrays = [*arrays, *self._mosaic_arrays]
         return tuple(sorted({array.factor for array in arrays} - {1}))
@@ -264,9 +260,10 @@ class Store:
         pixels themselves are not read; `damage` reads them too.
         """
         found = {}
-        for index in self._indices():
+        _ = self.pixels  # raises if their metadata are damaged
+        for index in self._files.indices():
             try:
-                record = self._record(index)
+                record = self._files.record(index)
             except DamageError:
                 continue
             if record is not None:
@@ -292,10 +289,11 @@ class Store:
             If a file cannot be read.
         """
         validate.function("tell", tell)
-        found, indices = {}, self._indices()
+        _ = self.pixels  # raises if their metadata are damaged
+        found, indices = {}, self._files.indices()
         for done, index in enumerate(indices, 1):
             try:
-                self._verify(index)
+                self._files.verify(index, self._opened)
             except DamageError as error:
                 found[index] = str(error)
             if tell is not None:
@@ -331,7 +329,9 @@ class Store:
         """
         row, column = (
             validate.count(name, index, least=0, most=most - 1)
-            for name, index, most in zip(("row", "column"), (row, column), self._shape, strict=True)
+            for name, index, most in zip(
+                ("row", "column"), (row, column), self._files.shape, strict=True
+            )
         )
         part = [
             range(count)[validate.selection(name, given, ascending=True)]
@@ -341,20 +341,20 @@ class Store:
         ]
         pixels = validate.array("pixels", pixels, np.complex64, tuple(map(len, part)))
         validate.instance("record", record, Record)
-        folder = self._folder((row, column))
+        folder = self._files.folder((row, column))
         check_own(self.path, folder)
         # Remove the old record first, so that it never stands beside pixels of the new patch.
         if (folder / "zarr.json").exists():
             (folder / "zarr.json").unlink()
             sync_folder(folder)
         attributes = read_document(self.path)
-        first, *others = self._patch_arrays
+        first, *others = self._files.arrays
         _arrays().write_values(self.path, attributes, first.name, (rows, columns), pixels)
         found = levels(pixels, stored_levels(attributes).of_patches)
         for array in others:
             window, values = array.window((row, column)), found[array.factor].values_of(array)
             _arrays().write_values(self.path, attributes, array.name, window, values)
-        write_attributes(folder, record.attributes(self._checksums((row, column))))
+        write_attributes(folder, record.attributes(self._files.checksums((row, column))))
 
     def complete_levels(self, tell: Callable[[int, int], object] | None = None) -> bool:
         """Compute the levels that mix patches, unless they already are those of the patches.
@@ -413,7 +413,7 @@ class Store:
         validate.function("tell", tell)
         if stored_levels(read_document(self.path)).coarsest is None:
             _arrays().add_levels(self.path)
-            for name in ("_patch_arrays", "_mosaic_arrays"):
+            for name in ("_files", "_mosaic_arrays"):
                 self.__dict__.pop(name, None)
         return self.complete_levels(tell)
 
@@ -429,7 +429,7 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        return self._read(self._patch_arrays[0], rows, columns)
+        return self._read(self._files.pixels, rows, columns)
 
     def read_level(
         self,
@@ -473,7 +473,7 @@ class Store:
         return self._read(array, rows, columns)
 
     def _array(self, name: str) -> PixelArray:
-        arrays = [*self._patch_arrays, *self._mosaic_arrays]
+        arrays = [*self._files.arrays, *self._mosaic_arrays]
         return next(array for array in arrays if array.name == name)
 
     def _read(self, array: PixelArray, rows: slice, columns: slice) -> NDArray:
@@ -484,17 +484,17 @@ class Store:
             len(range(n)[part]) for n, part in zip(stored.shape, (rows, columns), strict=True)
         )
         validate.memory("the mosaic", stored.dtype.itemsize * math.prod(requested))
-        patches = list(array.touched(rows, columns)) if array in self._patch_arrays else []
+        patches = list(array.touched(rows, columns)) if array in self._files.arrays else []
         try:
             _arrays().check_metadata(self.path, read_document(self.path))
             for index in patches:
-                self._record(index, [array])
+                self._files.record(index, [array])
             return np.asarray(stored[rows, columns])
         except ValueError as error:
             found = {}
             for index in patches:
                 try:
-                    self._verify(index, [array])
+                    self._files.verify(index, self._opened, [array])
                 except DamageError as damage:
                     found[index] = str(damage)
             reason = describe_damage(found) if found else f"{array.name}: {error}"
@@ -575,109 +575,28 @@ class Store:
                 *(slice(e.start // factor, -(-e.stop // factor), e.step) for e in chosen),
             )
 
-        rows_at_once, columns_at_once = (factor * side for side in self._patch_shape)
+        rows_at_once, columns_at_once = (factor * side for side in self._files.pixels.patch_shape)
         return reduced(part, Reading(read, factor, (rows_at_once, columns_at_once)), step)
 
     def _compared(self) -> tuple[Grid | None, dict[str, str]]:
         attributes = read_document(self.path)
         return _arrays().compared(self.path, attributes, has_height(self.path, attributes))
 
-    def _indices(self) -> list[PatchIndex]:
-        """Return the patches that have a folder for their record, in order."""
-        _ = self.pixels  # raises if their metadata are damaged
-        shape = self._shape
-        folders = self.path / GROUP
-        found = []
-        for folder in folders.iterdir() if folders.is_dir() else ():
-            if name := re.fullmatch(r"(\d+)\.(\d+)", folder.name):
-                index = int(name[1]), int(name[2])
-                if index[0] < shape[0] and index[1] < shape[1]:
-                    found.append(index)
-        return sorted(found)
-
-    @property
-    def _shape(self) -> tuple[int, int]:
-        """Number of patches along rows and columns."""
-        shape, patch_shape = self._patch_arrays[0].shape, self._patch_shape
-        rows, columns = (math.ceil(n / m) for n, m in zip(shape, patch_shape, strict=True))
-        return rows, columns
-
-    @property
-    def _patch_shape(self) -> tuple[int, int]:
-        return self._patch_arrays[0].patch_shape
-
     @cached_property
-    def _patch_arrays(self) -> list[PixelArray]:
-        """The pixels, and the levels that are written with each patch."""
-        return patch_arrays(read_document(self.path))
+    def _files(self) -> PatchFiles:
+        """The files that are written with each patch."""
+        return PatchFiles(self.path, tuple(patch_arrays(read_document(self.path))))
 
     @cached_property
     def _mosaic_arrays(self) -> list[PixelArray]:
         """The levels that mix patches."""
         return mosaic_arrays(read_document(self.path))
 
-    def _folder(self, index: PatchIndex) -> Path:
-        return self.path / GROUP / "{}.{}".format(*index)
-
-    def _checksums(self, index: PatchIndex, arrays: list[PixelArray] | None = None) -> Checksums:
-        """Return the checksums behind a patch's pixels and levels."""
-        return {
-            array.name: chunk_checksums(self.path, array, array.chunks(index))
-            for array in (self._patch_arrays if arrays is None else arrays)
-        }
-
-    def _record(self, index: PatchIndex, arrays: list[PixelArray] | None = None) -> Record | None:
-        """Return the record of a patch, or None if the patch is not finished.
-
-        Parameters
-        ----------
-        index : (row, column)
-        arrays : list of PixelArray, optional
-            Arrays whose checksums are compared with the record; by default the pixels and the
-            levels of patches.
-
-        Raises
-        ------
-        DamageError
-            If the record is damaged, or a checksum behind pixels or levels is not that of the
-            record.
-        """
-        found = Record.read(self._folder(index))
-        if found is None:
-            return None
-        record, expected = found
-        for array in self._patch_arrays if arrays is None else arrays:
-            try:
-                same = self._checksums(index, [array])[array.name] == expected.get(array.name, "")
-            except ValueError as error:
-                raise DamageError(str(error)) from error
-            if not same:
-                gone = any_missing(self.path, array, array.chunks(index))
-                raise DamageError(
-                    f"its {_words(array)} are " + ("gone" if gone else "not those of its record")
-                )
-        return record
-
-    def _verify(self, index: PatchIndex, arrays: list[PixelArray] | None = None) -> None:
-        """Read a patch if it is finished; raise DamageError if it differs from what was written."""
-        if self._record(index, arrays) is None:
-            return
-        for array in self._patch_arrays if arrays is None else arrays:
-            try:
-                _ = self._opened(array)[array.window(index)]
-            except ValueError as error:  # Zarr's message about a checksum
-                raise DamageError(f"its {_words(array)} do not match their checksum") from error
-
     def _digest(self) -> str:
         """Return a digest of the pixels of the finished patches."""
         with needed("stores of mosaics"):
             from clsas.mosaics import completing
-        checksums: dict[PatchIndex, Checksums] = {}
-        for index in self._indices():
-            with suppress(DamageError):  # such a patch is formed again
-                if found := Record.read(self._folder(index)):
-                    checksums[index] = found[1]
-        return completing.digest_of_patches(checksums)
+        return completing.digest_of_patches(self._files.recorded())
 
     def _is_complete(self) -> bool:
         """Return whether the levels that mix patches are those of the present patches."""
@@ -687,28 +606,11 @@ class Store:
 
     def _level_damage(self) -> dict[str, str]:
         """Read the levels that mix patches, if they are complete; return those that are damaged."""
-        found: dict[str, str] = {}
         if not (self.path / LEVELS / "zarr.json").exists() or not self._is_complete():
-            return found
-        for array in self._mosaic_arrays:
-            try:
-                stored = _arrays().open_array(self.path, read_document(self.path), array.name)
-            except DamageError:  # of the metadata, which `array_damage` reports
-                continue
-            height = array.chunk_shape[0]
-            try:
-                for first in range(0, array.shape[0], height):
-                    _ = stored[first : first + height]
-            except ValueError:  # Zarr's message about a checksum
-                found[array.name] = "its values do not match their checksum"
-        return found
-
-
-def _words(array: PixelArray) -> str:
-    """Return what an array has of a patch, in words."""
-    if array.name == "pixels":
-        return "pixels"
-    return "amplitudes in dB" if array.name == IN_DB else f"values of {array.name}"
+            return {}
+        with needed("stores of mosaics"):
+            from clsas.mosaics import completing
+        return completing.damage(self.path, read_document(self.path))
 
 
 def _arrays() -> ModuleType:

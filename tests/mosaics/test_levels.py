@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import stores
 from click.testing import CliRunner
 from stores import change, files_of, written
 
@@ -17,6 +18,7 @@ import clsas
 from clsas.cli import main
 from clsas.core.digests import grid_digest
 from clsas.core.grid import Grid
+from clsas.mosaics import pyramid
 from clsas.mosaics.documents import read_document
 from clsas.mosaics.levels import Levels, aligned_side, chunk_side, levels_of
 from clsas.mosaics.patches import Layout
@@ -121,11 +123,13 @@ def test_levels_are_means_of_power_and_of_pixels(tmp_path, patch_shape, levels):
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
-def test_powers_beyond_single_precision_are_kept(tmp_path, scale):
+def test_powers_beyond_single_precision_are_kept(scale):
     pixels = (scale * PIXELS).astype(np.complex64)
-    for patch_shape in (OF_PATCHES, ODD):
-        store = formed(tmp_path / f"{patch_shape[0]}.zarr", patch_shape, pixels)
-        np.testing.assert_allclose(store.read_level(8), scale * expected(8)[0], rtol=1e-5)
+    found = pyramid.levels(pixels, (2, 4))
+    np.testing.assert_allclose(found[4].amplitude, scale * expected(4)[0], rtol=1e-6)
+    rows, columns = (pyramid.covered(0, -(-n // 2), 2, n) for n in GRID.shape)
+    coarser = pyramid.coarser(found[2], rows, columns)
+    np.testing.assert_allclose(coarser.amplitude, scale * expected(4)[0], rtol=1e-6)
 
 
 class Killed(BaseException):
@@ -351,6 +355,7 @@ class TestStoresOfVersion2:
         assert store.complete_levels()
         np.testing.assert_allclose(store.read_level(8), expected(8)[0], rtol=1e-6)
 
+    @pytest.mark.slow
     def test_adding_is_killed_at_any_step(self, store, tmp_path, monkeypatch):
         whole = tmp_path / "whole.zarr"
         shutil.copytree(store.path, whole)
@@ -366,6 +371,26 @@ class TestStoresOfVersion2:
             assert files_of(path) == files_of(whole)
             step += 7
         assert step > 14
+
+
+def test_a_mosaic_forms_levels_and_continues_patches_of_other_sides(tmp_path, monkeypatch):
+    """As those of early versions, which are not rounded for levels."""
+    with monkeypatch.context() as patch:
+        patch.setattr("clsas.mosaics.levels.COARSEST_SIDE", 1024)
+        old = clsas.mosaic(stores.LINES, stores.GRID, tmp_path / "old.zarr", **stores.REQUEST)
+    new = clsas.mosaic(stores.LINES, stores.GRID, tmp_path / "new.zarr", **stores.REQUEST)
+    assert (old.patch_shape, new.patch_shape) == ((15, 14), (16, 16))
+    image = new.image()
+    again = clsas.mosaic(stores.LINES, stores.GRID, tmp_path / "old.zarr", **stores.REQUEST)
+    assert again.patch_shape == (15, 14)
+    assert clsas.relative_error_db(again.image(), image) < -50
+    store = clsas.Store.opened(tmp_path / "new.zarr")
+    assert store.levels == (2, 4)
+    for factor in store.levels:
+        amplitude = expected(factor, image.pixels)[0]
+        np.testing.assert_allclose(store.read_level(factor), amplitude, rtol=1e-6)
+    assert clsas.Store.opened(tmp_path / "old.zarr").levels == ()
+    assert clsas.Store.opened(tmp_path / "old.zarr").overview(10).shape == (7, 10)
 
 
 class TestOtherPrograms:
