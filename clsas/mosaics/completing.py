@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,11 @@ from clsas.mosaics.documents import (
     with_checksum,
     write_attributes,
 )
-from clsas.mosaics.levels import LEVELS, PixelArray, mosaic_arrays
+from clsas.mosaics.levels import LEVELS, PixelArray, mosaic_arrays, patch_arrays
 from clsas.mosaics.pyramid import Level, coarser, covered
 from clsas.mosaics.record import Checksums, PatchIndex
 
+_KEPT = 4  # patches that are kept while levels are computed: those around a corner
 _PATCHES = "patches"  # attribute with the digest of the patches
 _CHUNKS = "chunks_crc32c"  # attribute with the checksums of the chunks, by the name of the array
 
@@ -115,7 +117,8 @@ def complete(
         factor: [array for array in arrays if array.factor == factor]
         for factor in sorted({array.factor for array in arrays})
     }
-    work = [(factor, chunk) for factor, same in by_factor.items() for chunk in _all_chunks(same[0])]
+    work = [(factor, chunk) for factor, same in by_factor.items() for chunk in _in_order(same[0])]
+    read = _by_patches(read, patch_arrays(attributes)[0])
     for done, (factor, chunk) in enumerate(work, 1):
         same = by_factor[factor]
         window = _window(same[0], chunk)
@@ -161,6 +164,40 @@ def _level(
             )
         )
     return coarser(level, weights[0], weights[1])
+
+
+def _by_patches(
+    read: Callable[[slice, slice], NDArray[np.complex64]], array: PixelArray
+) -> Callable[[slice, slice], NDArray[np.complex64]]:
+    """Return a function that reads whole patches, which may be one chunk, and keeps the latest."""
+
+    @lru_cache(maxsize=_KEPT)
+    def patch(index: PatchIndex) -> NDArray[np.complex64]:
+        return read(*array.window(index))
+
+    def window(rows: slice, columns: slice) -> NDArray[np.complex64]:
+        pixels = np.empty((rows.stop - rows.start, columns.stop - columns.start), np.complex64)
+        for index in array.touched(rows, columns):
+            common = [
+                (slice(max(a.start, b.start), min(a.stop, b.stop)), a.start, b.start)
+                for a, b in zip((rows, columns), array.window(index), strict=True)
+            ]
+            to = tuple(slice(part.start - own, part.stop - own) for part, own, _ in common)
+            of = tuple(slice(part.start - its, part.stop - its) for part, _, its in common)
+            pixels[to] = patch(index)[of]
+        return pixels
+
+    return window
+
+
+def _in_order(array: PixelArray) -> list[tuple[int, int]]:
+    """Return all chunks of a level, those that begin in the same patch one after another."""
+
+    def patch(chunk: tuple[int, int]) -> tuple[int, ...]:
+        sides = zip(chunk, array.chunk_shape, array.patch_shape, strict=True)
+        return tuple(i * side * array.factor // of_patch for i, side, of_patch in sides)
+
+    return sorted(_all_chunks(array), key=lambda chunk: (patch(chunk), chunk))
 
 
 def _all_chunks(array: PixelArray) -> list[tuple[int, int]]:
