@@ -324,6 +324,8 @@ class Store:
 
         Raises
         ------
+        ValueError
+            If `rows` or `columns` are not those of the patch.
         OSError
             If the disk is full or the store is not writable.
         """
@@ -333,13 +335,17 @@ class Store:
                 ("row", "column"), (row, column), self._files.shape, strict=True
             )
         )
-        part = [
-            range(count)[validate.selection(name, given, ascending=True)]
-            for name, given, count in zip(
-                ("rows", "columns"), (rows, columns), self.pixels.shape, strict=True
-            )
-        ]
-        pixels = validate.array("pixels", pixels, np.complex64, tuple(map(len, part)))
+        own = self._files.pixels.window((row, column))
+        for name, given, part, count in zip(
+            ("rows", "columns"), (rows, columns), own, self.pixels.shape, strict=True
+        ):
+            if range(count)[validate.selection(name, given, ascending=True)] != range(count)[part]:
+                raise ValueError(
+                    f"{name} must be {part.start}:{part.stop} for patch {row},{column}, got "
+                    f"{validate.shown(given)}"
+                )
+        shape = tuple(part.stop - part.start for part in own)
+        pixels = validate.array("pixels", pixels, np.complex64, shape)
         validate.instance("record", record, Record)
         folder = self._files.folder((row, column))
         check_own(self.path, folder)
