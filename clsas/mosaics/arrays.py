@@ -30,12 +30,26 @@ from clsas.mosaics.documents import (
     write_attributes,
 )
 from clsas.mosaics.durable import DurableStore
+from clsas.mosaics.levels import (
+    CHUNK_SHAPE,
+    IN_DB,
+    LEVELS,
+    Levels,
+    chunk_side,
+    factors_of,
+    levels_of,
+    mosaic_arrays,
+    multiscales,
+    patch_arrays,
+)
 from clsas.mosaics.metadata import (
-    GROUP,
     Checked,
+    Form,
+    axes_of,
     check_group,
     checked,
     forms,
+    groups_of,
     has_height,
 )
 
@@ -54,21 +68,22 @@ def create_store(
     OSError
         If the parent folder cannot be written.
     """
-    chunk_bytes = 8 * math.prod(patch_shape)  # complex64
-    validate.memory("a chunk of pixels", 2 * chunk_bytes)
+    validate.memory("a patch of pixels", 2 * 8 * math.prod(patch_shape))  # complex64
     plane = None
     if grid.points_m is None:
         plane = {name: getattr(grid, name).tolist() for name in VECTORS}
+    levels = levels_of(grid.shape, patch_shape)
     attributes = {
         "format": FORMAT,
         "version": VERSION,
         "patch_shape": list(patch_shape),
+        CHUNK_SHAPE: list(map(chunk_side, patch_shape, grid.shape)),
+        LEVELS: levels.json(),
         "grid": plane,
         "inputs": inputs,
-    }
+    } | multiscales(levels)
     with creating(path) as temporary:
-        _create_arrays(temporary, grid, patch_shape)
-        write_attributes(temporary / GROUP, {})
+        _create_arrays(temporary, grid, attributes)
         digests = _digests(temporary, attributes, grid.height_m is not None)
         write_attributes(temporary, with_checksum(attributes | {DIGESTS: digests}))
 
@@ -84,22 +99,47 @@ def open_array(path: Path, attributes: dict[str, Any], name: str) -> zarr.Array:
     return _opened(path, attributes, name, read_only=True)
 
 
-def write_pixels(
+def add_levels(path: Path) -> None:
+    """Add the arrays of levels to a store without them, all to be computed by `complete_levels`.
+
+    A killed process leaves a store without levels, or one with them.
+
+    Raises
+    ------
+    OSError
+        If the store cannot be written.
+    """
+    attributes = read_document(path)
+    levels = Levels(of_mosaic=factors_of(attributes["inputs"]["pixels"]))
+    attributes = attributes | {LEVELS: levels.json()} | multiscales(levels)
+    names = {name.split("/")[0] for name in forms(attributes, False)} - {"pixels", "x", "y"}
+    with staging(path) as temporary:
+        new, old = temporary / "new", temporary / "old"
+        new.mkdir()
+        old.mkdir()
+        _create_arrays(new, plane_of(attributes), attributes)
+        for name in sorted(names):
+            _exchange(path, name, new, old)
+    digests = _digests(path, attributes, has_height(path, attributes))
+    write_attributes(path, with_checksum(attributes | {DIGESTS: digests}))
+
+
+def write_values(
     path: Path,
     attributes: dict[str, Any],
-    rows: slice,
-    columns: slice,
-    pixels: NDArray[np.complex64],
+    name: str,
+    window: tuple[slice, slice],
+    values: NDArray[np.complex64] | NDArray[np.float32],
 ) -> None:
-    """Write the pixels of whole patches. Zarr writes no chunk for pixels that are all zero."""
-    _opened(path, attributes, "pixels", read_only=False)[rows, columns] = pixels
+    """Write whole chunks of an array. Zarr writes no chunk that has only the fill value."""
+    _opened(path, attributes, name, read_only=False)[window] = values
 
 
 def check_metadata(path: Path, attributes: dict[str, Any]) -> None:
     """Raise a DamageError that names the array if the metadata of any array are damaged."""
-    for name in forms(attributes, has_height(path, attributes)):
+    for name, form in forms(attributes, has_height(path, attributes)).items():
         try:
-            _checked(path, attributes, name)
+            _checked(path, attributes, name, form)
         except DamageError as error:
             raise DamageError(f"{name}: {error}") from error
 
@@ -117,20 +157,23 @@ def compared(
         Reason for each damaged array or group, by its name.
     """
     grid, found = plane_of(attributes), {}
-    axes_m = dict(zip("xy", grid.axes_m, strict=True)) if grid and grid.has_axes else {}
-    for name in forms(attributes, with_height):
+    axes = axes_of(attributes)
+    for name, form in forms(attributes, with_height).items():
         try:
-            _checked(path, attributes, name)
-            if name in axes_m and not np.array_equal(_values(path, attributes, name), axes_m[name]):
-                raise DamageError("its values differ from those of the grid")
+            _checked(path, attributes, name, form)
+            if name in axes and grid is not None:
+                values_m = _values(path, attributes, name)
+                if not np.array_equal(values_m, axes[name].values_m(grid)):
+                    raise DamageError("its values differ from those of the grid")
             if name == "height" and grid is not None:
                 grid = _raised(grid, _values(path, attributes, name), attributes)
         except DamageError as error:
             found[name] = str(error)
-    try:
-        check_group(path)
-    except DamageError as error:
-        found[GROUP] = str(error)
+    for name in groups_of(attributes):
+        try:
+            check_group(path, name)
+        except DamageError as error:
+            found[name] = str(error)
     return grid, found
 
 
@@ -153,17 +196,15 @@ def repair(path: Path, grid: Grid) -> dict[str, str]:
     with_height = grid.height_m is not None
     _, found = compared(path, attributes, with_height)
     if found:
-        rows, columns = attributes["patch_shape"]
+        axes = {*axes_of(attributes), "height"}
         with staging(path) as temporary:
             new, old = temporary / "new", temporary / "old"
             new.mkdir()
             old.mkdir()
-            _create_arrays(new, grid, (rows, columns))
-            write_attributes(new / GROUP, {})
+            _create_arrays(new, grid, attributes)
             for name in found:
                 # Replace the metadata alone, since the chunks of pixels and the records must stay.
-                keeps = name in ("pixels", GROUP)
-                _exchange(path, f"{name}/zarr.json" if keeps else name, new, old)
+                _exchange(path, name if name in axes else f"{name}/zarr.json", new, old)
     if found or DIGESTS not in attributes:
         digests = _digests(path, attributes, with_height)
         write_attributes(path, with_checksum(attributes | {DIGESTS: digests}))
@@ -188,14 +229,14 @@ def _digests(path: Path, attributes: dict[str, Any], with_height: bool) -> dict[
     }
 
 
-def _checked(path: Path, attributes: dict[str, Any], name: str) -> Checked:
+def _checked(path: Path, attributes: dict[str, Any], name: str, form: Form) -> Checked:
     """Return the metadata of an array; raise DamageError if they are damaged."""
-    form = forms(attributes, name == "height")[name]
     return checked(path, name, form, attributes.get(DIGESTS, {}).get(name))
 
 
 def _opened(path: Path, attributes: dict[str, Any], name: str, *, read_only: bool) -> zarr.Array:
-    metadata = _checked(path, attributes, name)
+    form = forms(attributes, name == "height")[name]
+    metadata = _checked(path, attributes, name, form)
     validate.memory(f"a chunk of {name} in {path}", 2 * metadata.chunk_bytes)
     files = DurableStore.of_array(path, name, metadata, read_only=read_only)
     return zarr.open_array(files, path=name, mode="r" if read_only else "r+", zarr_format=3)
@@ -222,26 +263,48 @@ def _raised(plane: Grid, height_m: NDArray[np.float64], attributes: dict[str, An
     return grid
 
 
-def _create_arrays(path: Path, grid: Grid, patch_shape: tuple[int, int]) -> None:
-    """Create the arrays of a mosaic: pixels, all zero, coordinates and heights."""
+def _create_arrays(path: Path, grid: Grid | None, attributes: dict[str, Any]) -> None:
+    """Create the groups and arrays of a mosaic: pixels, all zero, levels, coordinates, heights."""
     files = DurableStore(path)
+    for name in groups_of(attributes):
+        write_attributes(path / name, {})
     # Noise does not compress, so the only codec is a checksum behind every chunk.
     checksum = Crc32cCodec()
-    names = ("y", "x") if grid.has_axes else ("row", "column")
+    names = ("y", "x") if grid is not None and grid.has_axes else ("row", "column")
+    first, *others = [*patch_arrays(attributes), *mosaic_arrays(attributes)]
     zarr.create_array(
         files,
         name="pixels",
-        shape=grid.shape,
+        shape=first.shape,
         dtype=np.complex64,
-        chunks=patch_shape,
+        chunks=first.chunk_shape,
         compressors=checksum,
         fill_value=0,
         dimension_names=names,
     )
+    for array in others:
+        in_db = array.name == IN_DB
+        zarr.create_array(
+            files,
+            name=array.name,
+            shape=array.shape,
+            dtype=array.data_type,
+            chunks=array.chunk_shape,
+            compressors=checksum,
+            fill_value=array.fill_value,
+            # Programs such as xarray demand one length of every dimension of a group.
+            dimension_names=[f"overview_{n}" for n in names]
+            if in_db and array.factor > 1
+            else names,
+            attributes={"units": "dB", "long_name": "amplitude"} if in_db else {},
+        )
     coordinates: dict[str, tuple[tuple[str, ...], NDArray[np.float64]]] = {}
-    if grid.has_axes:
-        coordinates |= {name: ((name,), axis) for name, axis in zip("xy", grid.axes_m, strict=True)}
-    if grid.height_m is not None:
+    if grid is not None:
+        coordinates |= {
+            name: ((axis.dimension,), axis.values_m(grid))
+            for name, axis in axes_of(attributes).items()
+        }
+    if grid is not None and grid.height_m is not None:
         coordinates["height"] = names, grid.height_m
     for name, (dimensions, values) in coordinates.items():
         zarr.create_array(

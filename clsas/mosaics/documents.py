@@ -18,12 +18,14 @@ from clsas.core import validate
 from clsas.core.atomic import make_folders, replacing
 from clsas.core.grid import Grid
 from clsas.core.reading import parse_json, read_bytes
+from clsas.mosaics.levels import are_levels
 
 CHECKSUM = "crc32"
 """Attribute with the checksum of all others."""
 
 FORMAT = "clsas mosaic"
-VERSION = 2  # version 1 had no checksums
+VERSION = 3
+READABLE = (2, 3)  # version 1 had no checksums, and version 2 no levels
 
 DIGESTS = "metadata"
 """Attribute with a digest of every array's metadata. Stores of early versions lack it."""
@@ -131,10 +133,10 @@ def read_document(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} exists and is not a mosaic of clsas") from error
     if attributes.get("format") != FORMAT:
         raise ValueError(f"{path} exists and is not a mosaic of clsas")
-    if attributes.get("version") != VERSION:
+    if attributes.get("version") not in READABLE:
         raise ValueError(
             f"{path} is a mosaic of version {attributes.get('version')}, but this clsas works "
-            f"with version {VERSION}: choose another path"
+            f"with versions {' and '.join(map(str, READABLE))}: choose another path"
         )
     if not is_intact(attributes):
         raise ValueError(f"{path} is damaged: its attributes do not match their checksum")
@@ -194,7 +196,7 @@ def _is_complete(attributes: dict[str, Any]) -> bool:
         plane_of(attributes)
     except (TypeError, ValueError):
         return False
-    return True
+    return are_levels(attributes)
 
 
 def _is_shape(value: Any) -> bool:

@@ -104,6 +104,12 @@ class Job:
         """Return the store, or None if there is none."""
         return None if self.store is None else Store.at(self.store)
 
+    def complete_levels(self) -> None:
+        """Compute the levels of the store that mix patches, once all patches are finished."""
+        store = self.opened_store()
+        if store is not None:
+            store.complete_levels()
+
 
 def stamped_files(survey: Survey) -> StampedFiles:
     """Return the files of a survey with their stamps, for `Job.files`."""

@@ -12,15 +12,22 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.grid import Grid
 from clsas.core.reading import parse_json, read_bytes
 from clsas.mosaics.documents import DIGESTS, DamageError, canonical, plane_of, read_attributes
+from clsas.mosaics.levels import axis_of, mosaic_arrays, patch_arrays, stored_levels
 
 GROUP = "patches"
 """Name of the group that contains the records; the group has no attributes of its own."""
 
-_ITEM_BYTES = {"complex64": 8, "float64": 8}
+ITEM_BYTES = {"complex64": 8, "float64": 8, "float32": 4}
+"""Size of a value by its type."""
+
 CHECKSUM_BYTES = 4
 """Size in bytes of the checksum behind every chunk."""
 
@@ -38,15 +45,18 @@ class Form:
     Attributes
     ----------
     data_type : str
-        "complex64" or "float64".
+        "complex64", "float64" or "float32".
     shape : tuple of int
     chunk_shape : tuple of int or None
         Shape of a chunk, or None if Zarr chose it.
+    fill_value : complex or float
+        Value where nothing has been written.
     """
 
     data_type: str
     shape: tuple[int, ...]
     chunk_shape: tuple[int, ...] | None = None
+    fill_value: complex | float = 0
 
 
 @dataclass(frozen=True)
@@ -71,12 +81,52 @@ class Checked:
 def forms(attributes: Mapping[str, Any], has_height: bool) -> dict[str, Form]:
     """Return the required form of every array of a store, by its name."""
     rows, columns = attributes["inputs"]["pixels"]
-    found = {"pixels": Form("complex64", (rows, columns), tuple(attributes["patch_shape"]))}
-    plane = plane_of(attributes)
-    if plane is not None and plane.has_axes:
-        found |= {"x": Form("float64", (columns,)), "y": Form("float64", (rows,))}
+    arrays = [*patch_arrays(attributes), *mosaic_arrays(attributes)]
+    found = {
+        array.name: Form(array.data_type, array.shape, array.chunk_shape, array.fill_value)
+        for array in arrays
+    }
+    for name, axis in axes_of(attributes).items():
+        count = (columns, rows)[axis.side]
+        found[name] = Form("float64", (math.ceil(count / axis.factor),))
     if has_height:
         found["height"] = Form("float64", (rows, columns))
+    return found
+
+
+class Axis(NamedTuple):
+    """Coordinates of the pixels of a mosaic or of a level, along one side.
+
+    Attributes
+    ----------
+    dimension : str
+        Name of the dimension.
+    side : int
+        0 for x, 1 for y.
+    factor : int
+        Factor of the level; 1 for the pixels of the mosaic.
+    """
+
+    dimension: str
+    side: int
+    factor: int
+
+    def values_m(self, plane: Grid) -> NDArray[np.float64]:
+        """Return the coordinates, m."""
+        return axis_of(plane.axes_m[self.side], self.factor)
+
+
+def axes_of(attributes: Mapping[str, Any]) -> dict[str, Axis]:
+    """Return the axes of a store by the name of their array; none if the grid is rotated."""
+    plane, factors = plane_of(attributes), stored_levels(attributes).factors
+    if plane is None or not plane.has_axes:
+        return {}
+    found = {}
+    for side, name in enumerate("xy"):
+        found[name] = Axis(name, side, 1)
+        found |= {f"{factor}x/{name}": Axis(name, side, factor) for factor in factors}
+        if factors:
+            found[f"overview_{name}"] = Axis(f"overview_{name}", side, factors[-1])
     return found
 
 
@@ -121,13 +171,18 @@ def checked(path: Path, name: str, form: Form, digest: str | None) -> Checked:
     if digest is not None and found != digest:
         raise DamageError("its metadata do not match their digest")
     chunk = math.prod(metadata["chunk_grid"]["configuration"]["chunk_shape"])
-    return Checked(text, chunk * _ITEM_BYTES[form.data_type] + CHECKSUM_BYTES, found)
+    return Checked(text, chunk * ITEM_BYTES[form.data_type] + CHECKSUM_BYTES, found)
 
 
-def check_group(path: Path) -> None:
-    """Raise DamageError if the group of the records differs from what was written."""
+def groups_of(attributes: Mapping[str, Any]) -> list[str]:
+    """Return the names of the groups of a store: that of the records, and one for each level."""
+    return [GROUP, *(f"{factor}x" for factor in stored_levels(attributes).factors)]
+
+
+def check_group(path: Path, name: str) -> None:
+    """Raise DamageError if a group without attributes differs from what was written."""
     try:
-        attributes = read_attributes(path / GROUP)
+        attributes = read_attributes(path / name)
     except PermissionError:
         raise
     except (OSError, DamageError) as error:
@@ -151,7 +206,9 @@ def _difference(metadata: Any, form: Form) -> str | None:
     encoding = _named(metadata.get("chunk_key_encoding"))
     codecs = metadata.get("codecs")
     codecs = [_named(codec) for codec in codecs] if isinstance(codecs, list) else None
-    zero = [0.0, 0.0] if form.data_type == "complex64" else 0.0
+    fill: Any = [0.0, 0.0] if form.data_type == "complex64" else 0.0
+    if math.isnan(abs(form.fill_value)):
+        fill = "NaN"
     matches = {
         "zarr_format": metadata.get("zarr_format") == 3,
         "node_type": metadata.get("node_type") == "array",
@@ -160,7 +217,7 @@ def _difference(metadata: Any, form: Form) -> str | None:
         "chunk_grid": chunks is not None and chunks[0] == "regular" and _fits(chunks[1], form),
         "chunk_key_encoding": encoding in (("default", {"separator": "/"}), ("default", {})),
         "codecs": codecs == _CODECS,
-        "fill_value": metadata.get("fill_value") == zero,
+        "fill_value": metadata.get("fill_value") == fill,
         "storage_transformers": metadata.get("storage_transformers", []) == [],
         "attributes": isinstance(metadata.get("attributes", {}), dict),
         "dimension_names": _are_names(metadata.get("dimension_names"), len(form.shape)),

@@ -363,9 +363,11 @@ def mosaic(
         warn_unreached(survey.geometry, grid, beam, visibility.along, survey.span_m)
     opened = None if store is None else Store.at(validate.path("store", store))
     inputs = {} if opened is None else inputs_of(survey, grid, request, beam)
+    stored = None if opened is None else opened.patch_shape
     if patch_shape is None:
-        stored = None if opened is None else opened.patch_shape
         patch_shape = stored or choose_patch_shape(visibility, grid, memory_bytes)
+    elif stored is not None and Layout(grid, stored).shape == Layout(grid, patch_shape).shape:
+        patch_shape = stored  # early versions rounded the sides of patches differently
     layout = Layout(grid, patch_shape)
     job = Job(
         files=(),

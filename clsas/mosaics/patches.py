@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from clsas.core import validate
 from clsas.core.grid import Grid
+from clsas.mosaics.levels import aligned_side, factors_of
 from clsas.mosaics.record import PatchIndex
 from clsas.mosaics.visibility import SurveyVisibility
 
@@ -77,10 +78,14 @@ def choose_patch_shape(
         If not even the smallest patches fit.
     """
     side = _LARGEST_SIDE
+    coarsest = factors_of(grid.shape)[-1]
     needed = 0
     while side >= _SMALLEST_SIDE:
-        # Make the patches as equal as possible.
-        height, width = (math.ceil(n / math.ceil(n / side)) for n in grid.shape)
+        # Make the patches as equal as possible, and levels end at their borders.
+        height, width = (
+            aligned_side(math.ceil(n / math.ceil(n / side)), math.ceil(n / side), n, coarsest)
+            for n in grid.shape
+        )
         most = 0
         for row in (0, grid.shape[0] - 1):
             top, left = row // height * height, grid.shape[1] // 2 // width * width
@@ -124,5 +129,5 @@ def patch_shape_of(patches: tuple[int, int], grid: Grid) -> tuple[int, int]:
                 f"patches must all have pixels: {count} patches of {side} are too many for "
                 f"{pixels} pixels, {fewer} are enough"
             )
-        shape.append(side)
+        shape.append(aligned_side(side, count, pixels, factors_of(grid.shape)[-1]))
     return shape[0], shape[1]

@@ -14,7 +14,16 @@ from clsas.core import reprs
 from clsas.mosaics.documents import DamageError, is_intact, read_attributes, with_checksum
 
 PIXELS_CHECKSUM = "pixels_crc32c"
-"""Attribute with the checksum of a patch's pixels."""
+"""Attribute with the checksum of a patch's pixels, or the list of those of its chunks."""
+
+LEVELS_CHECKSUMS = "levels_crc32c"
+"""Attribute with the checksums of a patch's levels, by the name of the array."""
+
+Checksums = dict[str, str | list[str | None] | None]
+"""Checksums of a patch by the name of the array: of its chunk, or a list of those of its chunks.
+
+That of a chunk that does not exist, because it has only the fill value, is None.
+"""
 
 PatchIndex = tuple[int, int]
 """Row and column of a patch."""
@@ -87,13 +96,17 @@ class Record:
             found.append(f"a gap of {self.gap_m:.3g} m between pings")
         return tuple(found)
 
-    def attributes(self, pixels_checksum: str | None) -> dict[str, Any]:
-        """Return the attributes to store; pixels that are all zero have the checksum None."""
-        return with_checksum(asdict(self) | {PIXELS_CHECKSUM: pixels_checksum})
+    def attributes(self, checksums: Checksums) -> dict[str, Any]:
+        """Return the attributes to store, with the checksums of pixels and levels."""
+        levels = {name: value for name, value in checksums.items() if name != "pixels"}
+        stored = {PIXELS_CHECKSUM: checksums["pixels"]} | (
+            {LEVELS_CHECKSUMS: levels} if levels else {}
+        )
+        return with_checksum(asdict(self) | stored)
 
     @classmethod
-    def read(cls, folder: Path) -> tuple[Record, str | None] | None:
-        """Return the record in a folder and the checksum of its pixels, or None if there is none.
+    def read(cls, folder: Path) -> tuple[Record, Checksums] | None:
+        """Return the record in a folder and its checksums, or None if there is none.
 
         Raises
         ------
@@ -108,10 +121,10 @@ class Record:
         names = {field.name for field in fields(cls)}
         try:
             record = cls(**{name: value for name, value in stored.items() if name in names})
-            checksum = stored[PIXELS_CHECKSUM]
+            checksums = {"pixels": stored[PIXELS_CHECKSUM], **stored.get(LEVELS_CHECKSUMS, {})}
         except (LookupError, TypeError) as error:
             raise DamageError("its record is incomplete") from error
-        return record, checksum
+        return record, checksums
 
 
 def describe_damage(found: dict[PatchIndex, str]) -> str:

@@ -176,6 +176,7 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Form
                     running[executor.submit(form_patch, job, layout.window(index))] = index
                 known[index] = survey.channels
             if not running and not todo and survey.has_ended:
+                run.job.complete_levels()
                 return
             timeout_s = None if survey.has_ended and running else POLL_S
             done = wait(running or [Future()], timeout_s)

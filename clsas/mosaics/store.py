@@ -1,17 +1,15 @@
-"""Mosaics in Zarr stores: an array of pixels with one chunk per patch, and one record per patch.
+"""Mosaics in Zarr stores: pixels and levels in chunks that belong to one patch, and its record.
 
 docs/mosaic.md describes the layout. A patch is finished once it has a record, which is written
-after its pixels. Pixels and records have checksums, and `Store.write` returns once both are on the
-disk.
+after its pixels and levels. All of them have checksums, and `Store.write` returns once they are on
+the disk.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +25,6 @@ from clsas.core.digests import grid_digest
 from clsas.core.extras import needed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
-from clsas.core.reading import check_ordinary
 from clsas.mosaics.documents import (
     DIGESTS,
     DamageError,
@@ -39,10 +36,24 @@ from clsas.mosaics.documents import (
     with_checksum,
     write_attributes,
 )
-from clsas.mosaics.metadata import CHECKSUM_BYTES, GROUP, has_height
-from clsas.mosaics.overview import reduced
+from clsas.mosaics.levels import (
+    LEVELS,
+    PixelArray,
+    mosaic_arrays,
+    patch_arrays,
+    stored_levels,
+)
+from clsas.mosaics.metadata import GROUP, has_height
+from clsas.mosaics.overview import Reading, reduced, step_of
+from clsas.mosaics.patch_files import PatchFiles
 from clsas.mosaics.provenance import OtherInputsError, differences
-from clsas.mosaics.record import PatchIndex, Record, describe_arrays, describe_damage
+from clsas.mosaics.pyramid import levels
+from clsas.mosaics.record import (
+    PatchIndex,
+    Record,
+    describe_arrays,
+    describe_damage,
+)
 
 if TYPE_CHECKING:
     import zarr
@@ -119,6 +130,18 @@ class Store:
             raise ValueError(f"{self.path} is damaged: pixels: {error}{_REPAIR}") from error
 
     @property
+    def levels(self) -> tuple[int, ...]:
+        """Factors of the levels that `read_level` can read, ascending, such as (2, 4, 8).
+
+        Empty for a mosaic that fits on a screen, or one of an early version to which `add_levels`
+        has not added any. Levels that mix patches are missing until a run has finished all patches.
+        """
+        arrays = list(self._files.arrays)
+        if self._mosaic_arrays and self._is_complete():
+            arrays = [*arrays, *self._mosaic_arrays]
+        return tuple(sorted({array.factor for array in arrays} - {1}))
+
+    @property
     def has_digests(self) -> bool:
         """True if the store has digests of its arrays' metadata.
 
@@ -150,6 +173,8 @@ class Store:
     def array_damage(self) -> dict[str, str]:
         """Return the arrays whose metadata, coordinates or heights differ from what was written.
 
+        Levels that mix patches, which `damage` does not read, are read here.
+
         Returns
         -------
         dict of str to str
@@ -161,7 +186,8 @@ class Store:
         ValueError
             If the store's own document is damaged.
         """
-        return self._compared()[1]
+        found = self._compared()[1]
+        return self._level_damage() | found
 
     def begin(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
         """Create the store, or check that the one at the path was made with the same inputs.
@@ -205,6 +231,13 @@ class Store:
             validate.warn(
                 f"{self.path} was damaged and has been repaired: {describe_arrays(repaired)}"
             )
+        if damaged := self._level_damage():
+            # Without their record they are computed again when all patches are finished.
+            (self.path / LEVELS / "zarr.json").unlink()
+            validate.warn(
+                f"{self.path} was damaged; these levels are computed again: "
+                f"{describe_arrays(damaged)}"
+            )
         self.grow(inputs)
 
     def grow(self, inputs: dict[str, Any]) -> None:
@@ -227,9 +260,10 @@ class Store:
         pixels themselves are not read; `damage` reads them too.
         """
         found = {}
-        for index in self._indices():
+        _ = self.pixels  # raises if their metadata are damaged
+        for index in self._files.indices():
             try:
-                record = self._record(index)
+                record = self._files.record(index)
             except DamageError:
                 continue
             if record is not None:
@@ -255,10 +289,11 @@ class Store:
             If a file cannot be read.
         """
         validate.function("tell", tell)
-        found, indices = {}, self._indices()
+        _ = self.pixels  # raises if their metadata are damaged
+        found, indices = {}, self._files.indices()
         for done, index in enumerate(indices, 1):
             try:
-                self._verify(index)
+                self._files.verify(index, self._opened)
             except DamageError as error:
                 found[index] = str(error)
             if tell is not None:
@@ -274,7 +309,9 @@ class Store:
         pixels: NDArray[np.complex64],
         record: Record,
     ) -> None:
-        """Write a patch and then its record, and wait until both are on the disk.
+        """Write a patch with its levels and then its record, and wait until they are on the disk.
+
+        Any number of processes can write patches at once, since no two patches share a file.
 
         Parameters
         ----------
@@ -287,29 +324,104 @@ class Store:
 
         Raises
         ------
+        ValueError
+            If `rows` or `columns` are not those of the patch.
         OSError
             If the disk is full or the store is not writable.
         """
         row, column = (
             validate.count(name, index, least=0, most=most - 1)
-            for name, index, most in zip(("row", "column"), (row, column), self._shape, strict=True)
-        )
-        part = [
-            range(count)[validate.selection(name, given, ascending=True)]
-            for name, given, count in zip(
-                ("rows", "columns"), (rows, columns), self.pixels.shape, strict=True
+            for name, index, most in zip(
+                ("row", "column"), (row, column), self._files.shape, strict=True
             )
-        ]
-        pixels = validate.array("pixels", pixels, np.complex64, tuple(map(len, part)))
+        )
+        own = self._files.pixels.window((row, column))
+        for name, given, part, count in zip(
+            ("rows", "columns"), (rows, columns), own, self.pixels.shape, strict=True
+        ):
+            if range(count)[validate.selection(name, given, ascending=True)] != range(count)[part]:
+                raise ValueError(
+                    f"{name} must be {part.start}:{part.stop} for patch {row},{column}, got "
+                    f"{validate.shown(given)}"
+                )
+        shape = tuple(part.stop - part.start for part in own)
+        pixels = validate.array("pixels", pixels, np.complex64, shape)
         validate.instance("record", record, Record)
-        folder = self._folder((row, column))
+        folder = self._files.folder((row, column))
         check_own(self.path, folder)
         # Remove the old record first, so that it never stands beside pixels of the new patch.
         if (folder / "zarr.json").exists():
             (folder / "zarr.json").unlink()
             sync_folder(folder)
-        _arrays().write_pixels(self.path, read_document(self.path), rows, columns, pixels)
-        write_attributes(folder, record.attributes(self._checksum((row, column))))
+        attributes = read_document(self.path)
+        first, *others = self._files.arrays
+        _arrays().write_values(self.path, attributes, first.name, (rows, columns), pixels)
+        found = levels(pixels, stored_levels(attributes).of_patches)
+        for array in others:
+            window, values = array.window((row, column)), found[array.factor].values_of(array)
+            _arrays().write_values(self.path, attributes, array.name, window, values)
+        write_attributes(folder, record.attributes(self._files.checksums((row, column))))
+
+    def complete_levels(self, tell: Callable[[int, int], object] | None = None) -> bool:
+        """Compute the levels that mix patches, unless they already are those of the patches.
+
+        A run does so when all patches are finished. Only one process may do so at a time.
+
+        Parameters
+        ----------
+        tell : callable, optional
+            Called as tell(chunks computed so far, number of chunks).
+
+        Returns
+        -------
+        bool
+            True if levels were computed.
+
+        Raises
+        ------
+        ValueError
+            If a patch is damaged; the message names it.
+        OSError
+            If the store cannot be read or written.
+        """
+        validate.function("tell", tell)
+        if not self._mosaic_arrays or self._is_complete():
+            return False
+        digest = self._digest()
+        with needed("stores of mosaics"):
+            from clsas.mosaics import completing
+        completing.complete(self.path, read_document(self.path), digest, self.read, tell)
+        return True
+
+    def add_levels(self, tell: Callable[[int, int], object] | None = None) -> bool:
+        """Add levels to a store of an early version, computed from its pixels.
+
+        Patches and records stay as they are. If patches are formed later, run it again, or let the
+        run that forms the last of them compute the levels.
+
+        Parameters
+        ----------
+        tell : callable, optional
+            Called as tell(chunks computed so far, number of chunks).
+
+        Returns
+        -------
+        bool
+            True if levels were computed, False if the store has its levels already.
+
+        Raises
+        ------
+        ValueError
+            If a patch is damaged; the message names it.
+        OSError
+            If the store cannot be read or written.
+        """
+        validate.function("tell", tell)
+        if stored_levels(read_document(self.path)).coarsest is None:
+            _arrays().add_levels(self.path)
+            for name in ("_files", "_mosaic_arrays"):
+                self.__dict__.pop(name, None)
+        return self.complete_levels(tell)
 
     def read(
         self, rows: slice = slice(None), columns: slice = slice(None)
@@ -323,26 +435,86 @@ class Store:
         OSError
             If a file cannot be read.
         """
+        return self._read(self._files.pixels, rows, columns)
+
+    def read_level(
+        self,
+        factor: int,
+        rows: slice = slice(None),
+        columns: slice = slice(None),
+        *,
+        coherent: bool = False,
+    ) -> NDArray[np.float32] | NDArray[np.complex64]:
+        """Return a window of a level, by default all of it.
+
+        Parameters
+        ----------
+        factor : int
+            One of `levels`: the pixels of the mosaic along each side of a pixel of the level.
+        rows, columns : slice
+            Pixels of the level.
+        coherent : bool
+            False for amplitudes, the root of the mean power of the pixels that are covered; True
+            for the mean of the complex pixels.
+
+        Returns
+        -------
+        float32 or complex64 [rows, columns]
+
+        Raises
+        ------
+        ValueError
+            If there is no such level, or a finished patch among the pixels is damaged.
+        OSError
+            If a file cannot be read.
+        """
+        factor = validate.count("factor", factor)
+        validate.flag("coherent", coherent)
+        if factor not in (found := self.levels):
+            known = ", ".join(map(str, found)) or "none: clsas mosaic --add-levels adds them"
+            raise ValueError(
+                f"factor must be that of a level of {self.path} ({known}), got {factor}"
+            )
+        array = self._array(f"{factor}x/{'pixels' if coherent else 'amplitude'}")
+        return self._read(array, rows, columns)
+
+    def _array(self, name: str) -> PixelArray:
+        arrays = [*self._files.arrays, *self._mosaic_arrays]
+        return next(array for array in arrays if array.name == name)
+
+    def _read(self, array: PixelArray, rows: slice, columns: slice) -> NDArray:
         validate.selection("rows", rows, ascending=True)
         validate.selection("columns", columns, ascending=True)
+        stored = self._opened(array)
         requested = (
-            len(range(n)[part]) for n, part in zip(self.pixels.shape, (rows, columns), strict=True)
+            len(range(n)[part]) for n, part in zip(stored.shape, (rows, columns), strict=True)
         )
-        validate.memory("the mosaic", 8 * math.prod(requested))
+        validate.memory("the mosaic", stored.dtype.itemsize * math.prod(requested))
+        patches = list(array.touched(rows, columns)) if array in self._files.arrays else []
         try:
             _arrays().check_metadata(self.path, read_document(self.path))
-            for index in self._touched(rows, columns):
-                self._record(index)
-            return np.asarray(self.pixels[rows, columns])
+            for index in patches:
+                self._files.record(index, [array])
+            return np.asarray(stored[rows, columns])
         except ValueError as error:
             found = {}
-            for index in self._touched(rows, columns):
+            for index in patches:
                 try:
-                    self._verify(index)
+                    self._files.verify(index, self._opened, [array])
                 except DamageError as damage:
                     found[index] = str(damage)
-            reason = describe_damage(found) if found else str(error)
+            reason = describe_damage(found) if found else f"{array.name}: {error}"
+            if not found and array.name == "pixels":
+                reason = str(error)
             raise ValueError(f"{self.path} is damaged: {reason}{_REPAIR}") from error
+
+    def _opened(self, array: PixelArray) -> zarr.Array:
+        if array.name == "pixels":
+            return self.pixels
+        try:
+            return _arrays().open_array(self.path, read_document(self.path), array.name)
+        except DamageError as error:
+            raise ValueError(f"{self.path} is damaged: {array.name}: {error}{_REPAIR}") from error
 
     def image(self, rows: slice = slice(None), columns: slice = slice(None)) -> Image:
         """Return the pixels of a window, by default all, as an image.
@@ -365,8 +537,10 @@ class Store:
     ) -> Image:
         """Return the mosaic at fewer pixels, each with the mean power of those that it covers.
 
-        About one patch at a time is read, so the pixels may take more than memory. A height map
-        becomes a plane.
+        If the store has levels, the coarsest is read whose pixels make up those of the overview,
+        which may then have up to a quarter fewer pixels along a side. Otherwise the pixels are
+        read, about one patch at a time, so they may take more than memory. A height map becomes a
+        plane.
 
         Parameters
         ----------
@@ -390,98 +564,59 @@ class Store:
             )
         ]
         part = self.grid.window(rows, columns)
+        # Levels serve if the part has every pixel, and begins at a pixel of the level.
+        dense = all(each.step == 1 for each in parts)
+        usable = [
+            factor
+            for factor in (self.levels if dense else ())
+            if all(each.start % factor == 0 for each in parts)
+        ]
+        step, factor = step_of(part.shape, most, usable)
+        array = self._array(f"{factor}x/amplitude" if factor > 1 else "pixels")
 
-        def read(*within: slice) -> NDArray[np.complex64]:
+        def read(*within: slice) -> NDArray[np.complex64] | NDArray[np.float32]:
             chosen = (whole[each] for whole, each in zip(parts, within, strict=True))
-            return self.read(*(slice(each.start, each.stop, each.step) for each in chosen))
+            return self._read(
+                array,
+                *(slice(e.start // factor, -(-e.stop // factor), e.step) for e in chosen),
+            )
 
-        height, width = self.pixels.chunks
-        return reduced(part, (height, width), read, most)
+        rows_at_once, columns_at_once = (factor * side for side in self._files.pixels.patch_shape)
+        return reduced(part, Reading(read, factor, (rows_at_once, columns_at_once)), step)
 
     def _compared(self) -> tuple[Grid | None, dict[str, str]]:
         attributes = read_document(self.path)
         return _arrays().compared(self.path, attributes, has_height(self.path, attributes))
 
-    def _indices(self) -> list[PatchIndex]:
-        """Return the patches that have a folder for their record, in order."""
-        shape = self._shape
-        folders = self.path / GROUP
-        found = []
-        for folder in folders.iterdir() if folders.is_dir() else ():
-            if name := re.fullmatch(r"(\d+)\.(\d+)", folder.name):
-                index = int(name[1]), int(name[2])
-                if index[0] < shape[0] and index[1] < shape[1]:
-                    found.append(index)
-        return sorted(found)
+    @cached_property
+    def _files(self) -> PatchFiles:
+        """The files that are written with each patch."""
+        return PatchFiles(self.path, tuple(patch_arrays(read_document(self.path))))
 
-    @property
-    def _shape(self) -> tuple[int, int]:
-        """Number of patches along rows and columns."""
-        pixels = self.pixels
-        rows, columns = (math.ceil(n / m) for n, m in zip(pixels.shape, pixels.chunks, strict=True))
-        return rows, columns
+    @cached_property
+    def _mosaic_arrays(self) -> list[PixelArray]:
+        """The levels that mix patches."""
+        return mosaic_arrays(read_document(self.path))
 
-    def _touched(self, rows: slice, columns: slice) -> Iterator[PatchIndex]:
-        """Yield the patches to which the pixels of a window belong."""
-        touched: list[range] = []
-        for part, count, side in zip(
-            (rows, columns), self.pixels.shape, self.pixels.chunks, strict=True
-        ):
-            pixels = range(count)[part]
-            if not pixels:
-                return
-            ends = sorted((pixels[0], pixels[-1]))
-            touched.append(range(ends[0] // side, ends[1] // side + 1))
-        yield from itertools.product(*touched)
+    def _digest(self) -> str:
+        """Return a digest of the pixels of the finished patches."""
+        with needed("stores of mosaics"):
+            from clsas.mosaics import completing
+        return completing.digest_of_patches(self._files.recorded())
 
-    def _folder(self, index: PatchIndex) -> Path:
-        return self.path / GROUP / "{}.{}".format(*index)
+    def _is_complete(self) -> bool:
+        """Return whether the levels that mix patches are those of the present patches."""
+        with needed("stores of mosaics"):
+            from clsas.mosaics import completing
+        return completing.is_current(self.path, read_document(self.path), self._digest())
 
-    def _chunk(self, index: PatchIndex) -> Path:
-        return self.path.joinpath("pixels", "c", *map(str, index))
-
-    def _checksum(self, index: PatchIndex) -> str | None:
-        """Return the checksum behind a patch's pixels, or None if the pixels are all zero."""
-        try:
-            check_ordinary(self._chunk(index))
-            with self._chunk(index).open("rb") as file:
-                file.seek(8 * math.prod(self.pixels.chunks))
-                return file.read(2 * CHECKSUM_BYTES).hex()  # of an intact file, half as many bytes
-        except FileNotFoundError:
-            return None  # Zarr writes no chunk of zeros
-
-    def _record(self, index: PatchIndex) -> Record | None:
-        """Return the record of a patch, or None if the patch is not finished.
-
-        Raises
-        ------
-        DamageError
-            If the record is damaged, or the checksum behind the pixels is not that of the record.
-        """
-        found = Record.read(self._folder(index))
-        if found is None:
-            return None
-        record, expected = found
-        try:
-            matches = self._checksum(index) == expected
-        except ValueError as error:
-            raise DamageError(str(error)) from error
-        if not matches:
-            gone = not self._chunk(index).exists()
-            raise DamageError("its pixels are " + ("gone" if gone else "not those of its record"))
-        return record
-
-    def _verify(self, index: PatchIndex) -> None:
-        """Read a patch if it is finished; raise DamageError if it differs from what was written."""
-        if self._record(index) is None or not self._chunk(index).exists():
-            return
-        row, column = (
-            slice(i * n, (i + 1) * n) for i, n in zip(index, self.pixels.chunks, strict=True)
-        )
-        try:
-            _ = self.pixels[row, column]
-        except ValueError as error:  # Zarr's message about a checksum
-            raise DamageError("its pixels do not match their checksum") from error
+    def _level_damage(self) -> dict[str, str]:
+        """Read the levels that mix patches, if they are complete; return those that are damaged."""
+        if not (self.path / LEVELS / "zarr.json").exists() or not self._is_complete():
+            return {}
+        with needed("stores of mosaics"):
+            from clsas.mosaics import completing
+        return completing.damage(self.path, read_document(self.path))
 
 
 def _arrays() -> ModuleType:

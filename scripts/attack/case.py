@@ -1,4 +1,8 @@
-"""A small mosaic to attack: 48 patches of a swaying track, which take some seconds to form."""
+"""A small mosaic to attack: 48 patches of a swaying track, which take some seconds to form.
+
+It is so high that it has two levels. The first is written with each patch. The second mixes
+patches, since these are 18 columns wide.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +31,8 @@ position_m = [1.5, 57.0, 0.0]
 amplitude = 0.5
 
 [grid]
-x = { start_m = -2, stop_m = 2, count = 160 }
-y = { start_m = 56, stop_m = 61, count = 192 }
+x = { start_m = -2, stop_m = 2, count = 140 }
+y = { start_m = 56, stop_m = 61, count = 2052 }
 
 [image]
 tolerance_db = -40

@@ -4,9 +4,9 @@
 
 Every run is killed at a random moment: while it starts, or after some patches. Either all of its
 processes are killed, or only the main process, or one worker. After every kill the finished patches
-must equal those of a mosaic that was never killed. After 10 kills the run may finish. The store
-must then equal the other bit by bit, and there must be no temporary files. Otherwise the exit code
-is 1.
+and their levels must equal those of a mosaic that was never killed. After 10 kills the run may
+finish. The store must then equal the other bit by bit, with all levels, and there must be no
+temporary files. Otherwise the exit code is 1.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ import psutil
 from case import PATCHES, command, write_scene
 
 from clsas import Store
+from clsas.mosaics.documents import read_document
+from clsas.mosaics.levels import patch_arrays
 
 KILLS_PER_STORE = 10
 ORPHANS_S = 60  # after which workers whose main process was killed must have ended
@@ -102,16 +104,33 @@ def check_finished(path: Path, reference: Store) -> int:
     if damage := store.damage():
         raise Miss(f"damaged: {damage}")
     records = store.records()
-    for row, column in records:
-        check_chunk(path, reference, row, column)
+    for index in records:
+        for array in patch_arrays(read_document(path)):
+            for row, column in array.chunks(index):
+                check_file(path, reference, f"{array.name}/c/{row}/{column}")
     return len(records)
 
 
-def check_chunk(path: Path, reference: Store, row: int, column: int) -> None:
-    """Compare the pixels of a patch with the reference, bit by bit."""
-    ours, theirs = (each / "pixels" / "c" / f"{row}/{column}" for each in (path, reference.path))
-    if ours.read_bytes() != theirs.read_bytes():
-        raise Miss(f"the pixels of patch {row},{column} differ")
+def check_all(path: Path, reference: Store) -> None:
+    """Compare all chunks, and the record of the levels that mix patches, with the reference."""
+    names = [
+        {str(each.relative_to(folder)) for each in folder.rglob("c/**/*") if each.is_file()}
+        for folder in (path, reference.path)
+    ]
+    for name in names[0] | names[1] | {"levels/zarr.json"}:
+        check_file(path, reference, name)
+    if Store.opened(path).levels != reference.levels:
+        raise Miss("levels are missing")
+
+
+def check_file(path: Path, reference: Store, name: str) -> None:
+    """Compare a file with that of the reference, bit by bit."""
+    ours, theirs = (
+        (each / name).read_bytes() if (each / name).exists() else None
+        for each in (path, reference.path)
+    )
+    if ours != theirs:
+        raise Miss(f"{name} differs")
 
 
 def main() -> None:
@@ -165,6 +184,7 @@ def attack(folder: Path, workers: int, kills: int, chance: random.Random) -> Non
         subprocess.run(command(scene, path, workers), check=True, capture_output=True)
         if check_finished(path, first) != PATCHES:
             raise Miss(f"{path.name} is not finished")
+        check_all(path, first)
         if left := [str(each) for each in folder.rglob("*.part")]:
             raise Miss(f"temporary files are left: {left}")
         stores += 1

@@ -22,7 +22,7 @@ from clsas.files.scene_files import read_scene
 ROOT = Path(__file__).parents[2]
 # The case that scripts/attack takes apart, with fewer pixels and patches.
 SCENE = runpy.run_path(str(ROOT / "scripts" / "attack" / "case.py"))["SCENE"]
-for many, few in {"= 160": "= 80", "= 192": "= 100", "[6, 8]": "[2, 2]"}.items():
+for many, few in {"= 140": "= 80", "= 2052": "= 100", "[6, 8]": "[2, 2]"}.items():
     assert many in SCENE
     SCENE = SCENE.replace(many, few)
 

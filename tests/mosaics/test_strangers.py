@@ -163,7 +163,8 @@ def test_a_store_that_claims_more_than_memory_is_refused(path, monkeypatch):
     side = 50_000
     document = json.loads((path / "zarr.json").read_text())["attributes"]
     inputs = document["inputs"] | {"pixels": [side, side]}
-    change(path, inputs=inputs, patch_shape=[50, 50], metadata=None)
+    sides = {"patch_shape": [50, 50], "chunk_shape": [50, 50]}
+    change(path, inputs=inputs, **sides, levels=None, metadata=None)
     for name, axes in {"pixels": 2, "height": 2, "x": 1, "y": 1}.items():
         grid = {"name": "regular", "configuration": {"chunk_shape": axes * [50]}}
         change_metadata(path, name, shape=axes * [side], chunk_grid=grid)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import clsas
 from api_calls.scene import Call, nothing, scene
+from clsas.core.digests import grid_digest
 from clsas.mosaics.documents import read_document
+from clsas.mosaics.record import Record
 from clsas.planning.costs import Costs
 
 
@@ -98,6 +101,14 @@ def files(folder: Path) -> dict[str, Call]:
             accepts={"inputs": ("dict",)},
         ),
         "Store.grow": Call(opened.grow, {"inputs": inputs}),
+        "Store.read_level": Call(
+            store_with_levels(folder, inputs, record).read_level,
+            {"factor": 2, "rows": slice(0, 1), "columns": slice(1, 5), "coherent": True},
+        ),
+        "Store.complete_levels": Call(
+            opened.complete_levels, {"tell": nothing}, accepts={"tell": optional}
+        ),
+        "Store.add_levels": Call(opened.add_levels, {"tell": nothing}, accepts={"tell": optional}),
         "Store.write": Call(
             opened.write,
             {
@@ -110,6 +121,16 @@ def files(folder: Path) -> dict[str, Call]:
             },
         ),
     }
+
+
+def store_with_levels(folder: Path, inputs: dict[str, Any], record: Record) -> clsas.Store:
+    """Return a store that is so wide that it has a level."""
+    grid = clsas.Grid.plane((0, 1, 1030), (20, 21, 2))
+    store = clsas.Store.at(folder / "wide.zarr")
+    store.begin(inputs | {"grid": grid_digest(grid), "pixels": [2, 1030]}, grid, grid.shape)
+    whole = slice(0, 2), slice(0, 1030)
+    store.write(0, 0, *whole, np.ones(grid.shape, np.complex64), record)
+    return store
 
 
 def results(folder: Path) -> dict[str, Call]:

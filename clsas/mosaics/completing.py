@@ -1,0 +1,215 @@
+"""Levels of a mosaic that mix patches: computed by one process when the patches are finished.
+
+Their record, the group `levels`, contains the checksums of their chunks, and a digest of those of
+the pixels from which they were computed. If patches have changed since, the digests differ, and the
+levels are computed again. The result depends on the pixels alone, so a run that is killed and
+continued leaves the same levels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.atomic import sync_folder
+from clsas.mosaics.arrays import open_array, write_values
+from clsas.mosaics.chunks import chunk_checksums
+from clsas.mosaics.documents import (
+    DamageError,
+    canonical,
+    check_own,
+    is_intact,
+    read_attributes,
+    with_checksum,
+    write_attributes,
+)
+from clsas.mosaics.levels import LEVELS, PixelArray, mosaic_arrays, patch_arrays
+from clsas.mosaics.pyramid import Level, coarser, covered
+from clsas.mosaics.record import Checksums, PatchIndex
+
+_KEPT = 4  # patches that are kept while levels are computed: those around a corner
+_PATCHES = "patches"  # attribute with the digest of the patches
+_CHUNKS = "chunks_crc32c"  # attribute with the checksums of the chunks, by the name of the array
+
+
+def digest_of_patches(checksums: dict[PatchIndex, Checksums]) -> str:
+    """Return a digest of the pixels of the finished patches."""
+    pixels = {"{}.{}".format(*index): each["pixels"] for index, each in checksums.items()}
+    return hashlib.sha256(canonical(pixels)).hexdigest()[:16]
+
+
+def is_current(path: Path, attributes: dict[str, Any], digest: str) -> bool:
+    """Return whether the levels of a mosaic are those of its patches.
+
+    Parameters
+    ----------
+    path : Path
+        The store.
+    attributes : dict
+        Attributes of the store.
+    digest : str
+        Digest of the finished patches.
+    """
+    try:
+        stored = read_attributes(path / LEVELS)
+        found = {
+            array.name: chunk_checksums(path, array, _all_chunks(array))
+            for array in mosaic_arrays(attributes)
+        }
+    except (OSError, DamageError, ValueError):
+        return False
+    return is_intact(stored) and stored.get(_PATCHES) == digest and stored.get(_CHUNKS) == found
+
+
+def damage(path: Path, attributes: dict[str, Any]) -> dict[str, str]:
+    """Read the levels of a mosaic; return the reason for each damaged array, by its name."""
+    found = {}
+    for array in mosaic_arrays(attributes):
+        try:
+            stored = open_array(path, attributes, array.name)
+        except DamageError:  # of the metadata, which are compared elsewhere
+            continue
+        try:
+            for window in (_window(array, chunk) for chunk in _all_chunks(array)):
+                _ = stored[window]
+        except ValueError:  # Zarr's message about a checksum
+            found[array.name] = "its values do not match their checksum"
+    return found
+
+
+def complete(
+    path: Path,
+    attributes: dict[str, Any],
+    digest: str,
+    read: Callable[[slice, slice], NDArray[np.complex64]],
+    tell: Callable[[int, int], object] | None,
+) -> None:
+    """Compute the levels of a mosaic that mix patches, and write their record.
+
+    Parameters
+    ----------
+    path : Path
+        The store.
+    attributes : dict
+        Attributes of the store.
+    digest : str
+        Digest of the finished patches.
+    read : callable
+        Called as read(rows, columns) with slices; returns pixels of the mosaic.
+    tell : callable or None
+        Called as tell(chunks computed so far, number of chunks).
+    """
+    folder = path / LEVELS
+    check_own(path, folder)
+    # Remove the old record first, so that it never stands beside new chunks.
+    if (folder / "zarr.json").exists():
+        (folder / "zarr.json").unlink()
+        sync_folder(folder)
+    arrays = mosaic_arrays(attributes)
+    by_factor = {
+        factor: [array for array in arrays if array.factor == factor]
+        for factor in sorted({array.factor for array in arrays})
+    }
+    work = [(factor, chunk) for factor, same in by_factor.items() for chunk in _in_order(same[0])]
+    read = _by_patches(read, patch_arrays(attributes)[0])
+    for done, (factor, chunk) in enumerate(work, 1):
+        same = by_factor[factor]
+        window = _window(same[0], chunk)
+        level = _level(path, attributes, factor, window, read)
+        for array in same:
+            write_values(path, attributes, array.name, window, level.values_of(array))
+        if tell is not None:
+            tell(done, len(work))
+    chunks = {array.name: chunk_checksums(path, array, _all_chunks(array)) for array in arrays}
+    write_attributes(folder, with_checksum({_PATCHES: digest, _CHUNKS: chunks}))
+
+
+def _level(
+    path: Path,
+    attributes: dict[str, Any],
+    factor: int,
+    window: tuple[slice, slice],
+    read: Callable[[slice, slice], NDArray[np.complex64]],
+) -> Level:
+    """Return a part of a level, computed from the level before or from the pixels."""
+    if factor == 1:
+        pixels = read(*window)
+        return Level(np.abs(pixels), pixels)
+    shape = attributes["inputs"]["pixels"]
+    before = factor // 2
+    finer = [
+        slice(2 * part.start, min(2 * part.stop, -(-count // before)))
+        for part, count in zip(window, shape, strict=True)
+    ]
+    weights = [
+        covered(part.start, part.stop - part.start, before, count)
+        for part, count in zip(finer, shape, strict=True)
+    ]
+    rows, columns = finer
+    if before == 1:
+        pixels = read(rows, columns)
+        level = Level(np.abs(pixels), pixels)
+    else:
+        level = Level(
+            *(
+                np.asarray(open_array(path, attributes, f"{before}x/{kind}")[rows, columns])
+                for kind in ("amplitude", "pixels")
+            )
+        )
+    return coarser(level, weights[0], weights[1])
+
+
+def _by_patches(
+    read: Callable[[slice, slice], NDArray[np.complex64]], array: PixelArray
+) -> Callable[[slice, slice], NDArray[np.complex64]]:
+    """Return a function that reads whole patches, which may be one chunk, and keeps the latest."""
+
+    @lru_cache(maxsize=_KEPT)
+    def patch(index: PatchIndex) -> NDArray[np.complex64]:
+        return read(*array.window(index))
+
+    def window(rows: slice, columns: slice) -> NDArray[np.complex64]:
+        pixels = np.empty((rows.stop - rows.start, columns.stop - columns.start), np.complex64)
+        for index in array.touched(rows, columns):
+            common = [
+                (slice(max(a.start, b.start), min(a.stop, b.stop)), a.start, b.start)
+                for a, b in zip((rows, columns), array.window(index), strict=True)
+            ]
+            to = tuple(slice(part.start - own, part.stop - own) for part, own, _ in common)
+            of = tuple(slice(part.start - its, part.stop - its) for part, _, its in common)
+            pixels[to] = patch(index)[of]
+        return pixels
+
+    return window
+
+
+def _in_order(array: PixelArray) -> list[tuple[int, int]]:
+    """Return all chunks of a level, those that begin in the same patch one after another."""
+
+    def patch(chunk: tuple[int, int]) -> tuple[int, ...]:
+        sides = zip(chunk, array.chunk_shape, array.patch_shape, strict=True)
+        return tuple(i * side * array.factor // of_patch for i, side, of_patch in sides)
+
+    return sorted(_all_chunks(array), key=lambda chunk: (patch(chunk), chunk))
+
+
+def _all_chunks(array: PixelArray) -> list[tuple[int, int]]:
+    rows, columns = (
+        range(-(-count // side)) for count, side in zip(array.shape, array.chunk_shape, strict=True)
+    )
+    return list(itertools.product(rows, columns))
+
+
+def _window(array: PixelArray, chunk: tuple[int, int]) -> tuple[slice, slice]:
+    rows, columns = (
+        slice(i * side, min((i + 1) * side, count))
+        for i, side, count in zip(chunk, array.chunk_shape, array.shape, strict=True)
+    )
+    return rows, columns

@@ -1,0 +1,141 @@
+"""Arithmetic of levels: means of power and of complex pixels over blocks of pixels.
+
+Sums are in double precision, so that neither the power of small amplitudes nor that of large ones
+leaves the range of numbers. Stored is the root of the mean power, which has the range of the
+pixels.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.mosaics.levels import IN_DB, PixelArray
+
+_BAND = 256  # rows that are reduced at once: a plain choice, which keeps copies small
+
+
+class Level(NamedTuple):
+    """Values of a level, or of a part of it."""
+
+    amplitude: NDArray[np.float32]
+    """Root of the mean power."""
+    pixels: NDArray[np.complex64]
+    """Mean of the complex pixels."""
+
+    def values_of(self, array: PixelArray) -> NDArray[np.float32] | NDArray[np.complex64]:
+        """Return the values of an array of the level: amplitudes, pixels, or amplitudes in dB."""
+        if array.name == IN_DB:
+            return _in_db(self.amplitude)
+        return self.pixels if array.name.endswith("/pixels") else self.amplitude
+
+
+class _Sums(NamedTuple):
+    """Sums over blocks of pixels, and the number of pixels in the blocks along both axes."""
+
+    power: NDArray[np.float64]
+    pixels: NDArray[np.complex128]
+    rows: NDArray[np.float64]
+    columns: NDArray[np.float64]
+
+    def halved(self) -> _Sums:
+        """Return the sums over blocks of twice the side."""
+        return _Sums(
+            _pairs_of_columns(_pairs(self.power)),
+            _pairs_of_columns(_pairs(self.pixels)),
+            _pairs(self.rows),
+            _pairs(self.columns),
+        )
+
+    def level(self) -> Level:
+        """Return the means."""
+        count = np.multiply.outer(self.rows, self.columns)
+        amplitude = np.sqrt(self.power / count).astype(np.float32)
+        return Level(amplitude, (self.pixels / count).astype(np.complex64))
+
+
+def levels(pixels: NDArray[np.complex64], factors: tuple[int, ...]) -> dict[int, Level]:
+    """Return the levels of a patch.
+
+    Parameters
+    ----------
+    pixels : complex64 [rows, columns]
+    factors : tuple of int
+        1, 2, 4 and so on, ascending. Their blocks begin at the first pixel; the last blocks may
+        extend beyond the pixels, and are then the mean of those that there are.
+    """
+    if not factors:
+        return {}
+    bands: dict[int, list[Level]] = {factor: [] for factor in factors}
+    height = factors[-1] * max(_BAND // factors[-1], 1)
+    for first in range(0, len(pixels), height):
+        sums, factor = _sums_of(pixels[first : first + height]), 1
+        while factor < factors[-1]:
+            if factor in bands:
+                bands[factor].append(sums.level())
+            sums, factor = sums.halved(), 2 * factor
+        bands[factor].append(sums.level())
+    return {
+        factor: Level(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+        for factor, found in bands.items()
+    }
+
+
+def coarser(level: Level, rows: NDArray[np.float64], columns: NDArray[np.float64]) -> Level:
+    """Return the next level.
+
+    Parameters
+    ----------
+    level : Level
+        A part of a level that begins at an even pixel along both axes.
+    rows, columns : float64
+        Number of pixels of the mosaic that its pixels cover, along both axes.
+    """
+    count = np.multiply.outer(rows, columns)
+    power = count * np.square(level.amplitude, dtype=np.float64)
+    return _Sums(power, count * level.pixels, rows, columns).halved().level()
+
+
+def _in_db(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return amplitudes in dB, NaN where they are zero."""
+    level = np.full(amplitude.shape, np.nan, np.float32)
+    np.log10(amplitude, out=level, where=amplitude > 0)
+    level *= 20
+    return level
+
+
+def covered(first: int, count: int, factor: int, pixels: int) -> NDArray[np.float64]:
+    """Return how many pixels of the mosaic the pixels of a level cover along an axis.
+
+    Parameters
+    ----------
+    first, count : int
+        The pixels of the level.
+    factor : int
+        Factor of the level.
+    pixels : int
+        Pixels of the mosaic along the axis.
+    """
+    starts = factor * np.arange(first, first + count)
+    return np.minimum(factor, pixels - starts).astype(np.float64)
+
+
+def _sums_of(pixels: NDArray[np.complex64]) -> _Sums:
+    exact = pixels.astype(np.complex128)
+    power = np.square(exact.real) + np.square(exact.imag)
+    return _Sums(power, exact, *(np.ones(count) for count in pixels.shape))
+
+
+def _pairs(values: NDArray) -> NDArray:
+    """Return the sums of pairs along the first axis; the last value may lack a partner."""
+    sums = values[::2].copy()
+    sums[: len(values) // 2] += values[1::2]
+    return sums
+
+
+def _pairs_of_columns(values: NDArray) -> NDArray:
+    sums = values[:, ::2].copy()
+    sums[:, : values.shape[1] // 2] += values[:, 1::2]
+    return sums

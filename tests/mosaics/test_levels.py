@@ -1,0 +1,473 @@
+"""Levels of mosaics: right, crash-safe, found by other programs, and read by overviews."""
+
+import functools
+import json
+import os
+import shutil
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import stores
+from click.testing import CliRunner
+from stores import change, files_of, written
+
+import clsas
+from clsas.cli import main
+from clsas.core.digests import grid_digest
+from clsas.core.grid import Grid
+from clsas.mosaics import pyramid
+from clsas.mosaics.documents import read_document
+from clsas.mosaics.levels import Levels, aligned_side, chunk_side, levels_of
+from clsas.mosaics.patches import Layout
+from clsas.mosaics.record import Record
+
+GRID = Grid.plane((-4, 4.3, 84), (30, 36.9, 70))
+RECORD = Record(channels=1, survey_channels=1, has_pixels=True)
+OF_PATCHES, MIXED, ODD = (24, 32), (20, 28), (15, 21)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """Let the small stores of these tests have chunks and levels like large ones."""
+    monkeypatch.setattr("clsas.mosaics.levels.CHUNK_SIDE", 16)
+    monkeypatch.setattr("clsas.mosaics.levels.COARSEST_SIDE", 16)
+    monkeypatch.setattr("clsas.mosaics.levels._SMALLEST_CHUNK", 2)
+
+
+def pixels_of(seed=0):
+    random = np.random.default_rng(seed)
+    pixels = random.normal(size=(*GRID.shape, 2)).astype(np.float32).view(np.complex64)[..., 0]
+    pixels[20:40, 28:56] = 0
+    return pixels
+
+
+PIXELS = pixels_of()
+
+
+def begun(path, patch_shape):
+    store = clsas.Store.at(path)
+    inputs = {"parts": [], "pixels": list(GRID.shape), "grid": grid_digest(GRID)}
+    store.begin(inputs, GRID, patch_shape)
+    return store
+
+
+def patches_of(patch_shape):
+    layout = Layout(GRID, patch_shape)
+    return [layout.window(index) for index in np.ndindex(layout.shape)]
+
+
+def write(store, window, pixels=PIXELS):
+    store.write(
+        window.row, window.column, window.rows, window.columns,
+        pixels[window.rows, window.columns], RECORD,
+    )  # fmt: skip
+
+
+def formed(path, patch_shape, pixels=PIXELS):
+    """Return a store after writing all patches and levels."""
+    store = begun(path, patch_shape)
+    for window in patches_of(patch_shape):
+        write(store, window, pixels)
+    store.complete_levels()
+    return store
+
+
+def finished(path, patch_shape):
+    """Return a copy of a store that contains all patches and levels."""
+    return clsas.Store.opened(written(path, files_of_finished(patch_shape)))
+
+
+@functools.cache
+def files_of_finished(patch_shape):
+    with tempfile.TemporaryDirectory() as folder:
+        return files_of(formed(Path(folder) / "a.zarr", patch_shape).path)
+
+
+def expected(factor, pixels=PIXELS):
+    """Return amplitude and mean of blocks, one by one."""
+    rows, columns = (range(0, count, factor) for count in pixels.shape)
+    blocks = [
+        [pixels[i : i + factor, j : j + factor].astype(complex) for j in columns] for i in rows
+    ]
+    amplitude = [[np.sqrt(np.mean(np.abs(block) ** 2)) for block in row] for row in blocks]
+    return np.array(amplitude), np.array([[block.mean() for block in row] for row in blocks])
+
+
+@pytest.mark.parametrize(
+    ("patch_shape", "levels"),
+    [
+        (OF_PATCHES, Levels((2, 4, 8))),
+        (MIXED, Levels((2, 4), (8,))),
+        (ODD, Levels((), (2, 4, 8))),
+        ((70, 84), Levels((2, 4, 8))),
+    ],
+)
+def test_levels_are_means_of_power_and_of_pixels(tmp_path, patch_shape, levels):
+    store = finished(tmp_path / "a.zarr", patch_shape)
+    assert levels_of(GRID.shape, patch_shape) == levels
+    assert store.levels == (2, 4, 8)
+    assert max(store.pixels.chunks) <= 16
+    np.testing.assert_array_equal(store.read(), PIXELS)
+    for factor in store.levels:
+        amplitude, mean = expected(factor)
+        np.testing.assert_allclose(store.read_level(factor), amplitude, rtol=1e-6, atol=1e-12)
+        coherent = store.read_level(factor, coherent=True)
+        np.testing.assert_allclose(coherent, mean, rtol=1e-5, atol=1e-7)
+    part = slice(3, 8), slice(1, 9)
+    np.testing.assert_array_equal(store.read_level(4, *part), store.read_level(4)[part])
+    assert not store.damage()
+    assert not store.array_damage()
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e30])
+def test_powers_beyond_single_precision_are_kept(scale):
+    pixels = (scale * PIXELS).astype(np.complex64)
+    found = pyramid.levels(pixels, (2, 4))
+    np.testing.assert_allclose(found[4].amplitude, scale * expected(4)[0], rtol=1e-6)
+    rows, columns = (pyramid.covered(0, -(-n // 2), 2, n) for n in GRID.shape)
+    coarser = pyramid.coarser(found[2], rows, columns)
+    np.testing.assert_allclose(coarser.amplitude, scale * expected(4)[0], rtol=1e-6)
+
+
+class Killed(BaseException):
+    """Stands for a signal that ends the process."""
+
+
+def killed_at(monkeypatch, step, work):
+    """Do some work until a file is about to get its name for the `step`-th time; or return."""
+    rename, count = os.replace, iter(range(step))
+
+    def replace(source, target):
+        if next(count, None) is None:
+            raise Killed
+        rename(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", replace)
+        try:
+            work()
+        except Killed:
+            return True
+    return False
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("patch_shape", [MIXED, ODD])
+def test_a_store_killed_at_any_step_ends_bit_identical(tmp_path, monkeypatch, patch_shape):
+    """While a patch is written anew with other pixels, or while levels are computed."""
+    whole = files_of(finished(tmp_path / "whole.zarr", patch_shape).path)
+    start, path = tmp_path / "start.zarr", tmp_path / "a.zarr"
+    store = formed(start, patch_shape, pixels_of(1))
+    first, *others = patches_of(patch_shape)
+    for window in others:
+        write(store, window)
+    step, kills, is_killed = 0, 0, True
+    while is_killed:
+        shutil.rmtree(path, ignore_errors=True)
+        shutil.copytree(start, path)
+        store = clsas.Store.opened(path)
+
+        def work(store=store):
+            write(store, first)
+            store.complete_levels()
+
+        is_killed = killed_at(monkeypatch, step, work)
+        kills += is_killed
+        step += 1 if step < 8 else 4
+        again = begun(path, patch_shape)
+        assert not again.damage()
+        assert not again.array_damage()
+        if (0, 0) not in again.records():
+            write(again, first)
+        again.complete_levels()
+        assert files_of(path) == whole
+    assert kills > 8
+
+
+def test_patches_can_be_written_side_by_side(tmp_path):
+    one = finished(tmp_path / "one.zarr", MIXED)
+    store = begun(tmp_path / "many.zarr", MIXED)
+    with ThreadPoolExecutor(8) as threads:
+        list(
+            threads.map(
+                lambda window: write(clsas.Store.opened(store.path), window),
+                reversed(patches_of(MIXED)),
+            )
+        )
+    store.complete_levels()
+    assert files_of(store.path) == files_of(one.path)
+
+
+def test_levels_that_mix_patches_follow_the_patches(tmp_path):
+    store = finished(tmp_path / "a.zarr", MIXED)
+    assert not store.complete_levels()  # there already
+    other = pixels_of(1)
+    for window in patches_of(MIXED):
+        write(store, window, other)
+    assert store.levels == (2, 4)  # the others are not those of the patches
+    np.testing.assert_allclose(
+        np.abs(store.overview(11).pixels), expected(8, other)[0][:8, :10], rtol=1e-6
+    )
+    assert store.complete_levels()
+    assert store.levels == (2, 4, 8)
+    np.testing.assert_allclose(store.read_level(8), expected(8, other)[0], rtol=1e-6)
+
+
+def test_the_overview_reads_the_level_that_makes_up_its_pixels(tmp_path, monkeypatch):
+    store = finished(tmp_path / "a.zarr", OF_PATCHES)
+    plain = {}
+    with monkeypatch.context() as patch:
+        patch.setattr(clsas.Store, "levels", ())
+        for most in (42, 21, 12, 7):
+            plain[most] = store.overview(most)
+        windows = [slice(8, 70)], [slice(3, 70)], [slice(0, 70, 2), slice(0, 84, 3)]
+        parts = [store.overview(12, *window) for window in windows]
+    read = []
+
+    def recorded(self, array, *window):
+        read.append(array.name)
+        return unrecorded(self, array, *window)
+
+    unrecorded = clsas.Store._read
+    monkeypatch.setattr(clsas.Store, "_read", recorded)
+    for most, image in plain.items():
+        read.clear()
+        ours = store.overview(most)
+        assert set(read) == {{42: "2x", 21: "4x", 12: "8x", 7: "4x"}[most] + "/amplitude"}
+        if most == 12:  # 8 pixels a side instead of 7
+            assert ours.shape == (8, 10)
+            np.testing.assert_allclose(np.abs(ours.pixels), expected(8)[0][:8, :10], rtol=1e-6)
+        else:
+            np.testing.assert_allclose(np.abs(ours.pixels), np.abs(image.pixels), rtol=1e-6)
+            np.testing.assert_allclose(ours.grid.positions_m(), image.grid.positions_m())
+    read.clear()
+    assert store.overview(12, *windows[0]).shape == (7, 10)
+    assert set(read) == {"8x/amplitude"}
+    read.clear()
+    for window, image in zip(windows[1:], parts[1:], strict=True):
+        np.testing.assert_allclose(store.overview(12, *window).pixels, image.pixels, rtol=1e-6)
+    assert set(read) == {"pixels"}  # the part begins within a pixel of a level, or lacks pixels
+
+
+@pytest.mark.parametrize("name", ["2x/pixels/c/1/1", "4x/amplitude/c/1/1", "pixels/c/3/2"])
+def test_damaged_chunks_of_patches_are_found(tmp_path, name):
+    store = finished(tmp_path / "a.zarr", OF_PATCHES)
+    chunk = store.path / name
+    content = bytearray(chunk.read_bytes())
+    content[5] ^= 1
+    chunk.write_bytes(content)
+    assert list(store.damage()) == [(1, 1)]
+    kind = "pixels" if name.startswith("pixels") else f"values of {name.split('/c/')[0]}"
+    assert store.damage()[1, 1] == f"its {kind} do not match their checksum"
+    factor = 1 if kind == "pixels" else int(name[0])
+    with pytest.raises(ValueError, match=r"a\.zarr is damaged: patch 1,1: its .* their checksum"):
+        store.read() if factor == 1 else store.read_level(factor, coherent="pixels" in name)
+    chunk.unlink()
+    assert store.damage()[1, 1] == f"its {kind} are gone"
+    assert (1, 1) not in store.records()
+
+
+def test_damaged_levels_that_mix_patches_are_computed_again(tmp_path):
+    store = finished(tmp_path / "a.zarr", MIXED)
+    whole = files_of(store.path)
+    chunk = store.path / "8x/amplitude/c/0/0"
+    chunk.write_bytes(b"\1" + chunk.read_bytes()[1:])
+    assert not store.damage()
+    assert store.array_damage() == {"8x/amplitude": "its values do not match their checksum"}
+    with pytest.raises(ValueError, match=r"8x/amplitude: .*; run clsas mosaic"):
+        store.overview(11)
+    with pytest.warns(clsas.ClsasWarning, match="these levels are computed again: 8x/amplitude"):
+        store = begun(store.path, MIXED)
+    assert store.complete_levels()
+    assert files_of(store.path) == whole
+    chunk.unlink()
+    assert store.levels == (2, 4)
+    assert store.complete_levels()
+    assert files_of(store.path) == whole
+
+
+@pytest.mark.parametrize("name", ["4x", "8x/amplitude", "8x/x", "overview_y", "amplitude_db"])
+def test_metadata_of_levels_are_repaired(tmp_path, name):
+    store = finished(tmp_path / "a.zarr", MIXED)
+    whole = files_of(store.path)
+    (store.path / name / "zarr.json").write_text("{}")
+    assert list(store.array_damage()) == [name]
+    with pytest.warns(clsas.ClsasWarning, match=f"has been repaired: {name}: its metadata"):
+        begun(store.path, MIXED)
+    assert files_of(store.path) == whole
+
+
+class TestStoresOfVersion2:
+    """Without levels, and with one chunk for each patch."""
+
+    @pytest.fixture
+    def store(self, tmp_path, monkeypatch):
+        with monkeypatch.context() as patch:
+            patch.setattr("clsas.mosaics.levels.CHUNK_SIDE", 1024)
+            patch.setattr("clsas.mosaics.arrays.levels_of", lambda *_: Levels())
+            path = begun(tmp_path / "old.zarr", ODD).path
+            change(path, version=2, chunk_shape=None, levels=None)
+            store = clsas.Store.opened(path)
+            for window in patches_of(ODD)[:-1]:
+                write(store, window)
+        assert not list(path.glob("[0-9]*x"))
+        assert not (path / "amplitude_db").exists()
+        record = json.loads((path / "patches/0.0/zarr.json").read_text())["attributes"]
+        assert isinstance(record["pixels_crc32c"], str)
+        assert "levels_crc32c" not in record
+        return store
+
+    def test_they_are_read_and_continued(self, store):
+        assert store.levels == ()
+        assert store.overview(10).pixels.any()
+        before = files_of(store.path)
+        store = begun(store.path, ODD)
+        assert files_of(store.path) == before
+        write(store, patches_of(ODD)[-1])
+        assert not store.complete_levels()
+        np.testing.assert_array_equal(store.read(), PIXELS)
+
+    def test_levels_can_be_added(self, store, tmp_path):
+        path = store.path
+        write(store, patches_of(ODD)[-1])
+        before = files_of(path)
+        result = CliRunner().invoke(main, ["mosaic", "--add-levels", "-o", str(path)])
+        assert result.exit_code == 0, result.output
+        assert "levels 2x, 4x, 8x: computed in" in result.output
+        assert {
+            name: (path / name).read_bytes() for name in before if name.name != "zarr.json"
+        } == {name: content for name, content in before.items() if name.name != "zarr.json"}
+        store = clsas.Store.opened(path)
+        assert not store.array_damage()
+        new = finished(tmp_path / "new.zarr", ODD)
+        for factor in new.levels:
+            np.testing.assert_array_equal(store.read_level(factor), new.read_level(factor))
+        result = CliRunner().invoke(main, ["mosaic", "--add-levels", "--json", "-o", str(path)])
+        assert json.loads(result.stdout)["added"] is False
+
+    def test_they_can_be_added_before_the_last_patch(self, store):
+        assert store.add_levels()
+        write(store, patches_of(ODD)[-1])
+        assert store.levels == ()
+        assert store.complete_levels()
+        np.testing.assert_allclose(store.read_level(8), expected(8)[0], rtol=1e-6)
+
+    @pytest.mark.slow
+    def test_adding_is_killed_at_any_step(self, store, tmp_path, monkeypatch):
+        whole = tmp_path / "whole.zarr"
+        shutil.copytree(store.path, whole)
+        clsas.Store.opened(whole).add_levels()
+        path, step = tmp_path / "a.zarr", 0
+        while True:
+            shutil.rmtree(path, ignore_errors=True)
+            shutil.copytree(store.path, path)
+            if not killed_at(monkeypatch, step, clsas.Store.opened(path).add_levels):
+                break
+            np.testing.assert_array_equal(clsas.Store.opened(path).read(), store.read())
+            clsas.Store.opened(path).add_levels()
+            assert files_of(path) == files_of(whole)
+            step += 7
+        assert step > 14
+
+
+def test_a_mosaic_forms_levels_and_continues_patches_of_other_sides(tmp_path, monkeypatch):
+    """As those of early versions, which are not rounded for levels."""
+    with monkeypatch.context() as patch:
+        patch.setattr("clsas.mosaics.levels.COARSEST_SIDE", 1024)
+        old = clsas.mosaic(stores.LINES, stores.GRID, tmp_path / "old.zarr", **stores.REQUEST)
+    new = clsas.mosaic(stores.LINES, stores.GRID, tmp_path / "new.zarr", **stores.REQUEST)
+    assert (old.patch_shape, new.patch_shape) == ((15, 14), (16, 16))
+    image = new.image()
+    again = clsas.mosaic(stores.LINES, stores.GRID, tmp_path / "old.zarr", **stores.REQUEST)
+    assert again.patch_shape == (15, 14)
+    assert clsas.relative_error_db(again.image(), image) < -50
+    store = clsas.Store.opened(tmp_path / "new.zarr")
+    assert store.levels == (2, 4)
+    for factor in store.levels:
+        amplitude = expected(factor, image.pixels)[0]
+        np.testing.assert_allclose(store.read_level(factor), amplitude, rtol=1e-6)
+    assert clsas.Store.opened(tmp_path / "old.zarr").levels == ()
+    assert clsas.Store.opened(tmp_path / "old.zarr").overview(10).shape == (7, 10)
+
+
+class TestOtherPrograms:
+    def test_xarray_plots_amplitudes_in_db_at_once(self, tmp_path):
+        xarray = pytest.importorskip("xarray")
+        store = finished(tmp_path / "a.zarr", MIXED)
+        data = xarray.open_zarr(store.path, consolidated=False)
+        assert data.amplitude_db.dims == ("overview_y", "overview_x")
+        assert data.amplitude_db.attrs["units"] == "dB"
+        amplitude = np.where(expected(8)[0] > 0, expected(8)[0], np.nan)
+        np.testing.assert_allclose(data.amplitude_db, 20 * np.log10(amplitude), atol=1e-4)
+        assert data.amplitude_db.plot() is not None
+        level = xarray.open_zarr(store.path, group="4x", consolidated=False)
+        np.testing.assert_allclose(level.amplitude, expected(4)[0], rtol=1e-6)
+        middles = [np.mean(GRID.axes_m[0][i : i + 4]) for i in range(0, 84, 4)]
+        np.testing.assert_allclose(level.x, middles)
+        np.testing.assert_allclose(level.pixels.isel(x=2), expected(4)[1][:, 2], rtol=1e-5)
+
+    def test_what_was_not_received_is_nan(self, tmp_path):
+        xarray = pytest.importorskip("xarray")
+        store = begun(tmp_path / "a.zarr", OF_PATCHES)
+        write(store, patches_of(OF_PATCHES)[0], np.where(np.arange(84) < 16, PIXELS, 0))
+        level = xarray.open_zarr(store.path, consolidated=False).amplitude_db.values
+        assert np.isfinite(level[:3, :2]).all()
+        assert np.isnan(level[:3, 2:]).all()
+        assert np.isnan(level[3:]).all()
+
+    def test_the_layout_is_that_of_the_convention(self, tmp_path):
+        """As GDAL writes it: the mosaic's array, then a group for each level."""
+        store = finished(tmp_path / "a.zarr", MIXED)
+        attributes = read_document(store.path)
+        assert attributes["zarr_conventions"][0]["name"] == "multiscales"
+        layout = attributes["multiscales"]["layout"]
+        assert [each["asset"] for each in layout] == ["pixels", "2x", "4x", "8x"]
+        assert [each.get("derived_from") for each in layout] == [None, "pixels", "2x", "4x"]
+        for each in layout[1:]:
+            assert each["transform"]["scale"] == [2.0, 2.0]
+            assert (store.path / each["asset"] / "pixels" / "zarr.json").exists()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"levels": []},
+        {"levels": {"of_patches": [2, 8], "of_mosaic": []}},
+        {"levels": {"of_patches": [2, 4, 8], "of_mosaic": []}},  # 8 divides no side of a patch
+        {"levels": {"of_patches": [True], "of_mosaic": []}},
+        {"chunk_shape": [0, 14]},
+        {"chunk_shape": [9, 14]},
+        {"chunk_shape": "ab"},
+    ],
+)
+def test_wrong_levels_in_a_document_are_damage(tmp_path, wrong):
+    path = finished(tmp_path / "a.zarr", MIXED).path
+    change(path, **wrong)
+    with pytest.raises(ValueError, match=r"a\.zarr is damaged: its attributes are not those"):
+        clsas.Store.opened(path)
+
+
+def test_patches_and_chunks_of_large_mosaics(monkeypatch):
+    monkeypatch.undo()
+    for pixels, count, side, chunk in [
+        (20_000, 5, 4000, 1000),
+        (20_001, 5, 4032, 1008),
+        (20_000, 8, 2528, 632),
+        (20_000, 64, 316, 316),  # multiples of 8 would be 63 patches
+        (20_011, 1, 20_032, 1001),
+        (900, 7, 129, 129),
+    ]:
+        found = aligned_side(-(-pixels // count), count, pixels, 32 if pixels > 900 else 1)
+        assert (found, -(-pixels // found)) == (side, count)
+        assert chunk_side(found, pixels) == chunk
+
+
+def test_a_factor_without_a_level_is_refused(tmp_path):
+    store = finished(tmp_path / "a.zarr", MIXED)
+    with pytest.raises(
+        ValueError, match=r"factor must be that of a level of .* \(2, 4, 8\), got 3"
+    ):
+        store.read_level(3)
