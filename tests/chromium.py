@@ -8,9 +8,8 @@ import shutil
 import subprocess
 import time
 
-PROGRAM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
+_NAMES = "chromium", "chromium-browser", "google-chrome"
+PROGRAM = next(filter(None, map(shutil.which, _NAMES)), None)
 _SECONDS = 30  # after which an answer is no longer expected
 
 OPTIONS = (
@@ -112,7 +111,7 @@ class Chromium:
 
     def wait_until(self, condition):
         end = time.monotonic() + _SECONDS
-        while not self.js(condition):
+        while not self.js(f"Boolean({condition})"):
             assert time.monotonic() < end, condition
             time.sleep(0.02)
 

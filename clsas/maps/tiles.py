@@ -88,9 +88,13 @@ class Levels:
 
     def power(self, pixels: NDArray[np.complex64]) -> NDArray[np.float32]:
         """Return power relative to the reference. It is 0 only where nothing was received."""
-        amplitude = np.abs(pixels)
-        power = (amplitude / np.float32(self.reference)) ** 2
-        np.maximum(power, _FAINTEST, out=power, where=amplitude > 0)
+        parts = np.ascontiguousarray(pixels).view(np.float32)
+        # The reference itself may be too large for float32, but half of it never is.
+        parts = np.multiply(parts, np.float32(0.5))
+        parts /= np.float32(self.reference / 2)
+        parts *= parts
+        power = np.add(parts[:, ::2], parts[:, 1::2])
+        np.maximum(power, _FAINTEST, out=power, where=pixels != 0)
         return power
 
     def encode(self, power: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -196,7 +200,8 @@ def halved(power: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the means of 2 x 2 pixels, or of those that exist at the end of odd sides."""
     rows, columns = (n % 2 for n in power.shape)
     even = np.pad(power, ((0, rows), (0, columns)), mode="edge") if rows or columns else power
-    return (even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4
+    total = even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]
+    return np.multiply(total, np.float32(0.25))
 
 
 def _packed(levels: NDArray[np.uint8]) -> bytes:

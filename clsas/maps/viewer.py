@@ -15,6 +15,7 @@ import numpy as np
 
 from clsas.core import validate
 from clsas.core.atomic import replacing_folder
+from clsas.core.decibels import largest_amplitude
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.version import __version__
@@ -108,6 +109,7 @@ def write(
     readers = [_reader(each) for each in sources]
     report = _Progress(2 * sum(map(len, readers)), progress)
     reference = max(_largest(reader, report) for reader in readers) or 1.0
+    scales = levels_of(readers[0].shape)
     levels = Levels(reference, max(STEP_DB, range_db / (BRIGHTEST - 1)))
     grid = grids[0]
     to_geographic = geographic_of(grid)
@@ -116,7 +118,7 @@ def write(
         "names": names,
         "shape": grid.shape,
         "side": SIDE,
-        "levels": [levels_of(grid.shape)[0], levels_of(grid.shape)[-1]],
+        "levels": [scales[0], scales[-1]],
         "reference": reference,
         "step_db": levels.step_db,
         "range_db": range_db,
@@ -203,7 +205,7 @@ def _largest(reader: Source, report: _Progress) -> float:
     """Return the largest amplitude of an image."""
     most = 0.0
     for rows, columns in report.through(reader):
-        most = max(most, float(np.abs(reader.read(rows, columns)).max()))
+        most = max(most, largest_amplitude(reader.read(rows, columns)))
     return most
 
 
