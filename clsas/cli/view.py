@@ -83,7 +83,7 @@ def view(
             sources[0],
             made,
             against=sources[1] if against is not None else None,
-            names=[printable(path.name) for path in paths],
+            names=[printable(path.resolve().name) for path in paths],
             progress=progress,
             **levels,
         )

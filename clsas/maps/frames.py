@@ -81,14 +81,13 @@ def fitted_degrees(
     """Return Chebyshev series of latitude and longitude over rows and columns.
 
     The page evaluates the series where the cursor is, without a library for map projections. Rows
-    and columns from the first to the last pixel become arguments from -1 to 1. The series agree to
-    1e-7 degrees, which is 1 cm, within scenes of 100 km.
+    and columns from the first to the last pixel become arguments from -1 to 1.
 
     Returns
     -------
     dict or None
-        Coefficients [row power][column power] of "latitude" and "longitude", degrees; None if
-        no series of this degree is good enough, as next to a pole.
+        Coefficients [row][column] of "latitude" and "longitude", degrees. None if the series err
+        by more than 1e-7 degrees (1 cm): close to a pole, or in scenes of 100 km at high latitudes.
     """
     nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     row, column = np.meshgrid(nodes, nodes, indexing="ij")

@@ -422,9 +422,8 @@
         draw.closePath();
       }, colour, 1);
       const text = patchText(error, words, false);
-      if (right - left > draw.measureText(text).width + 12 && bottom - top > 22) {
-        outlined(text, left + 6, top + 5, colour);
-      }
+      const [x, y] = [left < 36 ? 42 : left + 6, Math.max(top, 30) + 5]; // beside numbers of the axis
+      if (right - x > draw.measureText(text).width + 6 && bottom - y > 16) outlined(text, x, y, colour);
     }
   }
 

@@ -1,4 +1,4 @@
-"""A headless Chromium that tests drive through the DevTools protocol, over pipes."""
+"""A headless Chromium for tests and pictures, driven by the DevTools protocol over pipes."""
 
 import base64
 import json
@@ -20,13 +20,25 @@ OPTIONS = (
 
 
 class Chromium:
-    """One page of a browser that ends with the `with` block."""
+    """One page of a browser that runs within a `with` block.
+
+    Parameters
+    ----------
+    profile : Path
+        Folder for the browser's own files.
+
+    Attributes
+    ----------
+    errors : list
+        Errors of the page, and addresses that it has requested from a network.
+    """
 
     def __init__(self, profile):
         self._profile = profile
         self._number, self._session, self._rest, self.errors = 0, None, b"", []
 
     def __enter__(self):
+        """Start the browser, and open an empty page."""
         theirs_in, self._to = os.pipe()
         self._from, theirs_out = os.pipe()
         # The protocol's pipes are descriptors 3 and 4 of the browser.
@@ -46,6 +58,7 @@ class Chromium:
         return self
 
     def __exit__(self, *_):
+        """End the browser."""
         os.close(self._to)  # upon which the browser ends
         os.close(self._from)
         try:
@@ -55,7 +68,7 @@ class Chromium:
             self._process.wait()
 
     def call(self, method, **parameters):
-        """The result of a command of the protocol."""
+        """Return the result of a command of the protocol."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
         if self._session:
@@ -110,13 +123,14 @@ class Chromium:
         self.js(f"{frames}.then(() => 0)")
 
     def wait_until(self, condition):
+        """Wait until an expression is true."""
         end = time.monotonic() + _SECONDS
         while not self.js(f"Boolean({condition})"):
             assert time.monotonic() < end, condition
             time.sleep(0.02)
 
     def js(self, expression):
-        """The value of an expression, after a promise is kept."""
+        """Return the value of an expression, or what a promise leads to."""
         found = self.call(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
         )
@@ -124,13 +138,16 @@ class Chromium:
         return found["result"].get("value")
 
     def text(self, selector):
+        """Return the text of the first element that a selector finds."""
         return self.js(f"document.querySelector({selector!r}).textContent")
 
     def move(self, x, y):
+        """Move the mouse to a place."""
         self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
         self.settle()
 
     def click(self, x, y):
+        """Click at a place."""
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             button = {} if kind == "mouseMoved" else {"button": "left", "clickCount": 1}
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **button)
@@ -146,8 +163,9 @@ class Chromium:
         self.settle()
 
     def type(self, text):
+        """Type a text into the element that has the focus."""
         self.call("Input.insertText", text=text)
 
     def screenshot(self):
-        """A picture of the page, as the bytes of a PNG."""
+        """Return a picture of the page, as the bytes of a PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
