@@ -73,6 +73,12 @@ def position(page):
     return float(x.replace("−", "-")), float(y.replace("−", "-"))
 
 
+def pixels_per_metre(page):
+    """The scale that the scale bar shows."""
+    width = page.js("parseFloat(document.querySelector('#scale-bar').style.width)")
+    return width / float(page.text("#scale-length").removesuffix(" m"))
+
+
 def test_a_known_point_is_where_the_cursor_says(page):
     for point in BRIGHT:
         go(page, *point)
@@ -143,6 +149,7 @@ def test_distances_with_keys_and_mouse(page):
     assert page.text("#distance") == ""
 
 
+@pytest.mark.slow
 def test_two_images_swiped_and_blinked(page):
     go(page, 0, 45)
     middle = page.js("innerWidth / 2")
@@ -189,10 +196,25 @@ def test_fits_a_narrow_window(page, folder):
     assert page.js(outside) == []
 
 
-def test_scale_bar_and_axes_have_the_scale_of_the_image(page):
+def test_two_fingers_zoom_about_their_middle(page, folder):
+    page.open(folder / "index.html", width=400, height=700)
+    page.move(200, 300)
+    before = position(page)
+    scale = pixels_per_metre(page)
+    for kind, apart in (("touchStart", 40), ("touchMove", 100), ("touchMove", 160)):
+        fingers = [{"x": 200 + side * apart / 2, "y": 300, "id": side} for side in (-1, 1)]
+        page.call("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
+    page.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+    page.settle()
+    assert pixels_per_metre(page) / scale == pytest.approx(4, rel=1e-3)
+    page.move(200, 300)
+    assert position(page) == pytest.approx(before, abs=0.02)
+
+
+def test_the_scale_bar_has_the_scale_of_the_image(page):
     page.press("9")  # one pixel of the screen for each of the image: 2 cm
     assert page.text("#scale-length") == "2 m"
-    assert page.js("document.querySelector('#scale-bar').offsetWidth") == 100
+    assert pixels_per_metre(page) == pytest.approx(50, rel=1e-6)
 
 
 def test_a_slanted_grid_with_a_georeference_and_patches(browser, tmp_path, monkeypatch):
