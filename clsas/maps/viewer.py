@@ -31,7 +31,8 @@ PAGE = "index.html"
 
 _SCENE = "scene.js"
 _START = "window.clsasScene = "  # of that file, by which folders of viewers are recognized
-_FILES = (PAGE, "viewer.css", "viewer.js")
+_SCRIPTS = ("geometry", "view", "tiles", "marks", "controls", "events")
+_FILES = (PAGE, "viewer.css", *(f"{name}.js" for name in _SCRIPTS))
 _COLOURS = ("inferno", "sonar", "gray")
 _SAME = 1e-6  # of a pixel, by which positions of two images may differ
 
@@ -109,24 +110,10 @@ def write(
     readers = [_reader(each) for each in sources]
     report = _Progress(2 * sum(map(len, readers)), progress)
     reference = max(_largest(reader, report) for reader in readers) or 1.0
-    scales = levels_of(readers[0].shape)
     levels = Levels(reference, max(STEP_DB, range_db / (BRIGHTEST - 1)))
-    grid = grids[0]
-    to_geographic = geographic_of(grid)
-    scene = {
-        "version": __version__,
-        "names": names,
-        "shape": grid.shape,
-        "side": SIDE,
-        "levels": [scales[0], scales[-1]],
-        "reference": reference,
-        "step_db": levels.step_db,
-        "range_db": range_db,
-        "frame": Frame.of(grid).describe(grid),
-        "geographic": None if to_geographic is None else fitted_degrees(grid, to_geographic),
-        "colours": tables,
-        "patches": _patches(source) if isinstance(source, Store) else [],
-    }
+    scene = {"names": names, "range_db": range_db, "colours": tables}
+    scene |= _described(readers[0].shape, grids[0], levels)
+    scene |= {"patches": _patches(source) if isinstance(source, Store) else []}
     with replacing_folder(folder) as made:
         for name in _FILES:
             (made / name).write_text(_text_of(name), encoding="utf-8")
@@ -137,11 +124,8 @@ def write(
             for rows, columns in report.through(reader):
                 pyramid.add(rows, columns, reader.read(rows, columns))
         for each, before in zip(sources, records, strict=True):
-            if isinstance(each, Store) and each.records() != before:
-                raise ValueError(
-                    f"{each.path} must not change while it is exported, but patches were formed "
-                    "meanwhile: repeat the export when the mosaic is finished"
-                )
+            if isinstance(each, Store):
+                _check_unchanged(each, before)
 
 
 def check_folder(folder: Path) -> None:
@@ -226,6 +210,30 @@ def _check_grids(grids: Sequence[Grid]) -> None:
         raise ValueError(
             f"against must be on the grid of source, {one}, got {other}: form it on that grid"
         )
+
+
+def _check_unchanged(store: Store, records: object) -> None:
+    """Raise ValueError if patches of a store were formed since its records were read."""
+    if store.records() != records:
+        raise ValueError(
+            f"{store.path} must not change while it is exported, but patches were formed "
+            "meanwhile: repeat the export when the mosaic is finished"
+        )
+
+
+def _described(shape: tuple[int, int], grid: Grid, levels: Levels) -> dict[str, Any]:
+    """Return what the page needs to know of a grid and of the tiles."""
+    scales, to_geographic = levels_of(shape), geographic_of(grid)
+    return {
+        "version": __version__,
+        "shape": shape,
+        "side": SIDE,
+        "levels": [scales[0], scales[-1]],
+        "reference": levels.reference,
+        "step_db": levels.step_db,
+        "frame": Frame.of(grid).describe(grid),
+        "geographic": None if to_geographic is None else fitted_degrees(grid, to_geographic),
+    }
 
 
 def _patches(store: Store) -> list[list[Any]]:

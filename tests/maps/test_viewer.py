@@ -2,6 +2,7 @@
 
 import base64
 import json
+import os
 import re
 import zlib
 
@@ -174,12 +175,13 @@ def test_degrees_are_right_to_a_centimetre(longitude_deg):
 
 class TestFolder:
     def test_has_nothing_but_the_page(self, written):
-        assert {path.name for path in written.iterdir()} == {
-            "index.html", "viewer.css", "viewer.js", "scene.js", "tiles",
-        }  # fmt: skip
+        scripts = {"geometry.js", "view.js", "tiles.js", "marks.js", "controls.js", "events.js"}
+        others = {"index.html", "viewer.css", "scene.js", "tiles"}
+        assert {path.name for path in written.iterdir()} == scripts | others
         assert not list(written.parent.glob(".clsas-*"))
-        page = "".join((written / name).read_text() for name in ("index.html", "viewer.js"))
-        assert "http" not in page
+        page = (written / "index.html").read_text()
+        assert set(re.findall(r'src="(\w+\.js)"', page)) == scripts | {"scene.js"}
+        assert not any("http" in (written / name).read_text() for name in (*scripts, "index.html"))
 
     def test_replaces_only_an_earlier_viewer(self, image, tmp_path):
         small = clsas.Image(image.pixels[:20, :30], image.grid.window(slice(20), slice(30)))
@@ -207,6 +209,23 @@ class TestFolder:
         for name in ("web", "new"):
             with pytest.raises(type(error)):
                 viewer.write(small, tmp_path / name)
+        assert [path.name for path in tmp_path.iterdir()] == ["web"]
+        assert scene_of(tmp_path / "web")["names"] == ["image"]
+
+    def test_comes_back_if_the_new_one_cannot_take_its_place(self, image, tmp_path, monkeypatch):
+        small = clsas.Image(image.pixels[:20, :30], image.grid.window(slice(20), slice(30)))
+        viewer.write(small, tmp_path / "web")
+        rename, renamed = os.rename, []
+
+        def fail_once(one, other):
+            renamed.append(one)
+            if len(renamed) == 2:
+                raise PermissionError(1, "Operation not permitted", str(other))
+            rename(one, other)
+
+        monkeypatch.setattr(os, "rename", fail_once)
+        with pytest.raises(PermissionError):
+            viewer.write(small, tmp_path / "web", names=["again"])
         assert [path.name for path in tmp_path.iterdir()] == ["web"]
         assert scene_of(tmp_path / "web")["names"] == ["image"]
 
