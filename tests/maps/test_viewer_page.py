@@ -270,5 +270,5 @@ def test_an_incomplete_copy_says_what_is_missing(browser, folder, tmp_path):
         if path.is_file() and path.name != "scene.js":
             (tmp_path / path.name).write_bytes(path.read_bytes())
     browser.call("Page.navigate", url=(tmp_path / "index.html").as_uri())
-    browser.wait_until("document.querySelector('#trouble')")
+    browser.wait_until("document.readyState === 'complete'")  # later scripts fail for want of it
     assert "copy the whole folder" in browser.text("#trouble")
