@@ -18,11 +18,16 @@ const levelShape = (level) => {
 window.clsasTile = async (name, text) => {
   const tile = tiles.get(name);
   if (!tile) return;
-  const packed = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
-  const unpacked = new Uint8Array(await new Response(stream).arrayBuffer());
-  if (unpacked.length === tile.width * tile.height) tile.levels = unpacked;
-  redraw();
+  loading += 1; // until it is unpacked
+  try {
+    const packed = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+    const unpacked = new Uint8Array(await new Response(stream).arrayBuffer());
+    if (unpacked.length === tile.width * tile.height) tile.levels = unpacked;
+  } finally {
+    loading -= 1;
+    redraw();
+  }
 };
 
 // Return a tile that is loaded, or undefined after putting it on the list.
@@ -38,6 +43,7 @@ function tileAt(image, level, column, row, load = true) {
   return undefined;
 }
 
+// Load what the last drawing lacked, a few scripts at a time.
 function loadWanted() {
   while (loading < AT_ONCE && wanted.length) {
     const { name, level, column, row } = wanted.shift();
@@ -61,6 +67,7 @@ function loadWanted() {
   }
 }
 
+// Drop tiles that have not been in view for the longest time.
 function forget() {
   for (const [name, tile] of tiles) {
     if (tiles.size <= MOST_TILES) break;
@@ -134,6 +141,7 @@ function drawImage(image) {
   }
   const paper = sheet.getContext("2d");
   paper.clearRect(0, 0, width, height);
+  tileAt(image, COARSEST, 0, 0); // the first to be loaded, and shown until others are
   const list = [];
   for (let row = Math.floor(top / SIDE); row * SIDE < bottom; row += 1) {
     for (let column = Math.floor(left / SIDE); column * SIDE < right; column += 1) {
@@ -149,7 +157,6 @@ function drawImage(image) {
     if (tile) paper.drawImage(painted(tile), x, y);
     else drawCoarser(paper, image, level, column, row, x, y);
   }
-  tileAt(image, COARSEST, 0, 0); // always at hand
   const factor = 2 ** (FINEST - level);
   const scale = view.scale * size.ratio;
   const [u, v] = toPlane(left * factor - 0.5, top * factor - 0.5);
