@@ -80,6 +80,7 @@ def test_kernels_scenes_and_types_travel_in_the_wheel(wheel):
         path.name for path in (ROOT / "cl").iterdir()
     }
     assert (wheel / "clsas" / "scenes" / "thesis_wide_beam.toml").is_file()
+    assert (wheel / "clsas" / "maps" / "page" / "index.html").is_file()
     assert (wheel / "clsas" / "py.typed").is_file()
     assert not (wheel / "tests").exists()
 

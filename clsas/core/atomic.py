@@ -95,6 +95,34 @@ def creating(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """Yield an empty temporary folder to fill; on success it replaces the folder `path`, if any.
+
+    The old folder stays in place until the new one is complete and on the disk. There is a moment
+    between two renamings in which neither is at `path`.
+
+    Raises
+    ------
+    OSError
+        If the parent of `path` does not exist or cannot be written, `path` is a file, or the disk
+        is full.
+    """
+    with _temporary(path, Path.mkdir) as (new, _), _temporary(path, Path.mkdir) as (old, _):
+        yield new
+        os.sync()  # one call for thousands of files
+        exists = path.exists()
+        if exists:
+            os.rename(path, old)
+        try:
+            os.rename(new, path)
+        except OSError:
+            if exists:
+                os.rename(old, path)
+            raise
+        sync_folder(path.parent)
+
+
+@contextmanager
 def staging(folder: Path) -> Iterator[Path]:
     """Yield an empty temporary folder within a folder, for files to move from; then remove it."""
     with _temporary(folder / "staging", Path.mkdir) as (temporary, _):

@@ -1,0 +1,266 @@
+"""The viewer: a folder that shows an image or a mosaic in any browser, without a server."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from importlib import resources
+from itertools import product
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsas.core import validate
+from clsas.core.atomic import replacing_folder
+from clsas.core.decibels import largest_amplitude
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.core.version import __version__
+from clsas.maps.frames import Frame, fitted_degrees, geographic_of
+from clsas.maps.tiles import BRIGHTEST, SIDE, STEP_DB, Levels, Pyramid, Source, levels_of
+from clsas.mosaics.store import Store
+from clsas.plot.colours import COLOUR_MAP
+from clsas.plot.colours import colour_map as colours_of
+from clsas.plot.levels import DYNAMIC_RANGE_DB
+
+PAGE = "index.html"
+"""File in the folder of a viewer that a browser opens."""
+
+_SCENE = "scene.js"
+_START = "window.clsasScene = "  # of that file, by which folders of viewers are recognized
+_SCRIPTS = ("geometry", "view", "tiles", "marks", "controls", "events")
+_FILES = (PAGE, "viewer.css", *(f"{name}.js" for name in _SCRIPTS))
+_COLOURS = ("inferno", "sonar", "gray")
+_SAME = 1e-6  # of a pixel, by which positions of two images may differ
+
+
+def write(
+    source: Image | Store,
+    folder: str | os.PathLike,
+    *,
+    against: Image | Store | None = None,
+    names: Sequence[str] = ("image", "other image"),
+    dynamic_range_db: float | None = None,
+    colour_map: str | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> None:
+    """Write a folder that shows an image or a mosaic in a browser.
+
+    The file ``index.html`` in it opens by double click, without a server and without a network.
+    The folder needs nothing outside of it, and can be copied. A mosaic is read patch by patch and
+    may be larger than memory.
+
+    Parameters
+    ----------
+    source : Image or Store
+        Image on a plane or height map, or mosaic. A mosaic need not be finished.
+    folder : path-like
+        Folder to write, whose parent must exist. It must be new, empty, or an earlier viewer, which
+        is replaced at the end.
+    against : Image or Store, optional
+        Second image on the same grid, to blink or swipe against the first.
+    names : sequence of str
+        Names of the images, for the page.
+    dynamic_range_db : float, optional
+        Dynamic range that is shown at first, dB; by default 60. The page can change it.
+    colour_map : str, optional
+        Colours that are shown at first, as for `clsas.plot.image`; by default "inferno".
+    progress : callable, optional
+        Called as progress(done, total) while pixels are read.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument has the wrong type or is outside its limits, an image is on points, the two
+        images have different grids, or a mosaic is damaged or changes meanwhile.
+    FileExistsError
+        If the folder contains anything but a viewer.
+    ImportError
+        If Matplotlib is not installed (extra `plot`).
+    OSError
+        If the folder cannot be written, for example on a full disk. Nothing is then written.
+
+    Notes
+    -----
+    Levels are 8-bit numbers in steps of 0.4 dB below the largest amplitude of both images. Coarser
+    tiles are means of power, so that speckle and faint shadows look the same at every scale.
+    """
+    sources = [source] if against is None else [source, against]
+    for name, each in zip(("source", "against"), sources, strict=False):
+        validate.instance(name, each, Image, Store)
+    folder = validate.path("folder", folder)
+    names = validate.entries("names", names, "names of the images")[: len(sources)]
+    names = [validate.text("every entry of names", name) for name in names]
+    if len(names) < len(sources):
+        raise ValueError(f"names must have {len(sources)} entries, got {len(names)}")
+    range_db = DYNAMIC_RANGE_DB
+    if dynamic_range_db is not None:
+        range_db = validate.dynamic_range_db(dynamic_range_db)
+    colour_map = COLOUR_MAP if colour_map is None else validate.text("colour_map", colour_map)
+    tables = {name: _table(name) for name in dict.fromkeys((colour_map, *_COLOURS))}
+    validate.progress(progress)
+    grids = [each.grid for each in sources]
+    _check_grids(grids)
+    check_folder(folder)
+    records = [each.records() if isinstance(each, Store) else None for each in sources]
+
+    readers = [_reader(each) for each in sources]
+    report = _Progress(2 * sum(map(len, readers)), progress)
+    reference = max(_largest(reader, report) for reader in readers) or 1.0
+    levels = Levels(reference, max(STEP_DB, range_db / (BRIGHTEST - 1)))
+    scene = {"names": names, "range_db": range_db, "colours": tables}
+    scene |= _described(readers[0].shape, grids[0], levels)
+    scene |= {"patches": _patches(source) if isinstance(source, Store) else []}
+    with replacing_folder(folder) as made:
+        for name in _FILES:
+            (made / name).write_text(_text_of(name), encoding="utf-8")
+        # Escaped to ASCII, in which no text can end the script.
+        (made / _SCENE).write_text(f"{_START}{json.dumps(scene, allow_nan=False)};\n")
+        for index, reader in enumerate(readers):
+            pyramid = Pyramid(reader.shape, levels, made / "tiles" / str(index), str(index))
+            for rows, columns in report.through(reader):
+                pyramid.add(rows, columns, reader.read(rows, columns))
+        for each, before in zip(sources, records, strict=True):
+            if isinstance(each, Store):
+                _check_unchanged(each, before)
+
+
+def check_folder(folder: Path) -> None:
+    """Raise an error unless a viewer may be written to a folder.
+
+    Raises
+    ------
+    FileExistsError
+        If the folder contains anything but a viewer, or is a file.
+    FileNotFoundError
+        If its parent does not exist.
+    """
+    if not folder.absolute().parent.is_dir():
+        raise FileNotFoundError(f"cannot write {folder}: there is no folder {folder.parent}")
+    if not os.path.lexists(folder):
+        return
+    if not folder.is_dir() or folder.is_symlink():
+        raise FileExistsError(f"cannot write the folder {folder}: it is a file or a link")
+    if any(folder.iterdir()) and not is_viewer(folder):
+        raise FileExistsError(
+            f"cannot write the folder {folder}: it contains files, and is no viewer of clsas; "
+            "choose a new folder"
+        )
+
+
+def is_viewer(folder: Path) -> bool:
+    """Return whether a folder contains a viewer of clsas and nothing else."""
+    if {each.name for each in folder.iterdir()} != {*_FILES, _SCENE, "tiles"}:
+        return False
+    with (folder / _SCENE).open(encoding="ascii", errors="replace") as file:
+        return file.read(len(_START)) == _START
+
+
+class _Progress:
+    """Counts the windows that have been read."""
+
+    def __init__(self, total: int, progress: Callable[[int, int], object] | None) -> None:
+        self._done, self._total, self._progress = 0, total, progress
+
+    def through(self, reader: Source) -> Iterator[tuple[slice, slice]]:
+        """Yield the windows of a source, and report each after it has been read."""
+        for window in reader.windows():
+            yield window
+            self._done += 1
+            if self._progress is not None:
+                self._progress(self._done, self._total)
+
+
+def _reader(source: Image | Store) -> Source:
+    if isinstance(source, Store):
+        rows, columns = source.grid.shape
+        shape = source.patch_shape
+        assert shape is not None  # the store exists
+        return Source((rows, columns), source.read, shape)
+    rows, columns = source.pixels.shape
+    pixels = source.pixels
+    return Source((rows, columns), lambda rows, columns: pixels[rows, columns])
+
+
+def _largest(reader: Source, report: _Progress) -> float:
+    """Return the largest amplitude of an image."""
+    most = 0.0
+    for rows, columns in report.through(reader):
+        most = max(most, largest_amplitude(reader.read(rows, columns)))
+    return most
+
+
+def _check_grids(grids: Sequence[Grid]) -> None:
+    """Raise ValueError for grids that the page cannot show, or not on top of each other."""
+    for name, grid in zip(("source", "against"), grids, strict=False):
+        if grid.points_m is not None:
+            raise ValueError(f"{name} must be on a plane or height map for the viewer, got points")
+    if len(grids) < 2:
+        return
+    one, other = grids
+    steps_m = min(float(np.linalg.norm(step)) for step in one.vectors_m[1:])
+    most_m = max(
+        float(np.abs(mine - theirs).max()) * count
+        for mine, theirs, count in zip(one.vectors_m, other.vectors_m, (1, *one.shape), strict=True)
+    )
+    if one.shape != other.shape or most_m > _SAME * steps_m:
+        raise ValueError(
+            f"against must be on the grid of source, {one}, got {other}: form it on that grid"
+        )
+
+
+def _check_unchanged(store: Store, records: object) -> None:
+    """Raise ValueError if patches of a store were formed since its records were read."""
+    if store.records() != records:
+        raise ValueError(
+            f"{store.path} must not change while it is exported, but patches were formed "
+            "meanwhile: repeat the export when the mosaic is finished"
+        )
+
+
+def _described(shape: tuple[int, int], grid: Grid, levels: Levels) -> dict[str, Any]:
+    """Return what the page needs to know of a grid and of the tiles."""
+    scales, to_geographic = levels_of(shape), geographic_of(grid)
+    return {
+        "version": __version__,
+        "shape": shape,
+        "side": SIDE,
+        "levels": [scales[0], scales[-1]],
+        "reference": levels.reference,
+        "step_db": levels.step_db,
+        "frame": Frame.of(grid).describe(grid),
+        "geographic": None if to_geographic is None else fitted_degrees(grid, to_geographic),
+    }
+
+
+def _patches(store: Store) -> list[list[Any]]:
+    """Return [first row, first column, rows, columns, predicted error (dB), words] of patches."""
+    shape = store.patch_shape
+    assert shape is not None  # the store exists
+    records, pixels = store.records(), store.grid.shape
+    counts = [range(ceil(n / side)) for n, side in zip(pixels, shape, strict=True)]
+    found: list[list[Any]] = []
+    for index in product(*counts):
+        first = [i * side for i, side in zip(index, shape, strict=True)]
+        sides = [min(side, n - i) for side, n, i in zip(shape, pixels, first, strict=True)]
+        record = records.get((index[0], index[1]))
+        if record is None:
+            found.append([*first, *sides, None, "not formed yet"])
+            continue
+        error_db = record.predicted_error_db
+        rounded = None if error_db is None else round(error_db, 1)
+        found.append([*first, *sides, rounded, "; ".join(record.flags)])
+    return found
+
+
+def _table(name: str) -> str:
+    """Return the 256 colours of a colour map as hexadecimal digits, six for each colour."""
+    colours = colours_of(name)(np.arange(256), bytes=True)
+    return np.asarray(colours)[:, :3].astype(np.uint8).tobytes().hex()
+
+
+def _text_of(name: str) -> str:
+    return (resources.files("clsas.maps") / "page" / name).read_text(encoding="utf-8")

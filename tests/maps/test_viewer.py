@@ -1,0 +1,336 @@
+"""The viewer's folder: tiles, frames, and what is refused. test_viewer_page.py opens it."""
+
+import base64
+import json
+import os
+import re
+import zlib
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from stores import GRID, LINES, REQUEST
+
+import clsas
+from clsas.cli import main
+from clsas.maps import tiles, viewer
+from clsas.maps.frames import Frame, fitted_degrees
+from clsas.maps.tiles import Levels, Pyramid, levels_of
+
+SHAPE = (700, 1300)
+PLANE = clsas.Grid.plane((-13, 12.98, 1300), (40, 53.98, 700))
+
+
+def speckle(shape, seed=0):
+    rng = np.random.default_rng(seed)
+    pixels = rng.normal(size=shape) + 1j * rng.normal(size=shape)
+    pixels[: shape[0] // 4, : shape[1] // 4] = 0  # where nothing was received
+    return pixels.astype(np.complex64)
+
+
+@pytest.fixture(scope="module")
+def image():
+    return clsas.Image(speckle(SHAPE), PLANE)
+
+
+@pytest.fixture(scope="module")
+def written(image, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("viewer") / "web"
+    viewer.write(image, folder)
+    return folder
+
+
+def scene_of(folder):
+    text = (folder / "scene.js").read_text()
+    return json.loads(re.fullmatch(r"window\.clsasScene = (.*);\n", text)[1])
+
+
+def level_of(folder, shape, level, image=0):
+    """All levels of a pyramid's level, assembled from its tiles."""
+    factor = 2 ** (levels_of(shape)[-1] - level)
+    rows, columns = (-(-n // factor) for n in shape)
+    found = np.zeros((rows, columns), np.uint8)
+    names = {path.name for path in (folder / str(image) / str(level)).iterdir()}
+    for row in range(0, rows, tiles.SIDE):
+        for column in range(0, columns, tiles.SIDE):
+            name = f"{column // tiles.SIDE}_{row // tiles.SIDE}"
+            part = found[row : row + tiles.SIDE, column : column + tiles.SIDE]
+            text = (folder / str(image) / str(level) / f"{name}.js").read_text()
+            packed = re.fullmatch(rf'clsasTile\("{image}/{level}/{name}","(.*)"\);\n', text)[1]
+            values = np.frombuffer(zlib.decompress(base64.b64decode(packed)), np.uint8)
+            part[:] = values.reshape(part.shape)
+            names.remove(f"{name}.js")
+    assert not names
+    return found
+
+
+def test_tiles_have_every_pixel_to_half_a_step(image, written):
+    scene = scene_of(written)
+    assert scene["levels"] == [9, 11]  # 2048 is the first power of two that is not below 1300
+    found = level_of(written / "tiles", SHAPE, 11)
+    nothing = image.pixels == 0
+    assert np.array_equal(found == tiles.NOTHING, nothing)
+    level_db = (found[~nothing].astype(float) - tiles.BRIGHTEST) * scene["step_db"]
+    assert np.abs(level_db - image.db()[~nothing]).max() <= scene["step_db"] / 2 + 1e-4
+    assert found.max() == tiles.BRIGHTEST
+
+
+def test_coarse_tiles_are_means_of_power(image, written):
+    found = level_of(written / "tiles", SHAPE, 9)
+    power = np.abs(image.pixels[:, : 4 * 325].astype(complex)) ** 2
+    mean = power.reshape(175, 4, 325, 4).mean(axis=(1, 3)) / power.max()
+    some = mean > 0
+    expected = tiles.BRIGHTEST + 10 * np.log10(mean[some]) / scene_of(written)["step_db"]
+    assert found.shape == mean.shape
+    assert np.array_equal(found == tiles.NOTHING, ~some)
+    assert np.abs(found[some] - expected).max() <= 0.51
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 1500), (513, 511), (1025, 530)])
+def test_tiles_do_not_depend_on_windows(tmp_path, shape):
+    pixels = speckle(shape)
+    rng = np.random.default_rng(1)
+    for name, height, width in (("whole", *shape), ("windows", 401, 300)):
+        pyramid = Pyramid(shape, Levels(float(np.abs(pixels).max()) or 1.0), tmp_path / name, "0")
+        windows = [
+            (slice(top, min(top + height, shape[0])), slice(left, min(left + width, shape[1])))
+            for top in range(0, shape[0], height)
+            for left in range(0, shape[1], width)
+        ]
+        for index in rng.permutation(len(windows)):
+            pyramid.add(*windows[index], pixels[windows[index]])
+    whole, parts = (
+        {path.relative_to(tmp_path / name): path.read_bytes() for path in files}
+        for name in ("whole", "windows")
+        for files in [list((tmp_path / name).rglob("*.js"))]
+    )
+    assert whole == parts
+    assert whole
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 3e38 + 3e38j])
+def test_levels_of_any_scale(scale):
+    pixels = (np.array([[1, 0.1, 1e-9, 0]]) * scale).astype(np.complex64)
+    levels = Levels(abs(complex(pixels[0, 0])))
+    assert levels.encode(levels.power(pixels)).tolist() == [[255, 205, 1, 0]]
+
+
+X, Y, Z = np.eye(3)
+
+
+@pytest.mark.parametrize(
+    ("row_step", "column_step", "right", "up"),
+    [
+        (Y, X, X, Y),
+        (-Y, X, X, Y),
+        (Y, -X, X, Y),
+        (X, Y, X, Y),  # transposed, which would be mirrored if rows simply pointed up
+        (X, -Y, X, Y),
+        (Z, X, X, Z),
+        (-Z, -X, X, Z),
+        (X, -Z, X, Z),
+        (Z, Y, Y, Z),
+        (3 * Y + X, 2 * X, X, Y),  # not perpendicular
+        (Y - X, X + Y, (X + Y) / np.sqrt(2), (Y - X) / np.sqrt(2)),
+        (Y + 0.1 * Z, X, X, (Y + 0.1 * Z) / np.hypot(1, 0.1)),
+    ],
+)
+def test_a_plane_is_seen_from_above_and_never_mirrored(row_step, column_step, right, up):
+    grid = clsas.Grid.oriented((1, 2, 3), row_step, column_step, (4, 5))
+    frame = Frame.of(grid)
+    np.testing.assert_allclose([frame.right, frame.up], [right, up], atol=1e-12)
+    described = frame.describe(grid)
+    for axis, name in enumerate(("right", "up")):
+        along = getattr(frame, name)
+        assert described["screen_row_step"][axis] == pytest.approx(row_step @ along)
+        assert described["screen_column_step"][axis] == pytest.approx(column_step @ along)
+
+
+@pytest.mark.parametrize("longitude_deg", [5.3, 179.99])
+def test_degrees_are_right_to_a_centimetre(longitude_deg):
+    """On a sphere, at a latitude of 75 degrees, in a scene of 20 km."""
+
+    def to_geographic(positions_m):
+        x, y = positions_m[..., 0] / 6371e3, positions_m[..., 1] / 6371e3
+        distance = np.hypot(x, y) + 1e-300
+        start = np.radians(75)
+        sine = np.cos(distance) * np.sin(start) + y * np.sinc(distance / np.pi) * np.cos(start)
+        longitude = longitude_deg + np.degrees(
+            np.arctan2(
+                x * np.sinc(distance / np.pi),
+                np.cos(start) * np.cos(distance) - y * np.sin(start) * np.sinc(distance / np.pi),
+            )
+        )
+        return np.stack([np.degrees(np.arcsin(sine)), (longitude + 180) % 360 - 180], axis=-1)
+
+    grid = clsas.Grid.plane((-1e4, 1e4, 301), (-1e4, 1e4, 201))
+    found = fitted_degrees(grid, to_geographic)
+    expected = to_geographic(grid.positions_m())
+    row, column = np.meshgrid(np.linspace(-1, 1, 201), np.linspace(-1, 1, 301), indexing="ij")
+    for index, name in enumerate(("latitude", "longitude")):
+        values = np.polynomial.chebyshev.chebval2d(row, column, found[name])
+        error = (values - expected[..., index] + 180) % 360 - 180
+        assert np.abs(error).max() < 1e-7
+
+
+class TestFolder:
+    def test_has_nothing_but_the_page(self, written):
+        scripts = {"geometry.js", "view.js", "tiles.js", "marks.js", "controls.js", "events.js"}
+        others = {"index.html", "viewer.css", "scene.js", "tiles"}
+        assert {path.name for path in written.iterdir()} == scripts | others
+        assert not list(written.parent.glob(".clsas-*"))
+        page = (written / "index.html").read_text()
+        assert set(re.findall(r'src="(\w+\.js)"', page)) == scripts | {"scene.js"}
+        assert not any("http" in (written / name).read_text() for name in (*scripts, "index.html"))
+
+    def test_replaces_only_an_earlier_viewer(self, image, tmp_path):
+        small = clsas.Image(image.pixels[:20, :30], image.grid.window(slice(20), slice(30)))
+        (tmp_path / "web").mkdir()
+        viewer.write(small, tmp_path / "web")
+        viewer.write(small, tmp_path / "web", names=["again"])
+        assert scene_of(tmp_path / "web")["names"] == ["again"]
+        (tmp_path / "web" / "notes.txt").write_text("mine")
+        with pytest.raises(FileExistsError, match="it contains files, and is no viewer of clsas"):
+            viewer.write(small, tmp_path / "web")
+        with pytest.raises(FileExistsError, match="it is a file or a link"):
+            viewer.write(small, tmp_path / "web" / "notes.txt")
+        with pytest.raises(FileNotFoundError, match="there is no folder"):
+            viewer.write(small, tmp_path / "new" / "web")
+
+    @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+    def test_of_an_interrupted_export_is_the_one_before(self, image, tmp_path, monkeypatch, error):
+        small = clsas.Image(image.pixels[:20, :30], image.grid.window(slice(20), slice(30)))
+        viewer.write(small, tmp_path / "web")
+
+        def fail(*_):
+            raise error
+
+        monkeypatch.setattr(Pyramid, "add", fail)
+        for name in ("web", "new"):
+            with pytest.raises(type(error)):
+                viewer.write(small, tmp_path / name)
+        assert [path.name for path in tmp_path.iterdir()] == ["web"]
+        assert scene_of(tmp_path / "web")["names"] == ["image"]
+
+    def test_comes_back_if_the_new_one_cannot_take_its_place(self, image, tmp_path, monkeypatch):
+        small = clsas.Image(image.pixels[:20, :30], image.grid.window(slice(20), slice(30)))
+        viewer.write(small, tmp_path / "web")
+        rename, renamed = os.rename, []
+
+        def fail_once(one, other):
+            renamed.append(one)
+            if len(renamed) == 2:
+                raise PermissionError(1, "Operation not permitted", str(other))
+            rename(one, other)
+
+        monkeypatch.setattr(os, "rename", fail_once)
+        with pytest.raises(PermissionError):
+            viewer.write(small, tmp_path / "web", names=["again"])
+        assert [path.name for path in tmp_path.iterdir()] == ["web"]
+        assert scene_of(tmp_path / "web")["names"] == ["image"]
+
+
+def test_what_the_viewer_cannot_show_is_refused(image, tmp_path):
+    points = clsas.Image(image.pixels[:5, :5], clsas.Grid.points(np.ones((5, 5, 3))))
+    with pytest.raises(ValueError, match="source must be on a plane or height map for the viewer"):
+        viewer.write(points, tmp_path / "web")
+    moved = clsas.Image(image.pixels, clsas.Grid.plane((-13, 12.98, 1300), (40, 54, 700)))
+    with pytest.raises(ValueError, match="against must be on the grid of source, Grid"):
+        viewer.write(image, tmp_path / "web", against=moved)
+    with pytest.raises(ValueError, match="names must have 2 entries, got 1"):
+        viewer.write(image, tmp_path / "web", against=image, names=["one"])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    path = tmp_path_factory.mktemp("store") / "a.zarr"
+    list(clsas.mosaic(LINES, GRID, path, **REQUEST))
+    return path
+
+
+class TestStore:
+    def test_is_read_patch_by_patch_with_the_records_of_patches(self, store, tmp_path, monkeypatch):
+        opened, sizes, seen = clsas.Store.opened(store), [], []
+        read = clsas.Store.read
+
+        def counted(self, *window):
+            pixels = read(self, *window)
+            sizes.append(pixels.shape)
+            return pixels
+
+        monkeypatch.setattr(clsas.Store, "read", counted)
+        viewer.write(opened, tmp_path / "web", progress=lambda *now: seen.append(now))
+        assert set(sizes) <= {(15, 14), (15, 12)}
+        assert seen == [(done, 12) for done in range(1, 13)]
+        monkeypatch.undo()
+        pixels = opened.read()
+        found = level_of(tmp_path / "web" / "tiles", GRID.shape, levels_of(GRID.shape)[-1])
+        expected = tiles.BRIGHTEST + clsas.Image(pixels, GRID).db() / 0.4
+        assert np.abs(found - np.maximum(expected, 1)).max() <= 0.51
+        patches = scene_of(tmp_path / "web")["patches"]
+        assert [patch[:4] for patch in patches[:3]] == [
+            [0, 0, 15, 14], [0, 14, 15, 14], [0, 28, 15, 12],
+        ]  # fmt: skip
+        errors = [record.predicted_error_db for record in opened.records().values()]
+        assert [patch[4] for patch in patches] == pytest.approx(errors, abs=0.05)
+
+    def test_that_changes_meanwhile_is_refused(self, store, tmp_path, monkeypatch):
+        opened = clsas.Store.opened(store)
+        records = iter([opened.records(), opened.records(), {}])
+        monkeypatch.setattr(clsas.Store, "records", lambda _: next(records))
+        with pytest.raises(ValueError, match="must not change while it is exported"):
+            viewer.write(opened, tmp_path / "web")
+        assert not list(tmp_path.iterdir())
+
+
+class TestCommand:
+    @pytest.fixture
+    def opened(self, monkeypatch):
+        addresses = []
+        monkeypatch.setattr("webbrowser.open", lambda address: not addresses.append(address))
+        return addresses
+
+    @staticmethod
+    def run(*arguments, code=0):
+        result = CliRunner().invoke(main, ["view", *map(str, arguments)])
+        assert result.exit_code == code, result.output
+        return result.output
+
+    def test_opens_the_page(self, store, tmp_path, opened, monkeypatch):
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+        printed = self.run(store)
+        (page,) = tmp_path.glob("clsas-view-*/viewer/index.html")
+        assert opened == [page.as_uri()]
+        assert printed.startswith(f"{page}: ")
+
+    def test_writes_a_folder_with_two_images(self, store, tmp_path, opened):
+        image = clsas.Store.opened(store).image()
+        clsas.save(tmp_path / "image.h5", image)
+        options = ("--no-open", "--db", 40, "--colours", "gray", "--json")
+        found = json.loads(
+            self.run(store, tmp_path / "web", "--against", tmp_path / "image.h5", *options)
+        )
+        assert not opened
+        files = [path for path in (tmp_path / "web").rglob("*") if path.is_file()]
+        assert found["bytes"] == sum(path.stat().st_size for path in files)
+        scene = scene_of(tmp_path / "web")
+        assert scene["names"] == ["a.zarr", "image.h5"]
+        assert scene["range_db"] == 40
+        assert next(iter(scene["colours"])) == "gray"
+        level = scene["levels"][1]
+        one, other = (
+            level_of(tmp_path / "web" / "tiles", image.shape, level, index) for index in (0, 1)
+        )
+        assert np.array_equal(one, other)
+
+    def test_refuses_before_any_work(self, store, tmp_path, opened):
+        (tmp_path / "full").mkdir()
+        (tmp_path / "full" / "a.txt").touch()
+        assert "is no viewer of clsas" in self.run(store, tmp_path / "full", code=2)
+        assert "must not lie in the store" in self.run(store, store / "web", code=2)
+        assert "--no-open requires FOLDER" in self.run(store, "--no-open", code=2)
+        clsas.save(tmp_path / "lines.h5", LINES)
+        assert "must hold Image" in self.run(tmp_path / "lines.h5", tmp_path / "web", code=1)
+        assert not opened
+        assert not (tmp_path / "web").exists()
