@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from clsas import plot
     from clsas.core.contrast import contrast, entropy
+    from clsas.core.georeference import Georeference
     from clsas.core.grid import Grid
     from clsas.core.image import Image
     from clsas.core.image_error import relative_error_db
@@ -68,6 +69,7 @@ __all__ = [
     "Effect",
     "FileFormatError",
     "Finding",
+    "Georeference",
     "Grid",
     "Image",
     "Imager",
@@ -129,6 +131,7 @@ __all__ = [
 
 _MODULES = {
     "core.contrast": "contrast entropy",
+    "core.georeference": "Georeference",
     "core.grid": "Grid",
     "core.image": "Image",
     "core.image_error": "relative_error_db",

@@ -222,6 +222,17 @@ def _raised(plane: Grid, height_m: NDArray[np.float64], attributes: dict[str, An
     return grid
 
 
+def _map_of(grid: Grid) -> dict[str, Any]:
+    """Return attributes from which GDAL reads where the pixels lie, if x and y are map axes."""
+    place = grid.georeference
+    if place is None or place.crs is None or not grid.has_axes:
+        return {}
+    authority, _, code = place.crs.partition(":")
+    if authority == "EPSG" and code.isdigit():
+        return {"_CRS": {"url": f"http://www.opengis.net/def/crs/EPSG/0/{code}"}}
+    return {"_CRS": {"wkt": place.crs}} if "[" in place.crs else {}
+
+
 def _create_arrays(path: Path, grid: Grid, patch_shape: tuple[int, int]) -> None:
     """Create the arrays of a mosaic: pixels, all zero, coordinates and heights."""
     files = DurableStore(path)
@@ -237,6 +248,7 @@ def _create_arrays(path: Path, grid: Grid, patch_shape: tuple[int, int]) -> None
         compressors=checksum,
         fill_value=0,
         dimension_names=names,
+        attributes=_map_of(grid),
     )
     coordinates: dict[str, tuple[tuple[str, ...], NDArray[np.float64]]] = {}
     if grid.has_axes:

@@ -30,6 +30,7 @@ def inputs_of(
         "parts": survey.digests(),
         "grid": grid_digest(grid),
         "pixels": list(grid.shape),
+        "georeference": None if grid.georeference is None else asdict(grid.georeference),
         "beam": None if beam is None else json.loads(beam_json(beam)),
         **{name: request.get(name) for name in REQUESTS},
     }
