@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from clsas.files.xarrays import to_xarray
     from clsas.inspection.inspection import inspect
     from clsas.inspection.result import Inspection, PhaseSign
+    from clsas.maps.exporting import export
     from clsas.measures.assessment import assess, survey_lines
     from clsas.measures.assessment_result import Assessment, Effect
     from clsas.measures.limits_result import Limit, Limits
@@ -101,6 +102,7 @@ __all__ = [
     "compress",
     "contrast",
     "entropy",
+    "export",
     "factorize",
     "from_full_matrix",
     "from_phase_history",
@@ -150,6 +152,7 @@ _MODULES = {
     "files.xarrays": "to_xarray",
     "inspection.inspection": "inspect",
     "inspection.result": "Inspection PhaseSign",
+    "maps.exporting": "export",
     "measures.assessment": "assess survey_lines",
     "measures.assessment_result": "Assessment Effect",
     "measures.limits_result": "Limit Limits",
@@ -184,6 +187,7 @@ _MODULES = {
 _EXTRAS = {
     "files.cphd": "radar",
     "files.cphd_writing": "radar",
+    "maps.exporting": "maps",
     "mosaics.mosaic": "mosaic",
     "mosaics.store": "mosaic",
 }

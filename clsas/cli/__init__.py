@@ -39,6 +39,7 @@ _GROUPS = {
         "image": ("images", "Form an image of range lines, to a tolerance or exactly."),
         "mosaic": ("mosaics", "Form an image of any size, patch by patch."),
         "show": ("show", "Draw an image, range lines, a plan, a recording or a mosaic."),
+        "export": ("export", "Write an image or a mosaic as GeoTIFF, netCDF or a picture."),
     },
     "Measures": {
         "quality": ("measures", "Measure the contrast, a point or the error of an image."),

@@ -1,0 +1,347 @@
+"""Cloud-optimized GeoTIFF of images and mosaics, written window by window in bounded memory.
+
+GDAL's driver for cloud-optimized files copies a file and its overviews in the required order. The
+file and each overview are first written here, since GDAL would average decibels or complex numbers
+instead of power.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.atomic import assembling
+from clsas.core.extras import needed
+from clsas.maps.encoding import Encoding, colour_table
+from clsas.maps.orientation import Affine, Orientation
+from clsas.maps.resampling import Resampling, north_up, steps_m
+from clsas.maps.sources import Source, windows_of
+
+SUFFIXES = (".tif", ".tiff")
+"""Suffixes of GeoTIFF files."""
+
+_TILE = 512  # side of a tile in pixels, as GDAL and web servers prefer
+_CACHE_MB = 128  # GDAL's cache of tiles: a plain choice; its default is a share of the memory
+_COMPRESSION: dict[str, dict[str, str]] = {
+    "complex": {"COMPRESS": "NONE"},  # noise does not compress
+    "db": {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "LEVEL": "1"},
+    "8bit": {"COMPRESS": "DEFLATE", "PREDICTOR": "NO"},
+}
+
+Progress = Callable[[int, int], object]
+
+
+@dataclass(frozen=True)
+class Options:
+    """How an image becomes a GeoTIFF.
+
+    Attributes
+    ----------
+    kind : str
+        One of `clsas.maps.encoding.KINDS`.
+    north_up : bool
+        True to resample the image on the axes of the map.
+    pixel_m : float or None
+        Size of the pixels then, metres; None for the distance of the image's.
+    dynamic_range_db : float
+    reference : float or None
+        Amplitude of 0 dB; None for 1, or for the largest amplitude if the kind is "8bit".
+    colour_map : str
+    """
+
+    kind: str
+    north_up: bool
+    pixel_m: float | None
+    dynamic_range_db: float
+    reference: float | None
+    colour_map: str
+
+
+def write(
+    path: Path, source: Source, options: Options, tags: dict[str, str], progress: Progress | None
+) -> None:
+    """Write a cloud-optimized GeoTIFF; an existing file is replaced in one step.
+
+    Raises
+    ------
+    ValueError
+        If the grid is vertical, or the source is damaged or changes.
+    OSError
+        If the file cannot be written, for example on a full disk.
+    ImportError
+        If rasterio or pyproj is not installed, or matplotlib for 8-bit levels.
+    """
+    with needed("GeoTIFF files"):
+        import rasterio
+    colours = colour_table(options.colour_map) if options.kind == "8bit" else None
+    with assembling(path) as folder, rasterio.Env(GDAL_CACHEMAX=_CACHE_MB):
+        _Export(folder, source, options, progress).write(folder / path.name, tags, colours)
+        source.check_unchanged()
+
+
+class _Steps:
+    """Pixels done of all passes over an image, for a progress bar."""
+
+    def __init__(self, progress: Progress | None, total: int) -> None:
+        self._progress, self._total, self._done = progress, total, 0
+
+    def add(self, pixels: int) -> None:
+        self._done += pixels
+        if self._progress is not None:
+            self._progress(min(self._done, self._total), self._total)
+
+
+class _Export:
+    """One export: the passes over the image, with files in a temporary folder."""
+
+    def __init__(
+        self, folder: Path, source: Source, options: Options, progress: Progress | None
+    ) -> None:
+        place = source.grid.georeference
+        assert place is not None  # the caller has checked it
+        self._folder, self._source, self._options = folder, source, options
+        self._crs = place.wkt()
+        shape = source.grid.shape
+        self._turned = Orientation.of((shape[0], shape[1]), place.affine(source.grid))
+        self._shape, self._affine = self._turned.shape, self._turned.affine
+        self._largest = 0.0
+        height_m = source.grid.height_m
+        self._height_m: NDArray | None = None
+        if height_m is not None and options.kind != "8bit":
+            self._height_m = self._turned.turned(height_m)
+        self._steps = _Steps(progress, 4 * source.grid.size)
+
+    def write(self, path: Path, tags: dict[str, str], colours: dict | None) -> None:
+        """Write the file from the passes: read, resample, encode with overviews, and copy."""
+        is_complex = self._options.kind == "complex"
+        first = self._folder / "first.tif"
+        self._read(first, np.complex64 if is_complex else np.float32)
+        self._steps.add(0)
+        resamples = not self._turned.is_north_up or self._options.pixel_m is not None
+        if self._options.north_up and resamples:
+            first = self._resampled(first)
+        reference = self._options.reference
+        if reference is None:
+            reference = self._largest if self._options.kind == "8bit" and self._largest else 1.0
+        encoding = Encoding(self._options.kind, reference, self._options.dynamic_range_db)
+        base = self._levels(first, encoding, tags, colours)
+        self._copy(base, path)
+        _check(path, self._shape)
+
+    def _read(self, path: Path, dtype: Any) -> None:
+        """Write the pixels, or their amplitudes, in the order of the raster."""
+        with self._created(path, self._shape, dtype) as file:
+            for rows, columns in self._source.windows():
+                pixels = self._source.read(rows, columns)
+                amplitude = np.abs(pixels)
+                self._largest = max(self._largest, float(amplitude.max()))
+                given = pixels if dtype is np.complex64 else amplitude
+                self._put(file, self._turned.window(rows, columns), self._turned.turned(given))
+                self._steps.add(pixels.size)
+
+    def _resampled(self, given: Path) -> Path:
+        """Write the amplitudes on the axes of the map; return the file."""
+        pixel_m = self._options.pixel_m or min(steps_m(self._affine))
+        shape, affine = north_up(self._shape, self._affine, pixel_m)
+        resampling = Resampling(self._shape, self._affine, affine)
+        heights = None if self._height_m is None else np.empty(shape, np.float32)
+        path = self._folder / "north_up.tif"
+        share = self._source.grid.size / (shape[0] * shape[1])
+        with _opened(given) as file, self._created(path, shape, np.float32, affine) as new:
+            for rows, columns in windows_of(shape, (_TILE, _TILE)):
+                values = resampling.at(rows, columns, lambda *part: _get(file, part))
+                self._put(new, (rows, columns), values)
+                if heights is not None:
+                    heights[rows, columns] = resampling.at(
+                        rows, columns, self._heights_at, of_power=False
+                    )
+                self._steps.add(int(values.size * share))
+        given.unlink()
+        self._shape, self._affine, self._height_m = shape, affine, heights
+        return path
+
+    def _heights_at(self, rows: slice, columns: slice) -> NDArray:
+        """Return the heights of a window of the raster, metres."""
+        assert self._height_m is not None
+        return self._height_m[rows, columns]
+
+    def _levels(
+        self, first: Path, encoding: Encoding, tags: dict[str, str], colours: dict | None
+    ) -> Path:
+        """Write the encoded file and its overviews beside it; return the file."""
+        base = self._folder / "base.tif"
+        path, amplitude, shape, heights = base, first, self._shape, self._height_m
+        level = 0
+        while True:
+            is_last = max(shape) <= _TILE
+            below = None if is_last else self._folder / f"amplitude{level + 1}.tif"
+            a, b, c, d, e, f = self._affine
+            across, down = self._shape[1] / shape[1], self._shape[0] / shape[0]
+            affine = a * across, b * down, c, d * across, e * down, f
+            keeps = encoding.kind == "complex" and level == 0 and heights is None
+            if keeps:
+                amplitude = amplitude.rename(path)
+            self._encode(amplitude, path, below, shape, affine, encoding, heights, keeps)
+            if level == 0:
+                self._describe(path, encoding, tags, colours)
+            if not keeps:
+                amplitude.unlink()
+            if below is None:
+                return base
+            # GDAL finds the overviews of a file in file.ovr, and further ones in file.ovr.ovr.
+            path, amplitude, level = path.with_name(f"{path.name}.ovr"), below, level + 1
+            shape = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
+            heights = None if heights is None else _halved(heights)
+
+    def _encode(
+        self,
+        amplitude: Path,
+        path: Path,
+        below: Path | None,
+        shape: tuple[int, int],
+        affine: Affine,
+        encoding: Encoding,
+        heights: NDArray | None,
+        keeps: bool,
+    ) -> None:
+        """Write a level from its amplitudes, and the amplitudes of the level below it.
+
+        If `keeps`, the level is there already: its amplitudes are those of its pixels.
+        """
+        half = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
+        bands = 1 if heights is None else 2
+        with _opened(amplitude) as file:
+            level = None
+            if not keeps:
+                level = self._created(path, shape, encoding.dtype, affine, bands, encoding.nodata)
+            smaller = None
+            if below is not None:
+                smaller = self._created(below, half, np.float32, affine)
+            try:
+                for rows, columns in windows_of(shape):
+                    values = _get(file, (rows, columns))
+                    if level is not None:
+                        is_encoded = values.dtype.kind == "c"
+                        pixels = values if is_encoded else encoding.encode(values)
+                        self._put(level, (rows, columns), pixels)
+                        if heights is not None:
+                            self._put(level, (rows, columns), heights[rows, columns], band=2)
+                    if smaller is not None:
+                        window = tuple(
+                            slice(part.start // 2, (part.stop + 1) // 2) for part in (rows, columns)
+                        )
+                        self._put(smaller, window, _mean_power(np.abs(values)))
+                    self._steps.add(values.size * 3 // 4)
+            finally:
+                for each in (level, smaller):
+                    if each is not None:
+                        each.close()
+
+    def _describe(
+        self, path: Path, encoding: Encoding, tags: dict[str, str], colours: dict | None
+    ) -> None:
+        """Add tags, colours and the meaning of the bands to a file."""
+        with _opened(path, "r+") as file:
+            file.update_tags(**tags)
+            words = {
+                "complex": "Complex pixels",
+                "db": f"Amplitude (dB re {encoding.reference:.9g})",
+                "8bit": f"Amplitude (dB re {encoding.reference:.9g})",
+            }
+            heights = ["Height (m)"] * (file.count - 1)
+            file.descriptions = [words[encoding.kind], *heights]
+            file.units = ["" if encoding.kind == "complex" else "dB", *["m"] * (file.count - 1)]
+            if colours is not None:
+                file.write_colormap(1, colours)
+                scale, offset = encoding.scale_and_offset
+                file.scales, file.offsets = (scale,), (offset,)
+
+    def _copy(self, base: Path, path: Path) -> None:
+        """Copy a file with its overviews in the order of a cloud-optimized file."""
+        from rasterio.errors import RasterioError
+        from rasterio.shutil import copy
+
+        how = _COMPRESSION[self._options.kind]
+        try:
+            copy(
+                base, path, driver="COG", OVERVIEWS="FORCE_USE_EXISTING", BLOCKSIZE=_TILE,
+                BIGTIFF="IF_SAFER", NUM_THREADS="ALL_CPUS", **how,
+            )  # fmt: skip
+        except RasterioError as error:
+            raise OSError(None, f"cannot be written: {error}", str(path)) from error
+        self._steps.add(4 * self._source.grid.size)
+
+    def _created(
+        self,
+        path: Path,
+        shape: tuple[int, int],
+        dtype: Any,
+        affine: Affine | None = None,
+        bands: int = 1,
+        nodata: float | None = None,
+    ) -> Any:
+        """Return a new file of plain tiles, open for writing."""
+        import rasterio
+
+        tiled = {"tiled": True, "blockxsize": _TILE, "blockysize": _TILE, "BIGTIFF": "YES"}
+        return rasterio.open(
+            path, "w", driver="GTiff", height=shape[0], width=shape[1], count=bands, dtype=dtype,
+            crs=self._crs, transform=rasterio.Affine(*(affine or self._affine)), nodata=nodata,
+            INTERLEAVE="BAND", **tiled,
+        )  # fmt: skip
+
+    def _put(self, file: Any, window: Any, values: NDArray, band: int = 1) -> None:
+        from rasterio.windows import Window
+
+        file.write(
+            np.ascontiguousarray(values, file.dtypes[0]), band, window=Window.from_slices(*window)
+        )
+
+
+def _opened(path: Path, mode: str = "r") -> Any:
+    import rasterio
+
+    return rasterio.open(path, mode)
+
+
+def _get(file: Any, window: tuple[slice, slice]) -> NDArray:
+    """Return a window of the first band of a file."""
+    from rasterio.windows import Window
+
+    return file.read(1, window=Window.from_slices(*window))
+
+
+def _mean_power(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the amplitude of the mean power of 2 x 2 pixels, of those where it is not 0."""
+    squares = amplitude.astype(np.float64) ** 2
+    power, count = _summed(squares), _summed((amplitude != 0).astype(np.float64))
+    return np.sqrt(power / np.maximum(count, 1)).astype(np.float32)
+
+
+def _halved(values: NDArray) -> NDArray:
+    """Return the means of 2 x 2 values; fewer at the last row and column of odd shapes."""
+    return (_summed(values) / _summed(np.ones(values.shape))).astype(np.float32)
+
+
+def _summed(values: NDArray) -> NDArray:
+    """Return the sums of 2 x 2 values; fewer at the last row and column of odd shapes."""
+    rows, columns = (np.arange(0, n, 2) for n in values.shape)
+    return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
+
+
+def _check(path: Path, shape: tuple[int, int]) -> None:
+    """Raise OSError unless the last pixels of a file and of its overviews can be read."""
+    from rasterio.errors import RasterioError
+
+    try:
+        with _opened(path) as file:
+            rows, columns = shape
+            assert file.shape == shape
+            _get(file, (slice(rows - 1, rows), slice(columns - 1, columns)))
+    except RasterioError as error:
+        raise OSError(None, f"was not written whole: {error}", str(path)) from error
