@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clsas.core.decibels import level_db
-
 KINDS = ("db", "complex", "8bit")
 """What the pixels of a GeoTIFF may be."""
 
@@ -63,13 +61,15 @@ class Encoding:
         """Return the pixels of amplitudes."""
         if self.kind == "complex":
             return amplitude.astype(np.complex64)
-        level = level_db(amplitude, self.reference)
         nothing = amplitude == 0
+        level = np.full(amplitude.shape, np.nan)
+        # In double precision, so that levels do not depend on how an image is divided.
+        np.log10(amplitude, out=level, where=~nothing, dtype=np.float64)
+        level = 20 * (level - math.log10(self.reference))
         if self.kind == "db":
-            level[nothing] = np.nan
-            return level
-        level[nothing] = 0  # replaced below; minus infinity would be an invalid number
-        steps = np.rint((level + np.float32(self.dynamic_range_db)) / np.float32(self.step_db))
+            return level.astype(np.float32)
+        level[nothing] = 0  # any number: it is replaced below
+        steps = np.rint((level + self.dynamic_range_db) / self.step_db)
         encoded = (1 + np.clip(steps, 0, _LEVELS)).astype(np.uint8)
         encoded[nothing] = NOTHING
         return encoded

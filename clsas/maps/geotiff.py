@@ -7,6 +7,11 @@ instead of power.
 
 from __future__ import annotations
 
+import errno
+import itertools
+import math
+import os
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.core import reprs
 from clsas.core.atomic import assembling
 from clsas.core.extras import needed
 from clsas.maps.encoding import Encoding, colour_table
@@ -32,6 +38,11 @@ _COMPRESSION: dict[str, dict[str, str]] = {
     "db": {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "LEVEL": "1"},
     "8bit": {"COMPRESS": "DEFLATE", "PREDICTOR": "NO"},
 }
+
+_FULL_BYTES = 1 << 24  # free space of a disk on which a write failed because it is full
+# Free space per pixel that an export needs at least, in bytes: the file, its overviews and, for
+# complex pixels, which are not compressed, their copy.
+_SPACE_BYTES = {"complex": 21, "db": 9, "8bit": 6}
 
 Progress = Callable[[int, int], object]
 
@@ -80,8 +91,28 @@ def write(
         import rasterio
     colours = colour_table(options.colour_map) if options.kind == "8bit" else None
     with assembling(path) as folder, rasterio.Env(GDAL_CACHEMAX=_CACHE_MB):
-        _Export(folder, source, options, progress).write(folder / path.name, tags, colours)
+        _check_space(folder, _SPACE_BYTES[options.kind] * source.grid.size)
+        try:
+            _Export(folder, source, options, progress).write(folder / path.name, tags, colours)
+        except Exception as error:
+            if not type(error).__module__.startswith("rasterio"):
+                raise
+            # GDAL prints the cause of a failed write, but does not report it.
+            if shutil.disk_usage(folder).free < _FULL_BYTES:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
+            raise OSError(errno.EIO, f"GDAL cannot write the file ({error})") from error
         source.check_unchanged()
+
+
+def _check_space(folder: Path, least_bytes: int) -> None:
+    """Raise OSError if a folder has too little space. GDAL's own message would be less clear."""
+    free_bytes = shutil.disk_usage(folder).free
+    if free_bytes < least_bytes:
+        raise OSError(
+            errno.ENOSPC,
+            f"the export needs {reprs.quantity(least_bytes, 'bytes')} of free space in the folder "
+            f"of the file, which has {reprs.quantity(free_bytes, 'bytes')}",
+        )
 
 
 class _Steps:
@@ -121,7 +152,6 @@ class _Export:
         is_complex = self._options.kind == "complex"
         first = self._folder / "first.tif"
         self._read(first, np.complex64 if is_complex else np.float32)
-        self._steps.add(0)
         resamples = not self._turned.is_north_up or self._options.pixel_m is not None
         if self._options.north_up and resamples:
             first = self._resampled(first)
@@ -131,7 +161,7 @@ class _Export:
         encoding = Encoding(self._options.kind, reference, self._options.dynamic_range_db)
         base = self._levels(first, encoding, tags, colours)
         self._copy(base, path)
-        _check(path, self._shape)
+        _check_whole(path)
 
     def _read(self, path: Path, dtype: Any) -> None:
         """Write the pixels, or their amplitudes, in the order of the raster."""
@@ -143,6 +173,7 @@ class _Export:
                 given = pixels if dtype is np.complex64 else amplitude
                 self._put(file, self._turned.window(rows, columns), self._turned.turned(given))
                 self._steps.add(pixels.size)
+        _check_whole(path)
 
     def _resampled(self, given: Path) -> Path:
         """Write the amplitudes on the axes of the map; return the file."""
@@ -161,6 +192,7 @@ class _Export:
                         rows, columns, self._heights_at, of_power=False
                     )
                 self._steps.add(int(values.size * share))
+        _check_whole(path)
         given.unlink()
         self._shape, self._affine, self._height_m = shape, affine, heights
         return path
@@ -241,6 +273,9 @@ class _Export:
                 for each in (level, smaller):
                     if each is not None:
                         each.close()
+        for each in (None if keeps else path, below):
+            if each is not None:
+                _check_whole(each)
 
     def _describe(
         self, path: Path, encoding: Encoding, tags: dict[str, str], colours: dict | None
@@ -263,17 +298,12 @@ class _Export:
 
     def _copy(self, base: Path, path: Path) -> None:
         """Copy a file with its overviews in the order of a cloud-optimized file."""
-        from rasterio.errors import RasterioError
         from rasterio.shutil import copy
 
-        how = _COMPRESSION[self._options.kind]
-        try:
-            copy(
-                base, path, driver="COG", OVERVIEWS="FORCE_USE_EXISTING", BLOCKSIZE=_TILE,
-                BIGTIFF="IF_SAFER", NUM_THREADS="ALL_CPUS", **how,
-            )  # fmt: skip
-        except RasterioError as error:
-            raise OSError(None, f"cannot be written: {error}", str(path)) from error
+        copy(
+            base, path, driver="COG", OVERVIEWS="FORCE_USE_EXISTING", BLOCKSIZE=_TILE,
+            BIGTIFF="IF_SAFER", NUM_THREADS="ALL_CPUS", **_COMPRESSION[self._options.kind],
+        )  # fmt: skip
         self._steps.add(4 * self._source.grid.size)
 
     def _created(
@@ -288,6 +318,8 @@ class _Export:
         """Return a new file of plain tiles, open for writing."""
         import rasterio
 
+        tiles = math.prod(math.ceil(n / _TILE) for n in shape)
+        _check_space(self._folder, bands * tiles * _TILE**2 * np.dtype(dtype).itemsize)
         tiled = {"tiled": True, "blockxsize": _TILE, "blockysize": _TILE, "BIGTIFF": "YES"}
         return rasterio.open(
             path, "w", driver="GTiff", height=shape[0], width=shape[1], count=bands, dtype=dtype,
@@ -334,14 +366,21 @@ def _summed(values: NDArray) -> NDArray:
     return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
 
 
-def _check(path: Path, shape: tuple[int, int]) -> None:
-    """Raise OSError unless the last pixels of a file and of its overviews can be read."""
-    from rasterio.errors import RasterioError
+def _check_whole(path: Path) -> None:
+    """Raise OSError if a file or an overview in it lacks a tile.
 
-    try:
-        with _opened(path) as file:
-            rows, columns = shape
-            assert file.shape == shape
-            _get(file, (slice(rows - 1, rows), slice(columns - 1, columns)))
-    except RasterioError as error:
-        raise OSError(None, f"was not written whole: {error}", str(path)) from error
+    GDAL does not report a full disk if it notices that only when a file is closed.
+    """
+    size_bytes = path.stat().st_size
+    with _opened(path) as file:
+        for band in range(1, file.count + 1):
+            for level in (None, *range(len(file.overviews(band)))):
+                factor = 1 if level is None else 2 ** (level + 1)
+                down, across = (math.ceil(n / factor / _TILE) for n in file.shape)
+                for row, column in itertools.product(range(down), range(across)):
+                    place, length = (
+                        int(file.get_tag_item(f"{name}_{column}_{row}", "TIFF", band, level) or 0)
+                        for name in ("BLOCK_OFFSET", "BLOCK_SIZE")
+                    )
+                    if not place or place + length > size_bytes:
+                        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
