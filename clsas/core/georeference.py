@@ -321,13 +321,7 @@ class Georeference:
         """
         latitude, longitude = checked_geographic(latitude_deg, longitude_deg)
         height = validate.array("height_m", height_m, np.float64, None)
-        try:
-            latitude, longitude, height = np.broadcast_arrays(latitude, longitude, height)
-        except ValueError:
-            raise ValueError(
-                "latitude_deg, longitude_deg and height_m must have the same shape, got "
-                f"{latitude.shape}, {longitude.shape} and {height.shape}"
-            ) from None
+        latitude, longitude, height = _alike(latitude, longitude, height)
         easting_m, northing_m = self._transformer().transform(longitude, latitude)
         place_m = np.stack([easting_m, northing_m, height], axis=-1)
         if not np.isfinite(place_m).all():
@@ -346,7 +340,7 @@ class Georeference:
         TypeError, ValueError, ImportError
             As for `from_geographic`.
         """
-        latitude, longitude = checked_geographic(latitude_deg, longitude_deg)
+        latitude, longitude = _alike(*checked_geographic(latitude_deg, longitude_deg))
         crs = self.map_crs()  # raises if pyproj is missing
         import pyproj
 
@@ -380,6 +374,9 @@ class Georeference:
         >>> place.affine(clsas.Grid.plane((500_000, 500_100, 101), (6_700_000, 6_700_050, 101)))
         (1.0, 0.0, 499999.5, 0.0, 0.5, 6699999.75)
         """
+        from clsas.core.grid import Grid  # imports this module
+
+        validate.instance("grid", grid, Grid)
         origin_m, row_step_m, column_step_m = grid.vectors_m
         right, down = (self._on_map(step) for step in (column_step_m, row_step_m))
         rows, columns = grid.shape
@@ -481,6 +478,18 @@ def checked_geographic(
             f"longitude_deg must be from -180 to 360 degrees, got {_worst(longitude):.10g}"
         )
     return latitude, np.where(longitude >= 180, longitude - 360, longitude)
+
+
+def _alike(*arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Return latitudes, longitudes and perhaps heights, broadcast to the same shape."""
+    try:
+        return np.broadcast_arrays(*arrays)
+    except ValueError:
+        names = ("latitude_deg", "longitude_deg", "height_m")[: len(arrays)]
+        raise ValueError(
+            f"{', '.join(names)} must have the same shape, got "
+            f"{', '.join(str(each.shape) for each in arrays)}"
+        ) from None
 
 
 def _worst(values: NDArray[np.float64]) -> float:

@@ -133,7 +133,7 @@ def export(
     suffix = path.suffix.lower()
     if not suffix:
         raise ValueError(f"path must end in one of {', '.join(SUFFIXES)}, got {path}")
-    given = {
+    given: dict[str, Any] = {
         "kind": kind,
         "dynamic_range_db": dynamic_range_db,
         "reference": reference,
@@ -162,9 +162,9 @@ def export(
     options = Options(
         kind=kind or "db",
         north_up=north_up,
-        pixel_m=pixel_m,
-        dynamic_range_db=dynamic_range_db or DYNAMIC_RANGE_DB,
-        reference=reference,
+        pixel_m=given["pixel_m"],
+        dynamic_range_db=given["dynamic_range_db"] or DYNAMIC_RANGE_DB,
+        reference=given["reference"],
         colour_map=colour_map or COLOUR_MAP,
     )
     geotiff.write(path, found, options, tags, progress)

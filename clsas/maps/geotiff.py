@@ -31,6 +31,7 @@ from clsas.maps.sources import Source, windows_of
 SUFFIXES = (".tif", ".tiff")
 """Suffixes of GeoTIFF files."""
 
+_MOST_FINER = 16  # times that new pixels may be smaller than the image's: a plain choice
 _TILE = 512  # side of a tile in pixels, as GDAL and web servers prefer
 _CACHE_MB = 128  # GDAL's cache of tiles: a plain choice; its default is a share of the memory
 _COMPRESSION: dict[str, dict[str, str]] = {
@@ -177,7 +178,13 @@ class _Export:
 
     def _resampled(self, given: Path) -> Path:
         """Write the amplitudes on the axes of the map; return the file."""
-        pixel_m = self._options.pixel_m or min(steps_m(self._affine))
+        finest_m = min(steps_m(self._affine))
+        pixel_m = self._options.pixel_m or finest_m
+        if pixel_m < finest_m / _MOST_FINER:
+            raise ValueError(
+                f"pixel_m must be at least the distance of the pixels over {_MOST_FINER}, "
+                f"{finest_m / _MOST_FINER:g} m, got {pixel_m:g} m"
+            )
         shape, affine = north_up(self._shape, self._affine, pixel_m)
         resampling = Resampling(self._shape, self._affine, affine)
         heights = None if self._height_m is None else np.empty(shape, np.float32)

@@ -41,6 +41,7 @@ FLOORS = (
             ("files", "in and out\nHDF5, scene files"),
             ("mosaics", "larger than memory\nsurvey, patches, store"),
             ("plot", "what does it show?\nimages, tracks, trade-offs"),
+            ("maps", "where on Earth?\nGeoTIFF, netCDF"),
         ),
         INK,
     ),
