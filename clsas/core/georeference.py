@@ -22,10 +22,12 @@ if TYPE_CHECKING:
 
     from clsas.core.grid import Grid
     from clsas.core.lines import RangeLines
+    from clsas.signal.echoes import Echoes
 
 _LOCAL = ("latitude_deg", "longitude_deg", "height_m", "heading_deg")
 _MOST_HEIGHT_M = 1e5
 _SEMI_MAJOR_M, _SQUARED_ECCENTRICITY = 6378137.0, 0.0066943799901413165  # WGS 84
+_ROUNDING = 1e-12  # part of a step that may come from rounding: 1e-7 pixels over 100 000
 _PARALLEL = 1e-6  # sine of the least angle between rows and columns, seen from above
 
 
@@ -396,9 +398,58 @@ class Georeference:
             *(float(right[1]), float(down[1]), float(corner[1])),
         )
 
+    def north_up(self, grid: Grid, pixel_m: float | None = None) -> Grid:
+        """Return the smallest horizontal grid along the axes of the map that covers another one.
+
+        Its columns run east and its rows north. Edges of its pixels are at whole multiples of their
+        size, so that images of neighbouring scenes fit together.
+
+        Parameters
+        ----------
+        grid : Grid
+            A horizontal plane.
+        pixel_m : float, optional
+            Distance of its pixels, metres; by default the smaller one of `grid`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the grid is not a horizontal plane, or `pixel_m` is not a positive number, or so
+            small that pixels would not fit into memory.
+
+        Examples
+        --------
+        >>> import clsas
+        >>> place = clsas.Georeference.local(60.39, 5.32, heading_deg=45)
+        >>> grid = clsas.Grid.plane((0, 10, 101), (20, 25, 51), georeference=place)
+        >>> north_up = place.north_up(grid)
+        >>> north_up.shape
+        (109, 108)
+        >>> place.affine(north_up)[1], place.affine(north_up)[3]
+        (0.0, 0.0)
+        """
+        from clsas.core.grid import Grid
+
+        affine = self.affine(grid)
+        origin_m, row_step_m, column_step_m = grid.vectors_m
+        if grid.height_m is not None or row_step_m[2] or column_step_m[2]:
+            raise ValueError("grid must be a horizontal plane to be turned, got another one")
+        if pixel_m is None:
+            pixel_m = min(math.hypot(affine[0], affine[3]), math.hypot(affine[1], affine[4]))
+        pixel_m = validate.positive("pixel_m", pixel_m, "m")
+        left, bottom, rows, columns = cover(grid.shape, affine, pixel_m)
+        validate.memory("pixel_m", 8 * rows * columns)
+        first_m = self.from_map([(left + 0.5) * pixel_m, (bottom + 0.5) * pixel_m, 0.0])
+        first_m[2] = origin_m[2]
+        steps_m = np.zeros((2, 3))  # of columns to the east, and of rows to the north
+        steps_m[:, :2] = pixel_m * (np.eye(2) if self.is_projected else self._axes.T)
+        return Grid.oriented(first_m, steps_m[1], steps_m[0], (rows, columns), georeference=self)
+
     def _on_map(self, step_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a step's easting and northing."""
-        return step_m[:2].copy() if self.is_projected else step_m[:2] @ self._axes
+        """Return a step's easting and northing, exactly 0 if it is so but for rounding."""
+        found = step_m[:2].copy() if self.is_projected else step_m[:2] @ self._axes
+        found[np.abs(found) < _ROUNDING * np.abs(found).max()] = 0.0
+        return found
 
     @property
     def _axes(self) -> NDArray[np.float64]:
@@ -431,7 +482,38 @@ class Georeference:
         return pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
 
 
-def placed(lines: RangeLines, grid: Grid) -> Grid:
+def cover(
+    shape: tuple[int, ...], affine: tuple[float, ...], pixel_m: float
+) -> tuple[int, int, int, int]:
+    """Return the north-up raster of whole multiples of a pixel that covers another raster.
+
+    Parameters
+    ----------
+    shape : (rows, columns)
+    affine : tuple of float
+        Transform from columns and rows to easting and northing.
+    pixel_m : float
+        Size of the new pixels, metres.
+
+    Returns
+    -------
+    left, bottom : int
+        Edges of the new raster, in pixels.
+    rows, columns : int
+        Number of its pixels.
+    """
+    a, b, c, d, e, f = affine
+    rows, columns = shape
+    corners = [(i * columns, j * rows) for i in (0, 1) for j in (0, 1)]
+    east = [a * across + b * down + c for across, down in corners]
+    north = [d * across + e * down + f for across, down in corners]
+    # Rounding must not add a row or column of pixels that see nothing.
+    left, bottom = (math.floor(min(each) / pixel_m + 1e-6) for each in (east, north))
+    right, top = (math.ceil(max(each) / pixel_m - 1e-6) for each in (east, north))
+    return left, bottom, top - bottom, right - left
+
+
+def placed(lines: RangeLines | Echoes, grid: Grid) -> Grid:
     """Return a grid with the georeference of the lines, unless it has one of its own.
 
     Raises
@@ -502,6 +584,8 @@ def _words(name: str, value: object) -> str:
     text = validate.text(name, value)
     if not text.strip():
         raise ValueError(f"{name} must not be empty")
+    if "\0" in text:  # PROJ would read only what is in front of it
+        raise ValueError(f"{name} must be text without NUL, got {validate.shown(text)}")
     return text.strip()
 
 

@@ -120,7 +120,7 @@ def export(
 
     With `north_up`, power is interpolated bilinearly. Complex pixels are not resampled, since
     their phase cannot be interpolated where pixels are larger than a quarter of a wavelength: form
-    the image on a grid along the axes of the map instead.
+    the image on the grid of `Georeference.north_up` instead.
 
     Examples
     --------
@@ -230,7 +230,7 @@ def _check_map(source: Source, given: dict[str, Any]) -> None:
     if given["kind"] == "complex" and given["north_up"]:
         raise ValueError(
             "north_up must be off for complex pixels, whose phase cannot be interpolated: form the "
-            "image on a grid along the axes of the map, or export it rotated"
+            "image on the grid of Georeference.north_up, or export it rotated"
         )
     if grid.height_m is not None and given["kind"] == "8bit":
         validate.warn(

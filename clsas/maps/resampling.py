@@ -7,9 +7,12 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
+from clsas.core.georeference import cover
 from clsas.maps.orientation import Affine
 
+_CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
 _MOST_AVERAGED = 16  # samples per pixel and axis; coarser pixels are refused
 
 
@@ -28,17 +31,10 @@ def north_up(
     pixel_m : float
         Size of the new pixels, metres.
     """
-    a, b, c, d, e, f = affine
-    rows, columns = shape
-    corners = [(i * columns, j * rows) for i in (0, 1) for j in (0, 1)]
-    east = [a * across + b * down + c for across, down in corners]
-    north = [d * across + e * down + f for across, down in corners]
-    # Rounding must not add a row or column of pixels that see nothing.
-    left, bottom = (math.floor(min(each) / pixel_m + 1e-6) for each in (east, north))
-    right, top = (math.ceil(max(each) / pixel_m - 1e-6) for each in (east, north))
-    return (top - bottom, right - left), (
+    left, bottom, rows, columns = cover(shape, affine, pixel_m)
+    return (rows, columns), (
         *(pixel_m, 0.0, left * pixel_m),
-        *(0.0, -pixel_m, top * pixel_m),
+        *(0.0, -pixel_m, (bottom + rows) * pixel_m),
     )
 
 
@@ -98,53 +94,67 @@ class Resampling:
             values themselves, such as heights.
         """
         count = self._averaged
-        within = (np.arange(count) + 0.5) / count
-        down = (np.arange(rows.start, rows.stop)[:, None] + within).reshape(-1, 1)
-        across = (np.arange(columns.start, columns.stop)[:, None] + within).reshape(1, -1)
-        to = self._to_source
-        column = to[0, 0] * across + to[0, 1] * down + to[0, 2] - 0.5
-        row = to[1, 0] * across + to[1, 1] * down + to[1, 2] - 0.5
-        inside = (row >= -0.5) & (row <= self._shape[0] - 0.5)
-        inside &= (column >= -0.5) & (column <= self._shape[1] - 0.5)
-        total = np.zeros(row.shape)
-        weight = np.zeros(row.shape)
-        if inside.any():
-            self._add(row, column, inside, read, of_power, total, weight)
-        shape = (rows.stop - rows.start, count, columns.stop - columns.start, count)
-        total, weight = (each.reshape(shape).sum(axis=(1, 3)) for each in (total, weight))
+        matrix, offset = self._from_samples(rows, columns)
+        shape = (rows.stop - rows.start) * count, (columns.stop - columns.start) * count
+        inside = self._inside(matrix, offset, shape)
+        if inside is not None and not inside.any():
+            return np.zeros((shape[0] // count, shape[1] // count), np.float32)
+        corners = offset + [matrix @ [i * (shape[0] - 1), j * (shape[1] - 1)] for i, j in _CORNERS]
+        parts = [
+            slice(max(math.floor(low), 0), min(math.ceil(high) + 1, most))
+            for low, high, most in zip(
+                corners.min(axis=0), corners.max(axis=0), self._shape, strict=True
+            )
+        ]
+        # Samples within half a pixel of the border may lie beyond the outermost centres.
+        parts = [
+            slice(min(part.start, most - 1), max(part.stop, 1))
+            for part, most in zip(parts, self._shape, strict=True)
+        ]
+        values = read(*parts).astype(np.float64)
+        first = np.array([part.start for part in parts])
+
+        def interpolated(given: NDArray[np.float64]) -> NDArray[np.float64]:
+            return ndimage.affine_transform(
+                given, matrix, offset - first, shape, order=1, mode="nearest"
+            )
+
+        received = values != 0 if of_power else np.ones(values.shape, bool)
+        total = interpolated(values**2 if of_power else values)
+        weight = np.ones(shape) if received.all() else interpolated(received.astype(np.float64))
+        if inside is not None:
+            total *= inside
+            weight *= inside
+        blocks = shape[0] // count, count, shape[1] // count, count
+        total, weight = (each.reshape(blocks).sum(axis=(1, 3)) for each in (total, weight))
         seen = weight >= count**2 / 2  # at least half of the pixel
         mean = np.divide(total, weight, out=np.zeros_like(total), where=seen)
         return (np.sqrt(mean) if of_power else mean).astype(np.float32)
 
-    def _add(
-        self,
-        row: NDArray[np.float64],
-        column: NDArray[np.float64],
-        inside: NDArray[np.bool_],
-        read: Callable[[slice, slice], NDArray[np.float32]],
-        of_power: bool,
-        total: NDArray[np.float64],
-        weight: NDArray[np.float64],
-    ) -> None:
-        """Add the values and weights of the four nearest pixels."""
-        parts, nearest = [], []
-        for place, count in zip((row, column), self._shape, strict=True):
-            first = np.clip(np.floor(place).astype(np.int64), 0, max(count - 2, 0))
-            low, high = int(first[inside].min()), min(int(first[inside].max()) + 2, count)
-            parts.append(slice(low, high))
-            share = np.clip(place - first, 0.0, 1.0)
-            # Beyond the outer centres, values are those of the outer pixels.
-            nearest.append((np.clip(first - low, 0, high - low - 1), share, high - low - 1))
-        values = read(*parts).astype(np.float64)
-        received = np.ones(values.shape, bool)
-        if of_power:
-            received = values != 0
-            values *= values
-        (top, below, last_row), (left, right, last_column) = nearest
-        for i in (0, 1):
-            for j in (0, 1):
-                at = np.minimum(top + i, last_row), np.minimum(left + j, last_column)
-                share = (below if i else 1 - below) * (right if j else 1 - right) * inside
-                share = share * received[at]
-                total += share * values[at]
-                weight += share
+    def _from_samples(
+        self, rows: slice, columns: slice
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the matrix and offset from samples of a window to indices of the given raster."""
+        to, count = self._to_source, self._averaged
+        # Sample s of a row lies at row + (s + 0.5)/count; indices count from the centre of pixels.
+        centre = np.array([columns.start, rows.start]) + 0.5 / count
+        column, row = to[:2, :2] @ centre + to[:2, 2] - 0.5
+        matrix = np.array([[to[1, 1], to[1, 0]], [to[0, 1], to[0, 0]]]) / count
+        return matrix, np.array([row, column])
+
+    def _inside(
+        self, matrix: NDArray[np.float64], offset: NDArray[np.float64], shape: tuple[int, int]
+    ) -> NDArray[np.bool_] | None:
+        """Return which samples lie on pixels of the given raster; None if all do."""
+        ends = offset + [matrix @ [i * (shape[0] - 1), j * (shape[1] - 1)] for i, j in _CORNERS]
+        most = np.array(self._shape) - 0.5
+        if (ends >= -0.5).all() and (ends <= most).all():
+            return None
+        if (ends.max(axis=0) < -0.5).any() or (ends.min(axis=0) > most).any():
+            return np.zeros(shape, bool)
+        down, across = np.ogrid[: shape[0], : shape[1]]
+        inside = np.ones(shape, bool)
+        for axis in (0, 1):
+            place = offset[axis] + matrix[axis, 0] * down + matrix[axis, 1] * across
+            inside &= (place >= -0.5) & (place <= most[axis])
+        return inside

@@ -135,3 +135,25 @@ def test_lines_place_the_grid():
     assert placed(replace(lines, georeference=None), on_utm) is on_utm
     with pytest.raises(ValueError, match=r"grid must have the georeference of the lines \(lat"):
         placed(lines, on_utm)
+
+
+@pytest.mark.parametrize("place", [UTM, BERGEN], ids=str)
+def test_a_north_up_grid_covers_the_grid_along_the_map(place):
+    shift = [500_000.3, 6_700_000.4, -7] if place.is_projected else [0, 0, -7]
+    grid = clsas.Grid.oriented(shift, [-0.1, 0.3, 0], [0.4, 0.2, 0], (40, 50), georeference=place)
+    for pixel_m in (None, 1.5):
+        found = place.north_up(grid, pixel_m)
+        a, b, c, d, e, f = place.affine(found)
+        size = pixel_m or np.hypot(0.1, 0.3)
+        assert (b, d) == (0, 0)
+        assert (a, e) == pytest.approx((size, size))
+        np.testing.assert_allclose((np.array([c, f]) / size + 0.5) % 1, 0.5, atol=1e-6)
+        on_map, covered = (place.to_map(each.positions_m())[..., :2] for each in (grid, found))
+        assert (covered.min(axis=(0, 1)) - size / 2 <= on_map.min(axis=(0, 1))).all()
+        assert (covered.max(axis=(0, 1)) + size / 2 >= on_map.max(axis=(0, 1))).all()
+        assert (np.ptp(covered, axis=(0, 1)) <= np.ptp(on_map, axis=(0, 1)) + 2 * size + 0.6).all()
+        assert found.bounds_m[0][2] == found.bounds_m[1][2] == -7
+    for other in (grid.with_height(np.zeros((40, 50))), clsas.Grid.oriented(
+        shift, [0, 1, 0.1], [1, 0, 0], (2, 2), georeference=place)):  # fmt: skip
+        with pytest.raises(ValueError, match="grid must be a horizontal plane"):
+            place.north_up(other)

@@ -82,6 +82,7 @@ def maps(folder: Path) -> dict[str, Call]:
         "Georeference.convergence_deg": Call(
             place.convergence_deg, geographic, accepts=dict.fromkeys(geographic, EMPTY)
         ),
+        "Georeference.north_up": Call(place.north_up, {"grid": s.grid, "pixel_m": 0.2}),
         "Georeference.affine": Call(place.affine, {"grid": s.grid}),
         "Track.from_geographic": Call(
             clsas.Track.from_geographic,
