@@ -357,20 +357,23 @@ def _get(file: Any, window: tuple[slice, slice]) -> NDArray:
 
 def _mean_power(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the amplitude of the mean power of 2 x 2 pixels, of those where it is not 0."""
-    squares = amplitude.astype(np.float64) ** 2
-    power, count = _summed(squares), _summed((amplitude != 0).astype(np.float64))
+    received = amplitude != 0
+    power = _summed(amplitude.astype(np.float64) ** 2)
+    count = _summed(received.astype(np.uint8))
     return np.sqrt(power / np.maximum(count, 1)).astype(np.float32)
 
 
 def _halved(values: NDArray) -> NDArray:
     """Return the means of 2 x 2 values; fewer at the last row and column of odd shapes."""
-    return (_summed(values) / _summed(np.ones(values.shape))).astype(np.float32)
+    return (_summed(values) / _summed(np.ones(values.shape, np.uint8))).astype(np.float32)
 
 
 def _summed(values: NDArray) -> NDArray:
     """Return the sums of 2 x 2 values; fewer at the last row and column of odd shapes."""
-    rows, columns = (np.arange(0, n, 2) for n in values.shape)
-    return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
+    odd = [n % 2 for n in values.shape]
+    even = np.pad(values, [(0, n) for n in odd]) if any(odd) else values
+    rows = even[::2] + even[1::2]
+    return rows[:, ::2] + rows[:, 1::2]
 
 
 def _check_whole(path: Path) -> None:
