@@ -254,6 +254,9 @@ def test_axes_of_a_map_are_easting_and_northing():
     on_map = replace(GRID, georeference=Georeference(crs="EPSG:32632"))
     axes = plot.image_db(Image(PIXELS, on_map), north_arrow=True, scale_bar=True).axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("Easting (m)", "Northing (m)")
+    response = measure_point(Image(PIXELS, on_map), (X[80], Y[60]))
+    labels = [axes.get_xlabel() for axes in plot.cuts(response).axes]
+    assert labels == ["Easting from the peak (mm)", "Northing from the peak (mm)"]
     north, bar = axes.texts
     assert (north.get_text(), bar.get_text()) == ("N", "0.5 m")
     (line,) = axes.get_lines()
