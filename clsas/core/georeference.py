@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import reprs, validate
-from clsas.core.extras import needed
+from clsas.core import projections, reprs, validate
 
 if TYPE_CHECKING:
     import pyproj
@@ -26,9 +24,6 @@ if TYPE_CHECKING:
 
 _LOCAL = ("latitude_deg", "longitude_deg", "height_m", "heading_deg")
 _MOST_HEIGHT_M = 1e5
-_SEMI_MAJOR_M, _SQUARED_ECCENTRICITY = 6378137.0, 0.0066943799901413165  # WGS 84
-_ROUNDING = 1e-12  # part of a step that may come from rounding: 1e-7 pixels over 100 000
-_PARALLEL = 1e-6  # sine of the least angle between rows and columns, seen from above
 
 
 @dataclass(frozen=True)
@@ -111,7 +106,7 @@ class Georeference:
         for name in _LOCAL:
             if getattr(self, name) is None:
                 raise ValueError(f"{name} must be given unless crs is")
-        latitude, longitude = checked_geographic(self.latitude_deg, self.longitude_deg, ())
+        latitude, longitude = projections.checked(self.latitude_deg, self.longitude_deg, ())
         put("latitude_deg", float(latitude))
         put("longitude_deg", float(longitude))
         put("height_m", _height("height_m", self.height_m))
@@ -163,7 +158,7 @@ class Georeference:
         >>> clsas.Georeference.projected("epsg:32632")
         Georeference(EPSG:32632)
         """
-        found = _crs(_words("crs", crs))
+        found = projections.known(_words("crs", crs))
         authority = found.to_authority(min_confidence=100)
         name = crs if authority is None else ":".join(authority)
         return cls(crs=name, vertical_datum=vertical_datum)
@@ -238,8 +233,11 @@ class Georeference:
             As for `wkt`.
         """
         if self.crs is not None:
-            return _crs(self.crs)
-        return _transverse_mercator(self.latitude_deg, self.longitude_deg, self._scale)
+            return projections.known(self.crs)
+        assert self.latitude_deg is not None
+        assert self.longitude_deg is not None
+        assert self.height_m is not None
+        return projections.centred_on(self.latitude_deg, self.longitude_deg, self.height_m)
 
     def to_map(self, positions_m: ArrayLike) -> NDArray[np.float64]:
         """Return easting, northing and height of positions x, y, z, float64 [..., 3], metres.
@@ -252,7 +250,7 @@ class Georeference:
         found = _positions("positions_m", positions_m).copy()
         if self.is_projected:
             return found
-        found[..., :2] = found[..., :2] @ self._axes
+        found[..., :2] = found[..., :2] @ self.axes
         found[..., 2] += self.height_m or 0.0
         return found
 
@@ -267,7 +265,7 @@ class Georeference:
         found = _positions("places_m", places_m).copy()
         if self.is_projected:
             return found
-        found[..., :2] = found[..., :2] @ self._axes.T
+        found[..., :2] = found[..., :2] @ self.axes.T
         found[..., 2] -= self.height_m or 0.0
         return found
 
@@ -321,9 +319,9 @@ class Georeference:
         >>> place.from_geographic(60.39, 5.32, 10.0)
         array([ 0.,  0., 10.])
         """
-        latitude, longitude = checked_geographic(latitude_deg, longitude_deg)
+        latitude, longitude = projections.checked(latitude_deg, longitude_deg)
         height = validate.array("height_m", height_m, np.float64, None)
-        latitude, longitude, height = _alike(latitude, longitude, height)
+        latitude, longitude, height = projections.alike(latitude, longitude, height)
         easting_m, northing_m = self._transformer().transform(longitude, latitude)
         place_m = np.stack([easting_m, northing_m, height], axis=-1)
         if not np.isfinite(place_m).all():
@@ -342,7 +340,7 @@ class Georeference:
         TypeError, ValueError, ImportError
             As for `from_geographic`.
         """
-        latitude, longitude = _alike(*checked_geographic(latitude_deg, longitude_deg))
+        latitude, longitude = projections.alike(*projections.checked(latitude_deg, longitude_deg))
         crs = self.map_crs()  # raises if pyproj is missing
         import pyproj
 
@@ -376,27 +374,9 @@ class Georeference:
         >>> place.affine(clsas.Grid.plane((500_000, 500_100, 101), (6_700_000, 6_700_050, 101)))
         (1.0, 0.0, 499999.5, 0.0, 0.5, 6699999.75)
         """
-        from clsas.core.grid import Grid  # imports this module
+        from clsas.core import map_grids  # imports Grid, which imports this module
 
-        validate.instance("grid", grid, Grid)
-        origin_m, row_step_m, column_step_m = grid.vectors_m
-        right, down = (self._on_map(step) for step in (column_step_m, row_step_m))
-        rows, columns = grid.shape
-        # A single row or column has no step: it is as wide as the pixels of the other axis.
-        if rows == 1 and not down.any():
-            down = np.array([-right[1], right[0]])
-        if columns == 1 and not right.any():
-            right = np.array([down[1], -down[0]])
-        lengths = math.hypot(*right) * math.hypot(*down)
-        if abs(right[0] * down[1] - right[1] * down[0]) <= _PARALLEL * lengths:
-            raise ValueError(
-                "grid must not be vertical: seen from above, its rows and columns are parallel"
-            )
-        corner = self.to_map(origin_m)[:2] - (right + down) / 2
-        return (
-            *(float(right[0]), float(down[0]), float(corner[0])),
-            *(float(right[1]), float(down[1]), float(corner[1])),
-        )
+        return map_grids.affine(self, grid)
 
     def north_up(self, grid: Grid, pixel_m: float | None = None) -> Grid:
         """Return the smallest horizontal grid along the axes of the map that covers another one.
@@ -428,51 +408,20 @@ class Georeference:
         >>> place.affine(north_up)[1], place.affine(north_up)[3]
         (0.0, 0.0)
         """
-        from clsas.core.grid import Grid
+        from clsas.core import map_grids
 
-        affine = self.affine(grid)
-        origin_m, row_step_m, column_step_m = grid.vectors_m
-        if grid.height_m is not None or row_step_m[2] or column_step_m[2]:
-            raise ValueError("grid must be a horizontal plane to be turned, got another one")
-        if pixel_m is None:
-            pixel_m = min(math.hypot(affine[0], affine[3]), math.hypot(affine[1], affine[4]))
-        pixel_m = validate.positive("pixel_m", pixel_m, "m")
-        left, bottom, rows, columns = cover(grid.shape, affine, pixel_m)
-        validate.memory("pixel_m", 8 * rows * columns)
-        first_m = self.from_map([(left + 0.5) * pixel_m, (bottom + 0.5) * pixel_m, 0.0])
-        first_m[2] = origin_m[2]
-        steps_m = np.zeros((2, 3))  # of columns to the east, and of rows to the north
-        steps_m[:, :2] = pixel_m * (np.eye(2) if self.is_projected else self._axes.T)
-        return Grid.oriented(first_m, steps_m[1], steps_m[0], (rows, columns), georeference=self)
-
-    def _on_map(self, step_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a step's easting and northing, exactly 0 if it is so but for rounding."""
-        found = step_m[:2].copy() if self.is_projected else step_m[:2] @ self._axes
-        found[np.abs(found) < _ROUNDING * np.abs(found).max()] = 0.0
-        return found
+        return map_grids.north_up(self, grid, pixel_m)
 
     @property
-    def _axes(self) -> NDArray[np.float64]:
-        """Easting and northing of the unit vectors x and y of a local georeference, [2, 2]."""
-        assert self.heading_deg is not None
+    def axes(self) -> NDArray[np.float64]:
+        """Easting and northing of the unit vectors x and y, float64 [2, 2]."""
+        if self.heading_deg is None:
+            return np.eye(2)
         quarter, rest = divmod(self.heading_deg, 90.0)  # exact for multiples of 90 degrees
         sine, cosine = math.sin(math.radians(rest)), math.cos(math.radians(rest))
         for _ in range(int(quarter)):
             sine, cosine = cosine, -sine
         return np.array([[sine, cosine], [-cosine, sine]])
-
-    @property
-    def _scale(self) -> float:
-        """Scale of the transverse Mercator projection at the origin."""
-        assert self.latitude_deg is not None
-        assert self.height_m is not None
-        sine = math.sin(math.radians(self.latitude_deg))
-        radius_m = (
-            _SEMI_MAJOR_M
-            * math.sqrt(1 - _SQUARED_ECCENTRICITY)
-            / (1 - _SQUARED_ECCENTRICITY * sine**2)
-        )
-        return 1 + self.height_m / radius_m
 
     def _transformer(self) -> pyproj.Transformer:
         """Return the transform from longitude and latitude to easting and northing."""
@@ -480,37 +429,6 @@ class Georeference:
         import pyproj
 
         return pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
-
-
-def cover(
-    shape: tuple[int, ...], affine: tuple[float, ...], pixel_m: float
-) -> tuple[int, int, int, int]:
-    """Return the north-up raster of whole multiples of a pixel that covers another raster.
-
-    Parameters
-    ----------
-    shape : (rows, columns)
-    affine : tuple of float
-        Transform from columns and rows to easting and northing.
-    pixel_m : float
-        Size of the new pixels, metres.
-
-    Returns
-    -------
-    left, bottom : int
-        Edges of the new raster, in pixels.
-    rows, columns : int
-        Number of its pixels.
-    """
-    a, b, c, d, e, f = affine
-    rows, columns = shape
-    corners = [(i * columns, j * rows) for i in (0, 1) for j in (0, 1)]
-    east = [a * across + b * down + c for across, down in corners]
-    north = [d * across + e * down + f for across, down in corners]
-    # Rounding must not add a row or column of pixels that see nothing.
-    left, bottom = (math.floor(min(each) / pixel_m + 1e-6) for each in (east, north))
-    right, top = (math.ceil(max(each) / pixel_m - 1e-6) for each in (east, north))
-    return left, bottom, top - bottom, right - left
 
 
 def placed(lines: RangeLines | Echoes, grid: Grid) -> Grid:
@@ -529,54 +447,6 @@ def placed(lines: RangeLines | Echoes, grid: Grid) -> Grid:
         f"grid must have the georeference of the lines ({lines.georeference}), "
         f"got {grid.georeference}"
     )
-
-
-def checked_geographic(
-    latitude_deg: Any, longitude_deg: Any, shape: tuple[int | None, ...] | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return latitudes and longitudes, checked; longitudes are from -180 up to 180 degrees.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a value is outside its limits; the message says so if both are probably swapped.
-    """
-    if shape == ():
-        latitude = np.array(validate.number("latitude_deg", latitude_deg, "degrees"))
-        longitude = np.array(validate.number("longitude_deg", longitude_deg, "degrees"))
-    else:
-        latitude = validate.array("latitude_deg", latitude_deg, np.float64, shape)
-        longitude = validate.array("longitude_deg", longitude_deg, np.float64, shape)
-    farthest = np.abs(latitude).max(initial=0.0)
-    if farthest > 90:
-        hint = ""
-        if farthest <= 360 and np.abs(longitude).max(initial=0.0) <= 90:
-            hint = "; latitude_deg and longitude_deg are probably swapped"
-        raise ValueError(
-            f"latitude_deg must be from -90 to 90 degrees, got {_worst(latitude):.10g}{hint}"
-        )
-    if longitude.size and (longitude.min() < -180 or longitude.max() > 360):
-        raise ValueError(
-            f"longitude_deg must be from -180 to 360 degrees, got {_worst(longitude):.10g}"
-        )
-    return latitude, np.where(longitude >= 180, longitude - 360, longitude)
-
-
-def _alike(*arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Return latitudes, longitudes and perhaps heights, broadcast to the same shape."""
-    try:
-        return np.broadcast_arrays(*arrays)
-    except ValueError:
-        names = ("latitude_deg", "longitude_deg", "height_m")[: len(arrays)]
-        raise ValueError(
-            f"{', '.join(names)} must have the same shape, got "
-            f"{', '.join(str(each.shape) for each in arrays)}"
-        ) from None
-
-
-def _worst(values: NDArray[np.float64]) -> float:
-    """Return the value that is farthest from 0."""
-    return float(values.reshape(-1)[np.abs(values).argmax()])
 
 
 def _words(name: str, value: object) -> str:
@@ -603,47 +473,3 @@ def _positions(name: str, value: ArrayLike) -> NDArray[np.float64]:
     if found.ndim == 0 or found.shape[-1] != 3:
         raise ValueError(f"{name} must have shape [..., 3], got {found.shape}")
     return found
-
-
-@lru_cache(maxsize=32)
-def _crs(name: str) -> pyproj.CRS:
-    """Return a projected coordinate reference system in metres; raise ValueError for others."""
-    with needed("coordinate reference systems"):
-        import pyproj
-        from pyproj.exceptions import CRSError
-    try:
-        found = pyproj.CRS.from_user_input(name)
-    except CRSError as error:
-        reason = str(error).partition("(Internal Proj Error: ")[2].rstrip(")") or "not a CRS"
-        raise ValueError(
-            f"crs must be one that PROJ knows, such as 'EPSG:32632', got {validate.shown(name)} "
-            f"({reason})"
-        ) from None
-    if not found.is_projected:
-        kind = "a geographic one" if found.is_geographic else "another kind"
-        raise ValueError(
-            f"crs must be a projection with easting and northing in metres, such as 'EPSG:32632', "
-            f"got {kind}: {validate.shown(name)}; for latitudes and longitudes use "
-            "Georeference.local"
-        )
-    units = {axis.unit_name for axis in found.axis_info}
-    if units - {"metre"}:
-        raise ValueError(
-            f"crs must be in metres, got {validate.shown(name)} in {', '.join(sorted(units))}"
-        )
-    return found
-
-
-@lru_cache(maxsize=32)
-def _transverse_mercator(latitude_deg: float, longitude_deg: float, scale: float) -> pyproj.CRS:
-    """Return the transverse Mercator projection of WGS 84 centred on an origin."""
-    with needed("coordinate reference systems"):
-        from pyproj.crs import ProjectedCRS
-        from pyproj.crs.coordinate_operation import TransverseMercatorConversion
-    conversion = TransverseMercatorConversion(
-        latitude_natural_origin=latitude_deg,
-        longitude_natural_origin=longitude_deg,
-        scale_factor_natural_origin=scale,
-    )
-    name = f"Transverse Mercator about {latitude_deg:.8g}, {longitude_deg:.9g} (WGS 84)"
-    return ProjectedCRS(conversion, name=name, geodetic_crs="EPSG:4326")

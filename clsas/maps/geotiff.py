@@ -13,6 +13,7 @@ import math
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from clsas.core import reprs
 from clsas.core.atomic import assembling
 from clsas.core.extras import needed
 from clsas.maps.encoding import Encoding, colour_table
-from clsas.maps.orientation import Affine, Orientation
+from clsas.maps.orientation import Orientation
 from clsas.maps.resampling import Resampling, north_up, steps_m
 from clsas.maps.sources import Source, windows_of
 
@@ -116,6 +117,37 @@ def _check_space(folder: Path, least_bytes: int) -> None:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """An overview, or the raster itself.
+
+    Attributes
+    ----------
+    amplitude : Path
+        File with its amplitudes.
+    path : Path
+        File with its encoded pixels, which may be the same.
+    shape : (rows, columns)
+    height_m : ndarray or None
+        Heights of its pixels.
+    """
+
+    amplitude: Path
+    path: Path
+    shape: tuple[int, int]
+    height_m: NDArray | None = None
+
+    def below(self, folder: Path) -> _Level | None:
+        """Return the overview with half as many rows and columns, or None if none is needed."""
+        if max(self.shape) <= _TILE:
+            return None
+        # GDAL finds the overviews of a file in file.ovr, and further ones in file.ovr.ovr.
+        path = self.path.with_name(f"{self.path.name}.ovr")
+        shape = (self.shape[0] + 1) // 2, (self.shape[1] + 1) // 2
+        heights = None if self.height_m is None else _halved(self.height_m)
+        return _Level(folder / f"amplitude-{shape[0]}-{shape[1]}.tif", path, shape, heights)
+
+
 class _Steps:
     """Pixels done of all passes over an image, for a progress bar."""
 
@@ -188,9 +220,10 @@ class _Export:
         shape, affine = north_up(self._shape, self._affine, pixel_m)
         resampling = Resampling(self._shape, self._affine, affine)
         heights = None if self._height_m is None else np.empty(shape, np.float32)
+        self._shape, self._affine = shape, affine
         path = self._folder / "north_up.tif"
         share = self._source.grid.size / (shape[0] * shape[1])
-        with _opened(given) as file, self._created(path, shape, np.float32, affine) as new:
+        with _opened(given) as file, self._created(path, shape, np.float32) as new:
             for rows, columns in windows_of(shape, (_TILE, _TILE)):
                 values = resampling.at(rows, columns, lambda *part: _get(file, part))
                 self._put(new, (rows, columns), values)
@@ -201,7 +234,7 @@ class _Export:
                 self._steps.add(int(values.size * share))
         _check_whole(path)
         given.unlink()
-        self._shape, self._affine, self._height_m = shape, affine, heights
+        self._height_m = heights
         return path
 
     def _heights_at(self, rows: slice, columns: slice) -> NDArray:
@@ -214,75 +247,44 @@ class _Export:
     ) -> Path:
         """Write the encoded file and its overviews beside it; return the file."""
         base = self._folder / "base.tif"
-        path, amplitude, shape, heights = base, first, self._shape, self._height_m
-        level = 0
-        while True:
-            is_last = max(shape) <= _TILE
-            below = None if is_last else self._folder / f"amplitude{level + 1}.tif"
-            a, b, c, d, e, f = self._affine
-            across, down = self._shape[1] / shape[1], self._shape[0] / shape[0]
-            affine = a * across, b * down, c, d * across, e * down, f
-            keeps = encoding.kind == "complex" and level == 0 and heights is None
-            if keeps:
-                amplitude = amplitude.rename(path)
-            self._encode(amplitude, path, below, shape, affine, encoding, heights, keeps)
-            if level == 0:
-                self._describe(path, encoding, tags, colours)
-            if not keeps:
-                amplitude.unlink()
-            if below is None:
-                return base
-            # GDAL finds the overviews of a file in file.ovr, and further ones in file.ovr.ovr.
-            path, amplitude, level = path.with_name(f"{path.name}.ovr"), below, level + 1
-            shape = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
-            heights = None if heights is None else _halved(heights)
+        level: _Level | None = _Level(first, base, self._shape, self._height_m)
+        if encoding.kind == "complex" and self._height_m is None:  # encoded already
+            level = _Level(first.rename(base), base, self._shape)
+        while level is not None:
+            below = level.below(self._folder)
+            self._encode(level, below, encoding)
+            if level.path == base:
+                self._describe(base, encoding, tags, colours)
+            if level.amplitude != level.path:
+                level.amplitude.unlink()
+            level = below
+        return base
 
-    def _encode(
-        self,
-        amplitude: Path,
-        path: Path,
-        below: Path | None,
-        shape: tuple[int, int],
-        affine: Affine,
-        encoding: Encoding,
-        heights: NDArray | None,
-        keeps: bool,
-    ) -> None:
-        """Write a level from its amplitudes, and the amplitudes of the level below it.
-
-        If `keeps`, the level is there already: its amplitudes are those of its pixels.
-        """
-        half = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
-        bands = 1 if heights is None else 2
-        with _opened(amplitude) as file:
-            level = None
-            if not keeps:
-                level = self._created(path, shape, encoding.dtype, affine, bands, encoding.nodata)
-            smaller = None
+    def _encode(self, level: _Level, below: _Level | None, encoding: Encoding) -> None:
+        """Write a level from its amplitudes, and the amplitudes of the level below it."""
+        with ExitStack() as opened:
+            file = opened.enter_context(_opened(level.amplitude))
+            encoded = smaller = None
+            if level.path != level.amplitude:
+                encoded = opened.enter_context(self._created_for(level, encoding))
             if below is not None:
-                smaller = self._created(below, half, np.float32, affine)
-            try:
-                for rows, columns in windows_of(shape):
-                    values = _get(file, (rows, columns))
-                    if level is not None:
-                        is_encoded = values.dtype.kind == "c"
-                        pixels = values if is_encoded else encoding.encode(values)
-                        self._put(level, (rows, columns), pixels)
-                        if heights is not None:
-                            self._put(level, (rows, columns), heights[rows, columns], band=2)
-                    if smaller is not None:
-                        window = tuple(
-                            slice(part.start // 2, (part.stop + 1) // 2) for part in (rows, columns)
-                        )
-                        self._put(smaller, window, _mean_power(np.abs(values)))
-                    self._steps.add(values.size * 3 // 4)
-            finally:
-                for each in (level, smaller):
-                    if each is not None:
-                        each.close()
-        for each in (None if keeps else path, below):
-            if each is not None:
-                _check_whole(each)
+                smaller = opened.enter_context(
+                    self._created(below.amplitude, below.shape, np.float32)
+                )
+            for rows, columns in windows_of(level.shape):
+                values = _get(file, (rows, columns))
+                if encoded is not None:
+                    pixels = values if values.dtype.kind == "c" else encoding.encode(values)
+                    self._put(encoded, (rows, columns), pixels)
+                    if level.height_m is not None:
+                        self._put(encoded, (rows, columns), level.height_m[rows, columns], band=2)
+                if smaller is not None:
+                    halves = (slice(p.start // 2, (p.stop + 1) // 2) for p in (rows, columns))
+                    self._put(smaller, tuple(halves), _mean_power(np.abs(values)))
+                self._steps.add(values.size * 3 // 4)
+        for written in (level.path, None if below is None else below.amplitude):
+            if written is not None:
+                _check_whole(written)
 
     def _describe(
         self, path: Path, encoding: Encoding, tags: dict[str, str], colours: dict | None
@@ -313,24 +315,32 @@ class _Export:
         )  # fmt: skip
         self._steps.add(4 * self._source.grid.size)
 
+    def _created_for(self, level: _Level, encoding: Encoding) -> Any:
+        """Return a new file for the pixels of a level, open for writing."""
+        bands = 1 if level.height_m is None else 2
+        return self._created(level.path, level.shape, encoding.dtype, bands, encoding.nodata)
+
     def _created(
         self,
         path: Path,
         shape: tuple[int, int],
         dtype: Any,
-        affine: Affine | None = None,
         bands: int = 1,
         nodata: float | None = None,
     ) -> Any:
-        """Return a new file of plain tiles, open for writing."""
+        """Return a new file of plain tiles, open for writing, that covers the whole raster."""
         import rasterio
+
+        a, b, c, d, e, f = self._affine
+        across, down = self._shape[1] / shape[1], self._shape[0] / shape[0]
+        affine = rasterio.Affine(a * across, b * down, c, d * across, e * down, f)
 
         tiles = math.prod(math.ceil(n / _TILE) for n in shape)
         _check_space(self._folder, bands * tiles * _TILE**2 * np.dtype(dtype).itemsize)
         tiled = {"tiled": True, "blockxsize": _TILE, "blockysize": _TILE, "BIGTIFF": "YES"}
         return rasterio.open(
             path, "w", driver="GTiff", height=shape[0], width=shape[1], count=bands, dtype=dtype,
-            crs=self._crs, transform=rasterio.Affine(*(affine or self._affine)), nodata=nodata,
+            crs=self._crs, transform=affine, nodata=nodata,
             INTERLEAVE="BAND", **tiled,
         )  # fmt: skip
 

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 from numpy.typing import NDArray
 
-Affine = tuple[float, float, float, float, float, float]
-"""Transform from columns and rows to easting and northing: see `Georeference.affine`."""
+from clsas.core.map_grids import Affine
 
 _SAME = 1e-9  # smallest gain for which a raster is turned, far above rounding
 

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from clsas.core.georeference import cover
-from clsas.maps.orientation import Affine
+from clsas.core.map_grids import Affine, cover
 
 _CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
 _MOST_AVERAGED = 16  # samples per pixel and axis; coarser pixels are refused

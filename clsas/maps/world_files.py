@@ -10,7 +10,7 @@ import numpy as np
 
 from clsas.core.atomic import replacing
 from clsas.core.image import Image
-from clsas.maps.orientation import Affine
+from clsas.core.map_grids import Affine
 from clsas.plot import image_db
 from clsas.plot.canvas import PADDING_IN, PNG_DPI, length_unit, save
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
-from clsas.core.georeference import Georeference, checked_geographic
+from clsas.core import projections, validate
+from clsas.core.georeference import Georeference
 
 _ALIGNED = 0.5  # mean length of unit vectors, above which headings have a common direction
 # Largest drift angle of a platform that is believed, and the best agreement needed to suspect
@@ -49,7 +49,7 @@ def poses(
     Parameters and errors are those of `Track.from_geographic`.
     """
     validate.instance("georeference", georeference, Georeference, type(None))
-    latitude, longitude = checked_geographic(latitude_deg, longitude_deg, (None,))
+    latitude, longitude = projections.checked(latitude_deg, longitude_deg, (None,))
     if len(longitude) != len(latitude):
         raise ValueError(
             f"longitude_deg must have shape ({len(latitude)}) like latitude_deg, "
