@@ -64,8 +64,7 @@ from clsas.maps.exporting import SUFFIXES
     "--lines", "lines_path", type=INPUT,
     help="Range lines of the image, for tags with their carrier and sound speed.",
 )  # fmt: skip
-@click.option("--north-arrow", is_flag=True, help="Draw an arrow to the north into a picture.")
-@click.option("--scale-bar", is_flag=True, help="Draw a scale bar into a picture.")
+@options.map_marks
 @options.as_json
 def export(
     source: Path,

@@ -103,3 +103,14 @@ def test_images_keep_the_place_of_a_scene(folder):
         image = clsas.load("new.h5")
         assert image.georeference == clsas.Georeference.local(60.39, 5.32, heading_deg=217)
         assert np.abs(image.pixels).max() > 0
+
+
+def test_show_draws_the_marks_of_a_map(folder, figures):
+    command = ["show", "image.h5", "--north-arrow", "--scale-bar"]
+    assert CliRunner().invoke(main, command, catch_exceptions=False).exit_code == 0
+    (figure,) = figures
+    assert [text.get_text() for text in figure.axes[0].texts] == ["N", "10 m"]
+    clsas.save("lines.h5", LINES)
+    done = CliRunner().invoke(main, ["show", "lines.h5", "--scale-bar"])
+    assert done.exit_code == 2
+    assert "--scale-bar cannot be used with range lines" in done.output
