@@ -223,7 +223,7 @@ def _raised(plane: Grid, height_m: NDArray[np.float64], attributes: dict[str, An
 
 
 def _map_of(grid: Grid) -> dict[str, Any]:
-    """Return attributes from which GDAL reads where the pixels lie, if x and y are map axes."""
+    """Return the map projection in the convention of GDAL, if x and y are easting and northing."""
     place = grid.georeference
     if place is None or place.crs is None or not grid.has_axes:
         return {}

@@ -352,7 +352,7 @@ def test_a_store_keeps_the_place_and_refuses_another(tmp_path):
     assert store.grid.georeference == utm
     assert store.overview(8).georeference == utm
     url = "http://www.opengis.net/def/crs/EPSG/0/32632"
-    assert store.pixels.attrs["_CRS"] == {"url": url}  # where GDAL looks for it
+    assert store.pixels.attrs["_CRS"] == {"url": url}
     assert clsas.mosaic(LINES, grids["utm"], path, **REQUEST).grid.georeference == utm
     with pytest.raises(ValueError, match=r"georeference is .* in the store, None given"):
         clsas.mosaic(LINES, grids["none"], path, **REQUEST)
