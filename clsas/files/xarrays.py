@@ -53,8 +53,8 @@ def to_xarray(obj: Grid | RangeLines | Image | Echoes) -> xarray.DataArray | xar
     """Return an object as an xarray DataArray or Dataset, with coordinates in metres.
 
     An object with a georeference gets the coordinate `spatial_ref`, a grid mapping of the CF
-    conventions. If columns run east and rows north, x and y are easting and northing; otherwise
-    `easting` and `northing` of every pixel are further coordinates of images and grids.
+    conventions. Where x points east, x and y are easting and northing; otherwise `easting` and
+    `northing` of every pixel are further coordinates of images and grids.
 
     An image becomes a DataArray of its level in dB, relative to its largest amplitude. Neither
     pictures nor netCDF accept complex numbers. The complex pixels are therefore split into the
@@ -139,7 +139,7 @@ def _grid_coordinates(grid: Grid) -> dict[str, Any]:
     if place is None:
         return _coordinates(grid, _AXES)
     known = _coordinates(grid, _ON_MAP if place.is_north_up else _AXES)
-    if not (place.is_north_up and grid.has_axes):
+    if not place.is_north_up:
         on_map = np.moveaxis(place.to_map(grid.positions_m()), -1, 0)
         for name, axis, values in zip(("easting", "northing"), "xy", on_map, strict=False):
             known[name] = (_grid_dims(grid), values, dict(_ON_MAP[axis]))

@@ -14,6 +14,7 @@ from clsas.core.version import __version__
 from clsas.maps import geotiff, netcdf, world_files
 from clsas.maps.encoding import KINDS
 from clsas.maps.geotiff import Options, Progress
+from clsas.maps.orientation import Orientation
 from clsas.maps.sources import Source
 from clsas.mosaics.store import Store
 from clsas.plans.plan import Plan
@@ -227,7 +228,9 @@ def _check_map(source: Source, given: dict[str, Any]) -> None:
             "give georeference (on the command line --origin and --heading-deg, or --crs), or form "
             "the image by a scene with a table [georeference]"
         )
-    if given["kind"] == "complex" and given["north_up"]:
+    turned = Orientation.of((grid.shape[0], grid.shape[1]), grid.georeference.affine(grid))
+    resamples = given["north_up"] and (given["pixel_m"] is not None or not turned.is_north_up)
+    if given["kind"] == "complex" and resamples:
         raise ValueError(
             "north_up must be off for complex pixels, whose phase cannot be interpolated: form the "
             "image on the grid of Georeference.north_up, or export it rotated"
