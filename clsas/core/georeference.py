@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     import pyproj
 
     from clsas.core.grid import Grid
-    from clsas.core.lines import RangeLines
-    from clsas.signal.echoes import Echoes
 
 _LOCAL = ("latitude_deg", "longitude_deg", "height_m", "heading_deg")
 _MOST_HEIGHT_M = 1e5
@@ -431,7 +429,15 @@ class Georeference:
         return pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
 
 
-def placed(lines: RangeLines | Echoes, grid: Grid) -> Grid:
+class Recorded(Protocol):
+    """Range lines or echoes."""
+
+    @property
+    def georeference(self) -> Georeference | None:
+        """Where the coordinates lie on Earth; None if unknown."""
+
+
+def placed(lines: Recorded, grid: Grid) -> Grid:
     """Return a grid with the georeference of the lines, unless it has one of its own.
 
     Raises
