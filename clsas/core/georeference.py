@@ -26,7 +26,7 @@ _MOST_HEIGHT_M = 1e5
 
 @dataclass(frozen=True)
 class Georeference:
-    """Where the coordinates x, y and z lie on Earth.
+    """Place of the coordinates x, y and z on Earth.
 
     There are two kinds. With `projected`, x and y are easting and northing of a map projection.
     With `local`, the origin has a latitude and longitude, and the x axis a heading. The map of a
@@ -434,7 +434,7 @@ class Recorded(Protocol):
 
     @property
     def georeference(self) -> Georeference | None:
-        """Where the coordinates lie on Earth; None if unknown."""
+        """Georeference of the coordinates; None if unknown."""
 
 
 def placed(lines: Recorded, grid: Grid) -> Grid:
@@ -460,7 +460,7 @@ def _words(name: str, value: object) -> str:
     text = validate.text(name, value)
     if not text.strip():
         raise ValueError(f"{name} must not be empty")
-    if "\0" in text:  # PROJ would read only what is in front of it
+    if "\0" in text:  # PROJ would ignore everything after it
         raise ValueError(f"{name} must be text without NUL, got {validate.shown(text)}")
     return text.strip()
 

@@ -93,7 +93,7 @@ class Image:
 
     @property
     def georeference(self) -> Georeference | None:
-        """Where the grid lies on Earth; None if unknown."""
+        """Georeference of the grid; None if unknown."""
         return self.grid.georeference
 
     def db(self, *, reference: float | None = None) -> NDArray[np.float32]:
