@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from clsas import plot
     from clsas.core.contrast import contrast, entropy
+    from clsas.core.georeference import Georeference
     from clsas.core.grid import Grid
     from clsas.core.image import Image
     from clsas.core.image_error import relative_error_db
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from clsas.files.xarrays import to_xarray
     from clsas.inspection.inspection import inspect
     from clsas.inspection.result import Inspection, PhaseSign
+    from clsas.maps.exporting import export
     from clsas.measures.assessment import assess, survey_lines
     from clsas.measures.assessment_result import Assessment, Effect
     from clsas.measures.limits_result import Limit, Limits
@@ -68,6 +70,7 @@ __all__ = [
     "Effect",
     "FileFormatError",
     "Finding",
+    "Georeference",
     "Grid",
     "Image",
     "Imager",
@@ -99,6 +102,7 @@ __all__ = [
     "compress",
     "contrast",
     "entropy",
+    "export",
     "factorize",
     "from_full_matrix",
     "from_phase_history",
@@ -129,6 +133,7 @@ __all__ = [
 
 _MODULES = {
     "core.contrast": "contrast entropy",
+    "core.georeference": "Georeference",
     "core.grid": "Grid",
     "core.image": "Image",
     "core.image_error": "relative_error_db",
@@ -147,6 +152,7 @@ _MODULES = {
     "files.xarrays": "to_xarray",
     "inspection.inspection": "inspect",
     "inspection.result": "Inspection PhaseSign",
+    "maps.exporting": "export",
     "measures.assessment": "assess survey_lines",
     "measures.assessment_result": "Assessment Effect",
     "measures.limits_result": "Limit Limits",
@@ -181,6 +187,7 @@ _MODULES = {
 _EXTRAS = {
     "files.cphd": "radar",
     "files.cphd_writing": "radar",
+    "maps.exporting": "maps",
     "mosaics.mosaic": "mosaic",
     "mosaics.store": "mosaic",
 }

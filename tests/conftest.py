@@ -55,12 +55,16 @@ def left_as_found():
     assert changed == {}, "the test leaves this changed"
 
 
+_VARIABLES = ("PYTEST_CURRENT_TEST", "PROJ_CURL_CA_BUNDLE", "GDAL_CURL_CA_BUNDLE")
+"""Variables that pytest sets, and rasterio when it is imported."""
+
+
 def _shared_state():
     """State of a process that tests could change, by name."""
     umask = os.umask(0o077)
     os.umask(umask)
     found = {
-        "environment": {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"},
+        "environment": {k: v for k, v in os.environ.items() if k not in _VARIABLES},
         "working directory": os.getcwd(),
         "mask of modes": umask,
         "folders of modules": list(sys.path),

@@ -164,7 +164,7 @@ for name in clsas.__all__:
     assert said.keys() == {
         *("FileFormatError", "load", "save", "read_airsas", "read_cphd", "read_full_matrix"),
         *("read_phase_history", "write_cphd", "Mosaic", "Patch", "Store", "mosaic"),
-        *("Processed", "process", "assess", "survey_lines", "simulate", "simulate_lines"),
+        *("export", "Processed", "process", "assess", "survey_lines", "simulate", "simulate_lines"),
         "wavenumber",
     }
     assert "'sarkit>=" in said["read_cphd"]

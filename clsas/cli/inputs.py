@@ -57,7 +57,10 @@ def read_grid(
     if scene is None and x is None:
         raise click.UsageError("no grid given: use --scene, or --x and --y")
     described = read_scene(scene) if scene is not None else SceneFile(name="")
-    grid = clsas.Grid.plane(x, y, z or 0.0) if x and y else described.need("grid")[0]
+    if x and y:
+        grid = clsas.Grid.plane(x, y, z or 0.0, georeference=described.georeference)
+    else:
+        (grid,) = described.need("grid")
     if memory:
         validate.memory("--x and --y" if x else "[grid]", 8 * grid.size)
     return described, grid

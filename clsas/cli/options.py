@@ -99,6 +99,10 @@ levels = _together(
     ),
     colour_map,
 )  # fmt: skip
+map_marks = _together(
+    click.option("--north-arrow", is_flag=True, help="Draw an arrow to the north into a picture."),
+    click.option("--scale-bar", is_flag=True, help="Draw a scale bar into a picture."),
+)
 scene = click.option("--scene", type=INPUT, help="Scene file. Options override its values.")
 device = click.option(
     "--device",

@@ -95,6 +95,12 @@ def _range(text: str) -> tuple[float, float]:
 
 AXIS = Parsed("START:STOP:N", _axis, "START:STOP:N, two positions in metres and a number of pixels")
 POSITION = Parsed("X,Y", _position, "X,Y or X,Y,Z in metres, without a space, such as 0,42.5")
+ORIGIN = Parsed(
+    "LATITUDE,LONGITUDE",
+    _position,
+    "LATITUDE,LONGITUDE in degrees, or LATITUDE,LONGITUDE,HEIGHT, without a space, such as "
+    "60.39,5.32",
+)
 RATIO = Parsed("NUMBER", _ratio, "a number or a fraction such as 1/30")
 STAGES = Parsed("stages", _stages, "QRxQI for every stage, such as 2x2,2x2")
 PERCENTILES = Parsed(

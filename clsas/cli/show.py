@@ -24,6 +24,7 @@ Shown: TypeAlias = clsas.Image | clsas.RangeLines | clsas.Echoes | clsas.Plan | 
 _ENDINGS = (*SUFFIXES, ".mat", ".json", ".zarr")  # that the picture's name does without
 _MOST_PIXELS = 1024  # of a mosaic, along its longer side; a picture has as many dots
 _JSON = b"{"
+_MARKS = ("--north-arrow", "--scale-bar")
 
 
 @click.command()
@@ -50,6 +51,7 @@ _JSON = b"{"
     callback=options.checked(lambda value: validate.positive("extent_m", value, "m")),
     help="With --near, the distance on either side that is drawn (m). [default: 32 pixels]",
 )  # fmt: skip
+@options.map_marks
 @options.as_json
 def show(
     file: Path,
@@ -59,6 +61,8 @@ def show(
     colour_map: str | None,
     near: tuple[float, ...] | None,
     extent_m: float | None,
+    north_arrow: bool,
+    scale_bar: bool,
     as_json: bool,
 ) -> None:
     """Draw an image, range lines, a plan, a recording or a mosaic.
@@ -85,6 +89,8 @@ def show(
         "--colour-map": colour_map,
         "--near": near,
         "--extent-m": extent_m,
+        "--north-arrow": north_arrow or None,
+        "--scale-bar": scale_bar or None,
     }
     _check_options(shown, {option for option, value in given.items() if value is not None})
     from clsas import plot
@@ -92,6 +98,8 @@ def show(
     title = printable(file.name).replace("$", r"\$")  # matplotlib would read mathematics
     if percentile is not None:
         title += f" (0 dB: percentile {percentile:g})"
+    if north_arrow or scale_bar:
+        levels |= {"north_arrow": north_arrow, "scale_bar": scale_bar}
     figure, words = _drawn(shown, near, extent_m, percentile, title, levels)
     plot.save(figure, output)
     kind = "mosaic" if isinstance(shown, clsas.Store) else type(shown).__name__
@@ -140,10 +148,10 @@ def _check_options(shown: Shown, given: set[str]) -> None:
     if isinstance(shown, clsas.Plan):
         refused, what = given, "a plan"
     elif isinstance(shown, clsas.RangeLines | clsas.Echoes):
-        refused, what = given & {"--near", "--extent-m"}, "range lines or echoes"
+        refused, what = given & {"--near", "--extent-m", *_MARKS}, "range lines or echoes"
     elif isinstance(shown, clsas.Image) and shown.grid.points_m is not None:
         is_box = shown.grid.points_m.ndim == 4
-        refused = given & ({"--extent-m"} if is_box else {"--near", "--extent-m"})
+        refused = given & {*({"--extent-m"} if is_box else {"--near", "--extent-m"}), *_MARKS}
         what = "an image on points"
     else:
         return

@@ -38,17 +38,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         If the folder of `path` does not exist or cannot be written, if `path` is a folder, or on a
         full disk. The error names `path`, not the temporary file.
     """
-    given = path = Path(path)
-    if given.is_symlink():
-        path = Path(os.path.realpath(given))
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {given}: there is no folder {path.parent}")
-    if path.is_dir():
-        raise IsADirectoryError(f"cannot write {given}: it is a folder")
-    before = None
-    with suppress(FileNotFoundError):
-        check_ordinary(given)
-        before = path.stat()
+    path, before = _target(Path(path))
     with _temporary(path, _make_file) as (temporary, descriptor):
         if before is not None:
             # Done while the file is still empty, so that no other user can read its contents in the
@@ -64,6 +54,54 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
             fcntl.flock(descriptor, fcntl.LOCK_SH)
         os.replace(temporary, path)
         sync_folder(path.parent)
+
+
+@contextmanager
+def assembling(path: str | os.PathLike) -> Iterator[Path]:
+    """Yield a temporary folder in which `path` is assembled; rename the file to `path` on success.
+
+    The file must have the name of `path` in that folder, where programs may replace it and keep
+    files of their own. Everything else is as for `replacing`.
+
+    Raises
+    ------
+    ValueError, OSError
+        As for `replacing`.
+    """
+    path, before = _target(Path(path))
+    with _temporary(path, Path.mkdir) as (folder, _):
+        folder.chmod(stat.S_IRWXU)  # nobody else can read the file before it has its mode
+        yield folder
+        made = folder / path.name
+        descriptor = _open(made)
+        try:
+            if before is not None:
+                _own_as(descriptor, before)
+                os.fchmod(descriptor, stat.S_IMODE(before.st_mode))
+            os.fsync(descriptor)
+            os.replace(made, path)
+        finally:
+            os.close(descriptor)
+        sync_folder(path.parent)
+
+
+def _target(given: Path) -> tuple[Path, os.stat_result | None]:
+    """Return the file to replace, behind links, and its status if it exists.
+
+    Raises
+    ------
+    ValueError, OSError
+        As for `replacing`, if the file cannot be replaced.
+    """
+    path = Path(os.path.realpath(given)) if given.is_symlink() else given
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {given}: there is no folder {path.parent}")
+    if path.is_dir():
+        raise IsADirectoryError(f"cannot write {given}: it is a folder")
+    with suppress(FileNotFoundError):
+        check_ordinary(given)
+        return path, path.stat()
+    return path, None
 
 
 def _own_as(descriptor: int, before: os.stat_result) -> None:

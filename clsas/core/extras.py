@@ -21,6 +21,7 @@ PACKAGES = {
     "cli": (*_FILES, *_SIGNAL, "click>=8.1", "rich>=13.0"),
     "mosaic": _MOSAIC,
     "workers": (*_MOSAIC, "distributed>=2024.1", "cryptography>=42.0"),
+    "maps": (*_FILES, *_XARRAY, "rasterio>=1.4", "pyproj>=3.6", "h5netcdf>=1.3"),
     "radar": (*_FILES, *_SIGNAL, "sarkit>=1.8", "lxml>=5.1"),
 }
 """Requirements of every extra, as `pyproject.toml` has them. Extras that others include come first:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
+from clsas.core.georeference import Georeference
 
 _ALL = slice(None)
 _PARALLEL = 1e-12  # sine of the angle between parallel steps; float64 rounds to 1e-16
@@ -61,6 +62,8 @@ class Grid:
         Height of every pixel above the plane, added to z.
     points_m : ndarray of float64, shape [*shape, 3], or None
         Arbitrary positions; None for a plane or height map.
+    georeference : Georeference or None
+        Where the coordinates lie on Earth; None if unknown. Images on the grid have it too.
 
     Examples
     --------
@@ -80,6 +83,7 @@ class Grid:
     shape: tuple[int, ...]
     height_m: NDArray[np.float64] | None = None
     points_m: NDArray[np.float64] | None = None
+    georeference: Georeference | None = None
 
     if TYPE_CHECKING:  # the constructor converts array_like arguments
 
@@ -91,6 +95,7 @@ class Grid:
             shape: Sequence[int],
             height_m: ArrayLike | None = None,
             points_m: ArrayLike | None = None,
+            georeference: Georeference | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -100,6 +105,7 @@ class Grid:
             value = validate.array(name, getattr(self, name), np.float64, shape)
             object.__setattr__(self, name, value)
 
+        validate.instance("georeference", self.georeference, Georeference, type(None))
         counts = validate.entries("shape", self.shape, "whole numbers of pixels per axis")
         try:
             shape = tuple(validate.count("every entry of shape", n) for n in counts)
@@ -138,11 +144,22 @@ class Grid:
 
     def __repr__(self) -> str:
         """Return the shape and the extents of the pixels in x, y and z."""
-        return reprs.summary(self, f"{reprs.by(self.shape)} pixels", reprs.extents(*self.bounds_m))
+        place = self.georeference
+        return reprs.summary(
+            self,
+            f"{reprs.by(self.shape)} pixels",
+            reprs.extents(*self.bounds_m),
+            None if place is None else str(place),
+        )
 
     @classmethod
     def plane(
-        cls, x: tuple[float, float, int], y: tuple[float, float, int], z: float = 0.0
+        cls,
+        x: tuple[float, float, int],
+        y: tuple[float, float, int],
+        z: float = 0.0,
+        *,
+        georeference: Georeference | None = None,
     ) -> Self:
         """Return a horizontal plane whose columns run along x and whose rows run along y.
 
@@ -153,6 +170,8 @@ class Grid:
             `numpy.linspace`. With one pixel, `start` and `stop` must be equal.
         z : float
             Height of the plane, metres.
+        georeference : Georeference, optional
+            Where the coordinates lie on Earth.
 
         Raises
         ------
@@ -163,7 +182,8 @@ class Grid:
         x_start, x_step, columns = _axis("x", x)
         y_start, y_step, rows = _axis("y", y)
         origin = [x_start, y_start, _coordinate("z", z)]
-        return cls.oriented(origin, [0, y_step, 0], [x_step, 0, 0], (rows, columns))
+        steps = [0, y_step, 0], [x_step, 0, 0]
+        return cls.oriented(origin, *steps, (rows, columns), georeference=georeference)
 
     @classmethod
     def oriented(
@@ -172,6 +192,8 @@ class Grid:
         row_step_m: ArrayLike,
         column_step_m: ArrayLike,
         shape: tuple[int, int],
+        *,
+        georeference: Georeference | None = None,
     ) -> Self:
         """Return a plane of any orientation.
 
@@ -183,6 +205,8 @@ class Grid:
             Steps to the next row and to the next column, metres. They need not be perpendicular.
         shape : (rows, columns)
             Number of pixels.
+        georeference : Georeference, optional
+            Where the coordinates lie on Earth.
 
         Raises
         ------
@@ -190,11 +214,16 @@ class Grid:
             If an argument has the wrong type or shape or is not finite, or if pixels would
             coincide because steps are zero or parallel.
         """
-        return cls(origin_m, row_step_m, column_step_m, shape)
+        return cls(origin_m, row_step_m, column_step_m, shape, georeference=georeference)
 
     @classmethod
     def height_map(
-        cls, x: tuple[float, float, int], y: tuple[float, float, int], height_m: ArrayLike
+        cls,
+        x: tuple[float, float, int],
+        y: tuple[float, float, int],
+        height_m: ArrayLike,
+        *,
+        georeference: Georeference | None = None,
     ) -> Self:
         """Return the plane z = 0 raised by heights.
 
@@ -204,22 +233,26 @@ class Grid:
             As for `plane`.
         height_m : array_like, shape [rows, columns]
             Heights, metres along z.
+        georeference : Georeference, optional
+            Where the coordinates lie on Earth.
 
         Raises
         ------
         TypeError, ValueError
             As for `plane` and `with_height`.
         """
-        return cls.plane(x, y).with_height(height_m)
+        return cls.plane(x, y, georeference=georeference).with_height(height_m)
 
     @classmethod
-    def points(cls, points_m: ArrayLike) -> Self:
+    def points(cls, points_m: ArrayLike, *, georeference: Georeference | None = None) -> Self:
         """Return a grid of pixels at arbitrary positions.
 
         Parameters
         ----------
         points_m : array_like, shape [..., 3]
             Positions, metres. The image has the shape of the leading axes.
+        georeference : Georeference, optional
+            Where the coordinates lie on Earth.
 
         Raises
         ------
@@ -230,7 +263,8 @@ class Grid:
         given = validate.array("points_m", points_m, np.float64, None)
         shape = (*(None,) * max(given.ndim - 1, 1), 3)
         checked = validate.array("points_m", given, np.float64, shape)
-        return cls(None, None, None, checked.shape[:-1], points_m=checked)
+        points = checked, georeference
+        return cls(None, None, None, checked.shape[:-1], None, *points)
 
     def with_height(self, height_m: ArrayLike) -> Self:
         """Return this plane raised by heights.
@@ -251,9 +285,7 @@ class Grid:
                 "already, or consists of points"
             )
         height_m = validate.array("height_m", height_m, np.float64, self.shape)
-        return type(self)(
-            self.origin_m, self.row_step_m, self.column_step_m, self.shape, height_m=height_m
-        )
+        return replace(self, height_m=height_m)
 
     @property
     def bounds_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -422,7 +454,8 @@ class Grid:
         validate.selection("rows", rows)
         validate.selection("columns", columns)
         if self.points_m is not None:
-            return self.points(self.points_m[self._index(rows, columns)])
+            some_m = self.points_m[self._index(rows, columns)]
+            return self.points(some_m, georeference=self.georeference)
         row, column = (range(n)[s] for n, s in zip(self.shape, (rows, columns), strict=True))
         if not row or not column:
             raise ValueError(f"window must contain a pixel, got rows {rows} and columns {columns}")
@@ -435,6 +468,7 @@ class Grid:
             column_step_m * column.step,
             (len(row), len(column)),
             height_m=None if self.height_m is None else self.height_m[rows, columns],
+            georeference=self.georeference,
         )
 
     def _index(self, rows: slice, columns: slice) -> tuple[slice, ...]:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clsas.core import reprs, validate
 from clsas.core.decibels import level_db
+from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 
 if TYPE_CHECKING:
@@ -89,6 +90,11 @@ class Image:
     def shape(self) -> tuple[int, ...]:
         """Shape of the pixels: (rows, columns), or that of the grid's points."""
         return self.grid.shape
+
+    @property
+    def georeference(self) -> Georeference | None:
+        """Georeference of the grid; None if unknown."""
+        return self.grid.georeference
 
     def db(self, *, reference: float | None = None) -> NDArray[np.float32]:
         """Return the amplitude of the pixels in dB.

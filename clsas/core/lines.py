@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import conditioning, pings, reprs, validate
+from clsas.core.georeference import Georeference
 
 _PER_CHANNEL = ("first_range_m", "tx_m", "rx_m", "rx_velocity_m_s", "look_direction")
 GOLDEN = (np.sqrt(5) - 1) / 2
@@ -56,6 +57,8 @@ class RangeLines:
         face. Vectors of any length are stored as unit vectors. None means that the direction is
         unknown, or that the elements look to all sides. It does not change images, but imagers
         warn if pixels lie behind the elements.
+    georeference : Georeference, optional
+        Where the coordinates lie on Earth. Images of these lines have it too.
 
     Raises
     ------
@@ -103,6 +106,7 @@ class RangeLines:
     sound_speed_m_s: float
     rx_velocity_m_s: NDArray[np.float64] | None = None
     look_direction: NDArray[np.float64] | None = None
+    georeference: Georeference | None = None
 
     if TYPE_CHECKING:  # the constructor converts array_like arguments
 
@@ -117,6 +121,7 @@ class RangeLines:
             sound_speed_m_s: float,
             rx_velocity_m_s: ArrayLike | None = None,
             look_direction: ArrayLike | None = None,
+            georeference: Georeference | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -368,6 +373,7 @@ def checked_channels(received: Any, start: str) -> dict[str, Any]:
     TypeError, ValueError
         If a field has the wrong type or shape, or is outside its limits.
     """
+    validate.instance("georeference", received.georeference, Georeference, type(None))
     channels = received.samples.shape[0]
     shapes: dict[str, tuple[int, ...]] = {start: (channels,)}
     shapes |= {"tx_m": (channels, 3), "rx_m": (channels, 3)}

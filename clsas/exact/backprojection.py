@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from clsas.core.decibels import power
+from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -77,8 +78,8 @@ def backproject(
     TypeError, ValueError
         If an argument has the wrong type or is out of range, `accumulate` is on another grid or is
         given with a normalising beam, the track of the beam cannot be found from the lines,
-        receivers move faster than 0.05 times the sound speed, or numbers are too large or too small
-        for float32 sums or float64 phases.
+        lines and grid have different georeferences, receivers move faster than 0.05 times the sound
+        speed, or numbers are too large or too small for float32 sums or float64 phases.
     DeviceError
         If there is no such device.
 
@@ -144,13 +145,13 @@ def backproject(
         beam=beam,
     )
     if accumulate is not None:
-        check_accumulate(accumulate, grid, beam)
+        check_accumulate(accumulate, placed(lines, grid), beam)
     warn_behind(lines, grid)
     preparation.warn_of_ambiguity()
     image = execute(preparation, progress=progress)
     if accumulate is None:
         return image
-    return Image(image.pixels + accumulate.pixels, grid)
+    return Image(image.pixels + accumulate.pixels, image.grid)
 
 
 def prepare(
@@ -171,6 +172,7 @@ def prepare(
     no effect.
     """
     accuracy_db = check_input(lines, grid, beam, accuracy_db, BEST_ACCURACY_DB)
+    grid = placed(lines, grid)
     fixed = taps is not None and upsampling is not None
     model = simplify(lines, grid, beam, None if fixed or full_model else accuracy_db)
     along = None if model.beam is None else model.beam.directions(model.lines)

@@ -39,7 +39,10 @@ def check_input(
 def check_accumulate(image: Image, grid: Grid, beam: BeamWindow | None) -> None:
     """Raise an error if the image on a grid cannot be added to the image `accumulate`."""
     validate.instance("accumulate", image, Image)
-    if image.grid is not grid and not np.array_equal(image.grid.positions_m(), grid.positions_m()):
+    is_placed_alike = image.grid.georeference == grid.georeference
+    if image.grid is not grid and not (
+        is_placed_alike and np.array_equal(image.grid.positions_m(), grid.positions_m())
+    ):
         raise ValueError("accumulate must be an image on the same grid")
     if beam is not None and beam.normalise:
         raise ValueError(

@@ -10,6 +10,7 @@ import numpy as np
 
 from clsas.core import validate
 from clsas.core.geometry import pairwise_range_m
+from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -119,6 +120,7 @@ def wavenumber(
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
+    grid = placed(lines, grid)
     validate.instance("beam", beam, BeamWindow, type(None))
     validate.flag("motion_compensation", motion_compensation)
     workers = validate.count("workers", (os.cpu_count() or 1) if workers is None else workers)

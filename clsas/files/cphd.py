@@ -22,7 +22,9 @@ from scipy.constants import speed_of_light
 
 from clsas.core import reading, validate
 from clsas.core.extras import needed
+from clsas.core.georeference import Georeference
 from clsas.core.lines import RangeLines
+from clsas.core.reading import parse_json
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked_positions
 from clsas.signal.compression import Window, check_options
@@ -30,6 +32,8 @@ from clsas.signal.phase_history import from_phase_history
 
 SPEED, ORIGIN = "clsas.sound_speed_m_s", "clsas.origin_m"
 """Names of the collection parameters with which a CPHD file describes sonar data."""
+PLACE = "clsas.georeference"
+"""Name of the collection parameter with the georeference of lines, as JSON."""
 LOOK = "clsas.look_direction"
 """Name of the added parameter of every vector that stores where the elements look."""
 
@@ -155,7 +159,8 @@ def read_cphd(
     else:
         with _defects(path):
             lines = _lines_of_toa(signal, vectors, collection)
-    return checked_positions(path, replace(lines, look_direction=look))
+    lines = replace(lines, look_direction=look, georeference=collection.georeference)
+    return checked_positions(path, lines)
 
 
 @contextmanager
@@ -241,6 +246,7 @@ class _Collection:
     origin_m: NDArray[np.float64]
     speed_m_s: float
     is_own: bool
+    georeference: Georeference | None
 
     @classmethod
     def read(cls, tree: Any) -> _Collection:
@@ -260,6 +266,7 @@ class _Collection:
             origin_m=_vector(own.get(ORIGIN, "0 0 0").split()),
             speed_m_s=validate.positive("its speed", float(own.get(SPEED, speed_of_light)), "m/s"),
             is_own=SPEED in own,
+            georeference=_georeference(own.get(PLACE)),
         )
 
     @property
@@ -270,6 +277,16 @@ class _Collection:
     def local_m(self, position_m: NDArray) -> NDArray[np.float64]:
         """Return positions in local coordinates."""
         return (position_m.astype(np.float64) - self.centre_m) @ self.axes.T + self.origin_m
+
+
+def _georeference(text: str | None) -> Georeference | None:
+    """Return the georeference in a parameter of the collection."""
+    if text is None:
+        return None
+    try:
+        return Georeference(**parse_json(text.encode()))
+    except (TypeError, ValueError) as error:
+        raise FileFormatError(f"must have a georeference in {PLACE}: {error}") from None
 
 
 def _axes(scene: Any) -> NDArray[np.float64]:

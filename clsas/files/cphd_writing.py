@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import datetime
+import json
 import os
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from scipy.constants import speed_of_light
 from clsas.core import validate
 from clsas.core.atomic import replacing
 from clsas.core.lines import RangeLines
-from clsas.files.cphd import LOOK, ORIGIN, SPEED, sarkit_cphd
+from clsas.files.cphd import LOOK, ORIGIN, PLACE, SPEED, sarkit_cphd
 
 SUFFIXES = (".cphd",)
 """Suffix of CPHD files."""
@@ -68,8 +70,9 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
     -----
     The standard assumes the speed of light. Lines with another speed c are written with the same
     wavelengths and geometry: frequencies are multiplied by 299 792 458 m/s over c, so that any CPHD
-    processor forms the same image. A parameter of the collection stores c. The origin is at
-    latitude and longitude 0, with x pointing east, y north and z up. An added parameter of every
+    processor forms the same image. Parameters of the collection store c and the georeference, from
+    which `read_cphd` restores them. For other programs, the origin is at latitude and longitude 0,
+    with x pointing east, y north and z up. An added parameter of every
     vector stores its look direction, and the side of the track (SideOfTrack) follows from it; if it
     is unknown, the file states the left side, because the standard requires one. Times, velocities,
     polarization and the date are placeholders, since range lines lack them. Lines that still have
@@ -186,6 +189,8 @@ def _document(
         SPEED: repr(lines.sound_speed_m_s),
         ORIGIN: " ".join(repr(float(each)) for each in origin_m),
     }
+    if lines.georeference is not None:
+        own[PLACE] = json.dumps(asdict(lines.georeference))
     root["CollectionID"] = {
         "CollectorName": "clsas",
         "CoreName": "lines",

@@ -20,6 +20,7 @@ import numpy as np
 
 from clsas.core import reading, validate
 from clsas.core.atomic import replacing
+from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -34,6 +35,7 @@ _KINDS = {
     "image": Image,
     "echoes": Echoes,
     "pulse": Pulse,
+    "georeference": Georeference,
 }
 _SAVED = (Grid, RangeLines, Image, Echoes)
 

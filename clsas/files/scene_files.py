@@ -17,6 +17,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from clsas.core import reading, validate
+from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.version import __version__
 from clsas.files.mistakes import explain
@@ -37,8 +38,8 @@ class SceneFile:
     ----------
     name : str
         Origin of the scene, for messages.
-    sonar, track, grid
-        From the tables of these names.
+    sonar, track, grid, georeference
+        From the tables of these names. Track and grid have the georeference.
     targets : PointTargets, Seabed, or a tuple of both
         From the tables `targets` and `seabed`.
     simulate, compress, image : dict
@@ -60,6 +61,7 @@ class SceneFile:
     track: Track | None = None
     targets: Scene | None = None
     grid: Grid | None = None
+    georeference: Georeference | None = None
     simulate: dict[str, Any] = field(default_factory=dict)
     compress: dict[str, Any] = field(default_factory=dict)
     image: dict[str, Any] = field(default_factory=dict)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,6 +17,7 @@ from pydantic import Field
 
 from clsas.core import validate
 from clsas.exact.backprojection import BEST_ACCURACY_DB
+from clsas.files.georeference_table import GeoreferenceTable
 from clsas.files.grid_tables import GridTable
 from clsas.files.process_tables import ProcessTable
 from clsas.files.survey_tables import SonarTable, TrackTable
@@ -206,6 +208,7 @@ class SceneTables(Table):
     targets: list[_Target] | None = None
     seabed: _Seabed | None = None
     grid: GridTable | None = None
+    georeference: GeoreferenceTable | None = None
     simulate: _Simulate = _Simulate()
     compress: _Compress = _Compress()
     image: _Image = _Image()
@@ -237,11 +240,13 @@ class SceneTables(Table):
             "mosaic.lines": self.mosaic.lines,
             "process.lines": self.process.lines,
         }
+        place = self.georeference.build() if self.georeference else None
         return dict(
             sonar=self.sonar.build() if self.sonar else None,
-            track=self.track.build(folder) if self.track else None,
+            track=replace(self.track.build(folder), georeference=place) if self.track else None,
             targets=tuple(parts) if len(parts) > 1 else parts[0] if parts else None,
-            grid=self.grid.build(folder) if self.grid else None,
+            grid=replace(self.grid.build(folder), georeference=place) if self.grid else None,
+            georeference=place,
             simulate=self.simulate.build(),
             compress=self.compress.build(),
             image=self.image.build(),

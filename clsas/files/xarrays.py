@@ -11,6 +11,7 @@ import numpy as np
 from clsas.core import validate
 from clsas.core.decibels import largest_amplitude
 from clsas.core.extras import needed
+from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -25,6 +26,13 @@ _AXES = {
     "y": {"units": "m", "long_name": "Across-track"},
     "z": {"units": "m", "long_name": "Height", "positive": "up"},
 }
+_ON_MAP = {
+    "x": {"units": "m", "long_name": "Easting", "standard_name": "projection_x_coordinate"},
+    "y": {"units": "m", "long_name": "Northing", "standard_name": "projection_y_coordinate"},
+    "z": _AXES["z"],
+}
+GRID_MAPPING = "spatial_ref"
+"""Name of the coordinate that describes the map, as rioxarray calls it."""
 _NAMES = {
     "samples": "Samples",
     "tx_m": "Transmitter position",
@@ -43,6 +51,10 @@ def to_xarray(obj: Image) -> xarray.DataArray: ...
 def to_xarray(obj: Grid | RangeLines | Echoes) -> xarray.Dataset: ...
 def to_xarray(obj: Grid | RangeLines | Image | Echoes) -> xarray.DataArray | xarray.Dataset:
     """Return an object as an xarray DataArray or Dataset, with coordinates in metres.
+
+    An object with a georeference gets the coordinate `spatial_ref`, a grid mapping of the CF
+    conventions. Where x points east, x and y are easting and northing; otherwise `easting` and
+    `northing` of every pixel are further coordinates of images and grids.
 
     An image becomes a DataArray of its level in dB, relative to its largest amplitude. Neither
     pictures nor netCDF accept complex numbers. The complex pixels are therefore split into the
@@ -68,7 +80,7 @@ def to_xarray(obj: Grid | RangeLines | Image | Echoes) -> xarray.DataArray | xar
     Raises
     ------
     ImportError
-        If xarray is not installed.
+        If xarray is not installed, or the object has a georeference and pyproj is not.
     TypeError
         If `obj` is of another type.
 
@@ -108,6 +120,8 @@ def _image_to_xarray(xarray: ModuleType, image: Image) -> xarray.DataArray:
         "comment": "20 log10(amplitude / reference); minus infinity where a pixel is 0",
         "Conventions": "CF-1.11",
     }
+    if image.georeference is not None:
+        of_level["grid_mapping"] = GRID_MAPPING
     # DataArray would copy the coordinates; Dataset shares them.
     level = {"amplitude_db": (dims, image.db(), of_level)}
     return xarray.Dataset(level, coordinates)["amplitude_db"]
@@ -120,11 +134,38 @@ def _grid_dims(grid: Grid) -> tuple[str, ...]:
 
 
 def _grid_coordinates(grid: Grid) -> dict[str, Any]:
+    """Return the coordinates of a grid, and those on the map if it has a georeference."""
+    place = grid.georeference
+    if place is None:
+        return _coordinates(grid, _AXES)
+    known = _coordinates(grid, _ON_MAP if place.is_north_up else _AXES)
+    if not place.is_north_up:
+        on_map = np.moveaxis(place.to_map(grid.positions_m()), -1, 0)
+        for name, axis, values in zip(("easting", "northing"), "xy", on_map, strict=False):
+            known[name] = (_grid_dims(grid), values, dict(_ON_MAP[axis]))
+    return known | {GRID_MAPPING: ((), 0, grid_mapping(place))}
+
+
+def grid_mapping(place: Georeference) -> dict[str, Any]:
+    """Return the attributes of a grid mapping of the CF conventions.
+
+    Those whose names begin with `clsas_` restore the georeference.
+    """
+    of_map = place.map_crs().to_cf()
+    fields_given = {
+        f"clsas_{field.name}": getattr(place, field.name)
+        for field in fields(place)
+        if getattr(place, field.name) is not None
+    }
+    return {**of_map, "spatial_ref": of_map["crs_wkt"], **fields_given}
+
+
+def _coordinates(grid: Grid, words: dict[str, dict[str, str]]) -> dict[str, Any]:
     dims = _grid_dims(grid)
     if not grid.has_axes:
         positions = np.moveaxis(grid.positions_m(), -1, 0)
         return {
-            name: (dims, values, dict(_AXES[name]))
+            name: (dims, values, dict(words[name]))
             for name, values in zip("xyz", positions, strict=True)
         }
     x, y = grid.axes_m
@@ -132,9 +173,9 @@ def _grid_coordinates(grid: Grid) -> dict[str, Any]:
     if grid.height_m is not None:
         z = (dims, grid.positions_m()[..., 2])
     return {
-        "x": ("x", x, _AXES["x"] | {"axis": "X"}),
-        "y": ("y", y, _AXES["y"] | {"axis": "Y"}),
-        "z": (*z, dict(_AXES["z"])),
+        "x": ("x", x, words["x"] | {"axis": "X"}),
+        "y": ("y", y, words["y"] | {"axis": "Y"}),
+        "z": (*z, dict(words["z"])),
     }
 
 
@@ -142,7 +183,7 @@ def _channels_to_xarray(xarray: ModuleType, obj: RangeLines | Echoes) -> xarray.
     steps = np.arange(obj.samples.shape[1])
     if isinstance(obj, RangeLines):
         known = {"units": "m", "long_name": "Range from the first sample"}
-        offset = {"range_offset_m": ("sample", steps * obj.range_step_m, known)}
+        offset: dict[str, Any] = {"range_offset_m": ("sample", steps * obj.range_step_m, known)}
     else:
         known = {"units": "s", "long_name": "Time from the first sample"}
         offset = {"time_offset_s": ("sample", steps / obj.sample_rate_hz, known)}
@@ -155,6 +196,8 @@ def _channels_to_xarray(xarray: ModuleType, obj: RangeLines | Echoes) -> xarray.
             unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "1")
             known = {"long_name": _NAMES.get(name, name), "units": unit}
             variables[name] = (dims, value, known)
+        elif isinstance(value, Georeference):
+            offset[GRID_MAPPING] = ((), 0, grid_mapping(value))
         elif is_dataclass(value):
             attributes |= {
                 f"{name}_{part.name}": getattr(value, part.name) for part in fields(value)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core import validate
+from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.inspection.checks import CHECKS
@@ -96,6 +97,7 @@ def inspect(
     validate.instance("lines", lines, RangeLines, Echoes)
     if grid is not None:
         validate.instance("grid", grid, Grid)
+        placed(lines, grid)  # raises if the georeferences differ
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
     if element_length_m is not None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from clsas.core import validate
 from clsas.core.decibels import in_db
 from clsas.core.geometry import pairwise_range_m
+from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.wavelengths import band_wavelength_m, cycles_per_m_at, wavelength_m
@@ -80,6 +81,7 @@ class Survey:
         """Check the fields."""
         validate.instance("lines", self.lines, RangeLines)
         validate.instance("grid", self.grid, Grid)
+        placed(self.lines, self.grid)  # raises if the georeferences differ
         if self.beam is not None:
             validate.instance("beam", self.beam, BeamWindow)
         validate.instance("sonar", self.sonar, Sonar, type(None))

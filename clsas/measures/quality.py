@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
+from clsas.core.georeference import Georeference
 from clsas.core.grid import Axis, Grid
 from clsas.core.image import Image
 from clsas.measures.cuts import Cut, measure_cut
@@ -31,6 +32,8 @@ class PointResponse:
     azimuth, range : Cut
         Cuts through the peak along the columns and rows of the image: x and y of a horizontal
         plane, x and z of a vertical one.
+    georeference : Georeference or None
+        Where the image lies on Earth; its `to_geographic` takes the position.
     """
 
     x_m: float
@@ -39,6 +42,7 @@ class PointResponse:
     amplitude: float
     azimuth: Cut
     range: Cut
+    georeference: Georeference | None = None
 
     def __repr__(self) -> str:
         """Return a summary: position and amplitude of the peak, and the resolutions."""
@@ -150,6 +154,7 @@ def measure_point(
         amplitude=amplitude,
         azimuth=measure_cut(across, along_x, column, amplitude, extent_m),
         range=measure_cut(upward, along_y, row, amplitude, extent_m),
+        georeference=image.georeference,
     )
     highest_db = max(*response.azimuth.pslr_db, *response.range.pslr_db)
     if highest_db > 0:

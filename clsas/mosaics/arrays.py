@@ -263,6 +263,17 @@ def _raised(plane: Grid, height_m: NDArray[np.float64], attributes: dict[str, An
     return grid
 
 
+def _map_of(grid: Grid | None) -> dict[str, Any]:
+    """Return the map projection in the convention of GDAL, if x and y are easting and northing."""
+    place = None if grid is None else grid.georeference
+    if grid is None or place is None or place.crs is None or not grid.has_axes:
+        return {}
+    authority, _, code = place.crs.partition(":")
+    if authority == "EPSG" and code.isdigit():
+        return {"_CRS": {"url": f"http://www.opengis.net/def/crs/EPSG/0/{code}"}}
+    return {"_CRS": {"wkt": place.crs}} if "[" in place.crs else {}
+
+
 def _create_arrays(path: Path, grid: Grid | None, attributes: dict[str, Any]) -> None:
     """Create the groups and arrays of a mosaic: pixels, all zero, levels, coordinates, heights."""
     files = DurableStore(path)
@@ -281,6 +292,7 @@ def _create_arrays(path: Path, grid: Grid | None, attributes: dict[str, Any]) ->
         compressors=checksum,
         fill_value=0,
         dimension_names=names,
+        attributes=_map_of(grid),
     )
     for array in others:
         in_db = array.name == IN_DB

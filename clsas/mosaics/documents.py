@@ -16,6 +16,7 @@ from typing import Any
 
 from clsas.core import validate
 from clsas.core.atomic import make_folders, replacing
+from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.reading import parse_json, read_bytes
 from clsas.mosaics.levels import are_levels
@@ -150,7 +151,10 @@ def plane_of(attributes: Mapping[str, Any]) -> Grid | None:
     stored = attributes["grid"]
     if stored is None:
         return None
-    return Grid.oriented(**stored, shape=tuple(attributes["inputs"]["pixels"]))
+    inputs = attributes["inputs"]
+    place = inputs.get("georeference")  # stores of early versions lack it
+    georeference = None if place is None else Georeference(**place)
+    return Grid.oriented(**stored, shape=tuple(inputs["pixels"]), georeference=georeference)
 
 
 def check_inputs(inputs: Any, shape: Sequence[int] | None) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core import reprs, validate
+from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -293,8 +294,9 @@ def mosaic(
     ------
     TypeError, ValueError
         If an argument has the wrong type or is outside its limits, if the files of a folder do not
-        belong together, if the smallest patch does not fit into memory, or if `store` was made with
-        other inputs (the message names the differences).
+        belong together, if lines and grid have different georeferences, if the smallest patch does
+        not fit into memory, or if `store` was made with other inputs (the message names the
+        differences).
     FileFormatError, OSError
         If a file cannot be read or the store cannot be written.
     ImportError
@@ -356,6 +358,7 @@ def mosaic(
     if growth is not None:
         wait_for_first_file(growth)
     survey = open_survey(source if isinstance(source, RangeLines) else source.resolve())
+    grid = placed(survey.geometry, grid)
     visibility = SurveyVisibility.of(survey, beam)
     if growth is None:
         warn_behind(survey.geometry, grid, survey.last_range_m)

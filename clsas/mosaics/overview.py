@@ -99,5 +99,11 @@ def reduced(grid: Grid, reading: Reading, step: int) -> Image:
             power[first:last, start:stop] = blocks.mean(axis=1).mean(axis=2)
     origin_m, row_step_m, column_step_m = grid.vectors_m
     middle_m = (down - 1) / 2 * row_step_m + (across - 1) / 2 * column_step_m
-    coarse = Grid.oriented(origin_m + middle_m, row_step_m * down, column_step_m * across, shape)
+    coarse = Grid.oriented(
+        origin_m + middle_m,
+        row_step_m * down,
+        column_step_m * across,
+        shape,
+        georeference=grid.georeference,
+    )
     return Image(np.sqrt(power).astype(np.complex64), coarse)

@@ -17,6 +17,8 @@ from clsas.sonar.beam import BeamWindow
 REQUESTS = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
 """Requests for accuracy or a method, of which a mosaic takes at most one."""
 
+_ADDED = ("carrier_hz", "sound_speed_m_s")  # which stores of early versions lack
+
 
 class OtherInputsError(ValueError):
     """A store was made with other inputs than those given."""
@@ -30,6 +32,9 @@ def inputs_of(
         "parts": survey.digests(),
         "grid": grid_digest(grid),
         "pixels": list(grid.shape),
+        "carrier_hz": survey.geometry.carrier_hz,
+        "sound_speed_m_s": survey.geometry.sound_speed_m_s,
+        "georeference": None if grid.georeference is None else asdict(grid.georeference),
         "beam": None if beam is None else json.loads(beam_json(beam)),
         **{name: request.get(name) for name in REQUESTS},
     }
@@ -52,7 +57,7 @@ def differences(
         found.append("the range lines differ")
     for name, theirs in given.items():
         mine = stored.get(name)
-        if name == "parts":
+        if name == "parts" or (name in _ADDED and name not in stored):
             continue
         if name == "grid" and mine != theirs:
             if stored.get("pixels") == given["pixels"]:

@@ -222,7 +222,7 @@ def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
         If a file does not contain range lines.
     ValueError
         If there is no file, or if the files of a folder differ in carrier, sound speed or range
-        step, or only some of them have velocities.
+        step or georeference, or only some of them have velocities.
     OSError
         If a file cannot be read.
     """
@@ -287,6 +287,11 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
                     f"{path}: {name} must equal that of the survey's first file, {theirs:g}, got "
                     f"{ours:g}"
                 )
+        if geometry.georeference != found[0].georeference:
+            raise ValueError(
+                f"{path}: georeference must equal that of the survey's first file, "
+                f"{found[0].georeference}, got {geometry.georeference}"
+            )
         different = geometry.per_channel.keys() ^ found[0].per_channel.keys()
         for name in different - {_LOOK}:
             raise ValueError(f"{path}: {name} must be in all files of the survey or in none")

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from clsas.core import validate
 from clsas.core.contrast import contrast
+from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -181,6 +182,7 @@ def autofocus(
     """
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
+    placed(lines, grid)  # raises if the georeferences differ
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
     validate.progress(progress)

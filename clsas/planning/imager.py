@@ -9,6 +9,7 @@ from types import TracebackType
 from clsas.core import reprs, validate
 from clsas.core.decibels import in_db
 from clsas.core.digests import lines_digest
+from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -129,6 +130,7 @@ class Imager:
                 + ", ".join(validate.shown(value) for value in given)
             )
         validate.memory("grid", 8 * grid.size)
+        grid = placed(lines, grid)
         self.grid, self.plan, self.beam = grid, plan, beam
         self.device = open_device(device)
         self._former: Former | None
@@ -196,6 +198,7 @@ class Imager:
         """
         validate.instance("lines", lines, RangeLines)
         validate.progress(progress)
+        placed(lines, self.grid)  # raises if the georeferences differ
         if self._former is None:
             raise ValueError("the imager was closed; make another one")
         if accumulate is not None:

@@ -8,6 +8,7 @@ from dataclasses import InitVar, dataclass, field
 
 from clsas.aperture.filters import ALIGN_TAPS
 from clsas.core import validate
+from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.opencl.device import Device
@@ -65,6 +66,7 @@ class Request:
         """Check every argument, and combine those that go together."""
         validate.instance("lines", self.lines, RangeLines)
         validate.instance("grid", self.grid, Grid)
+        placed(self.lines, self.grid)  # raises if the georeferences differ
         if self.beam is not None:
             validate.instance("beam", self.beam, BeamWindow)
         given = [self.tolerance_db, tolerance_wavelengths, self.stages]

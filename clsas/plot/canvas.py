@@ -14,12 +14,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from clsas.core.georeference import Georeference
+
 SUFFIXES = (".png", ".pdf", ".svg")
 """Suffixes of the files that `save` writes."""
+PNG_DPI = 150.0
+"""Default pixels per inch of PNG files, for screens."""
+PADDING_IN = 0.1
+"""Margin around labels and axes in inches."""
 
 _NAMES = {"x": "Along-track", "y": "Across-track", "z": "Height"}
+_NAMES_ON_MAP = {"x": "Easting", "y": "Northing", "z": "Height"}
 _LEAST_DPI, _MOST_DPI = 10.0, 10_000.0  # below 10, letters have no pixels
-_PNG_DPI, _VECTOR_DPI = 150.0, 300.0  # for screens, and for the images on a printed page
+_VECTOR_DPI = 300.0  # for the images on a printed page
 _SETTINGS: Any = {
     "pdf.fonttype": 42,  # TrueType: publishers refuse matplotlib's default, Type 3
     "svg.hashsalt": "clsas",  # the same picture gives the same file
@@ -54,14 +61,16 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -
     validate.suffix("path", path, *SUFFIXES)
     kind = path.suffix.lower().removeprefix(".") or "png"
     if dpi is None:
-        dpi = _PNG_DPI if kind == "png" else _VECTOR_DPI
+        dpi = PNG_DPI if kind == "png" else _VECTOR_DPI
     dpi = validate.number("dpi", dpi, "pixels per inch", least=_LEAST_DPI, most=_MOST_DPI)
     import matplotlib as mpl
 
     options: Any = {"metadata": _DATES[kind]} if kind in _DATES else {}
     with replacing(path) as temporary, mpl.rc_context(_SETTINGS):
         # "tight" includes labels that the layout leaves outside, such as those of square axes.
-        figure.savefig(temporary, format=kind, dpi=dpi, bbox_inches="tight", **options)
+        figure.savefig(
+            temporary, format=kind, dpi=dpi, bbox_inches="tight", pad_inches=PADDING_IN, **options
+        )
 
 
 def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -> None:
@@ -115,7 +124,7 @@ def length_unit(length_m: float) -> tuple[float, str]:
     return (1e3, "mm") if length_m < 0.5 else (1.0, "m")
 
 
-def axis_label(name: str, unit: str, of: str = "") -> str:
+def axis_label(name: str, unit: str, of: str = "", place: Georeference | None = None) -> str:
     """Return the label of an axis, such as "Along-track (m)".
 
     Parameters
@@ -125,8 +134,11 @@ def axis_label(name: str, unit: str, of: str = "") -> str:
     unit : str
     of : str
         Words for the origin, as in "Along-track from the peak (mm)".
+    place : Georeference, optional
+        Where the axes lie on Earth; x and y of a map projection are easting and northing.
     """
-    return " ".join(filter(None, (_NAMES.get(name, f"Distance {name}"), of, f"({unit})")))
+    names = _NAMES_ON_MAP if place is not None and place.is_projected else _NAMES
+    return " ".join(filter(None, (names.get(name, f"Distance {name}"), of, f"({unit})")))
 
 
 def drawable(name: str, value: object) -> str:

@@ -65,7 +65,7 @@ def cuts(response: PointResponse, *, floor_db: float = -60.0, resolutions: float
         axes.set(
             xlim=(max(-reach, scale * cut.offset_m[0]), min(reach, scale * cut.offset_m[-1])),
             ylim=(floor_db, 3),
-            xlabel=axis_label(cut.axis, unit, "from the peak"),
+            xlabel=axis_label(cut.axis, unit, "from the peak", response.georeference),
             ylabel="Amplitude (dB re peak)",
         )
         axes.grid(alpha=0.3)

@@ -26,6 +26,7 @@ from clsas.plot.canvas import (
     with_fewer_colours,
 )
 from clsas.plot.colours import COLOUR_MAP, colour_map
+from clsas.plot.map_marks import draw_north, draw_scale_bar
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -118,6 +119,8 @@ def image(
     reference: float | None = None,
     colour_map: str | Colormap = COLOUR_MAP,
     colour_bar: bool = True,
+    north_arrow: bool = False,
+    scale_bar: bool = False,
     title: str = "",
 ) -> Axes:
     """Draw the amplitude of an image in dB over metres or millimetres.
@@ -127,7 +130,8 @@ def image(
     image : Image
         Image on a plane of any direction or a height map. The axes show the coordinates along
         columns and rows: x and y of a horizontal plane, x and z of a vertical one, and distances
-        along columns and rows of other planes. Units are millimetres if all coordinates are below
+        along columns and rows of other planes. If the georeference is a map projection, x is
+        labelled as easting and y as northing. Units are millimetres if all coordinates are below
         0.5 m, otherwise metres. Columns and rows are always drawn at right angles.
     axes : matplotlib.axes.Axes, optional
         Axes to draw into; by default those of a new pyplot figure, which notebooks and
@@ -145,6 +149,8 @@ def image(
         "cividis" and "gray" are perceptually even: equal steps in dB look equally large.
     colour_bar : bool
         True to draw the scale of levels beside the axes.
+    north_arrow, scale_bar : bool
+        True to draw an arrow to the north, which needs a georeference, and a bar of a round length.
     title : str
         Title above the axes.
 
@@ -157,8 +163,9 @@ def image(
     ImportError
         If matplotlib is not installed.
     TypeError, ValueError
-        If an argument has the wrong type or is out of bounds, or the image has arbitrary points
-        (`volume` draws those of a box).
+        If an argument has the wrong type or is out of bounds, the image has arbitrary points
+        (`volume` draws those of a box), or `north_arrow` is set for an image without a georeference
+        or on a vertical plane.
 
     See Also
     --------
@@ -169,7 +176,10 @@ def image(
     if image.grid.points_m is not None:
         raise ValueError("image must be on a plane or height map to be drawn, got points")
     scale = Scale(dynamic_range_db, percentiles, reference, colour_map)
-    validate.flag("colour_bar", colour_bar)
+    for name, flag in {
+        "colour_bar": colour_bar, "north_arrow": north_arrow, "scale_bar": scale_bar,
+    }.items():  # fmt: skip
+        validate.flag(name, flag)
     title = drawable("title", title)
     figure_class()  # raises if matplotlib is missing
     if axes is None:
@@ -184,10 +194,15 @@ def image(
     flat = height_per_width(image) < FLAT
     side = ("bottom" if flat else "right") if colour_bar else None
     draw_levels(axes, image.db(reference=reference), extent, scale, side)
-    axes.set(
-        xlabel=axis_label(across.name, unit), ylabel=axis_label(upward.name, unit), title=title
+    xlabel, ylabel = (
+        axis_label(axis.name, unit, place=image.georeference) for axis in (across, upward)
     )
+    axes.set(xlabel=xlabel, ylabel=ylabel, title=title)
     axes.set_aspect("equal" if min(image.shape) > 1 else "auto")
+    if north_arrow:
+        draw_north(axes, image.grid)
+    if scale_bar:
+        draw_scale_bar(axes, 1 / factor)
     return axes
 
 
@@ -199,8 +214,8 @@ def image_db(image: Image, *, title: str = "", **options: Any) -> Figure:
     image, title
         As for `image`.
     **options
-        Further arguments of `image`: `dynamic_range_db`, `percentiles`, `reference`, `colour_map`
-        and `colour_bar`.
+        Further arguments of `image`: `dynamic_range_db`, `percentiles`, `reference`, `colour_map`,
+        `colour_bar`, `north_arrow` and `scale_bar`.
 
     Raises
     ------

@@ -201,7 +201,9 @@ def _draw_track(axes: Axes, found: Inspection, grid: Grid | None) -> None:
     if outline is not None:
         places_m, style = outline
         axes.plot(*(scale * places_m[:, :2].T), style, linewidth=1.5, markersize=2, label="Grid")
-    axes.set(xlabel=axis_label("x", unit), ylabel=axis_label("y", unit), title="Track from above")
+    place = None if grid is None else grid.georeference
+    xlabel, ylabel = (axis_label(name, unit, place=place) for name in "xy")
+    axes.set(xlabel=xlabel, ylabel=ylabel, title="Track from above")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small", loc="best")

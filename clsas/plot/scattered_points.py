@@ -72,7 +72,8 @@ def points(
         s=float(np.clip(_DOTS / len(order), 0.5, 30.0)), linewidths=0, rasterized=True,
     )  # fmt: skip
     axes.set_facecolor(colours(0.0))
-    axes.set(xlabel=axis_label(across, unit), ylabel=axis_label(upward, unit), title=title)
+    xlabel, ylabel = (axis_label(name, unit, place=image.georeference) for name in (across, upward))
+    axes.set(xlabel=xlabel, ylabel=ylabel, title=title)
     axes.set_aspect("equal", adjustable="datalim")
     plain_ticks(axes)
     add_colour_bar(drawn, scale, level, ax=axes)

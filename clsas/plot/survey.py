@@ -73,8 +73,9 @@ def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
             markersize=2,
             label="Grid " + " × ".join(map(str, grid.shape)),
         )
-    across, upward = ("xyz"[coordinate] for coordinate in shown)
-    axes.set(xlabel=axis_label(across, unit), ylabel=axis_label(upward, unit), aspect="equal")
+    place = lines.georeference or (None if grid is None else grid.georeference)
+    xlabel, ylabel = (axis_label("xyz"[index], unit, place=place) for index in shown)
+    axes.set(xlabel=xlabel, ylabel=ylabel, aspect="equal")
     axes.set_adjustable("datalim")
     axes.grid(alpha=0.3)
     figure.legend(loc="outside lower center", ncols=3, fontsize="small")

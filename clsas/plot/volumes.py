@@ -116,9 +116,10 @@ def volume(
             panel.axvline(views[0][indices[across]], **line)
             panel.axhline(views[1][indices[upward]], **line)
     top, side, front = panels
-    top.set_ylabel(axis_label("y", unit))
-    side.set_xlabel(axis_label("z", unit))
-    front.set(xlabel=axis_label("x", unit), ylabel=axis_label("z", unit))
+    x, y, z = (axis_label(name, unit, place=image.georeference) for name in "xyz")
+    top.set_ylabel(y)
+    side.set_xlabel(z)
+    front.set(xlabel=x, ylabel=z)
     top.tick_params(labelbottom=False)  # the views below and to the left have these labels
     side.tick_params(labelleft=False)
     add_colour_bar(drawn, scale, box.level, cax=beside)

@@ -111,6 +111,8 @@ def options_of(step: str, scene: SceneFile) -> dict[str, Any]:
     options = dict(scene.process.get(step, {}))
     if step in ("inspect", "focus", "image", "mosaic"):
         options["grid"] = None if scene.grid is None else grid_digest(scene.grid)
+        if scene.georeference is not None:
+            options["georeference"] = str(scene.georeference)
         options["beam"] = scene.image.get("beam")
     if step == "inspect":
         options["element_length_m"] = None if scene.sonar is None else scene.sonar.element_length_m

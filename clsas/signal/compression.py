@@ -167,6 +167,7 @@ def compress(
         sound_speed_m_s=echoes.sound_speed_m_s,
         rx_velocity_m_s=echoes.rx_velocity_m_s,
         look_direction=echoes.look_direction,
+        georeference=echoes.georeference,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
+from clsas.core.georeference import Georeference
 from clsas.core.lines import checked_channels
 from clsas.sonar.system import Pulse
 
@@ -45,6 +46,8 @@ class Echoes:
         stop-and-hop.
     look_direction : array_like, [channels, 3] or [3], optional
         Direction in which the beam of each channel looks, as for `RangeLines`.
+    georeference : Georeference, optional
+        Where the coordinates lie on Earth.
 
     Raises
     ------
@@ -77,6 +80,7 @@ class Echoes:
     pulse: Pulse | None = None
     rx_velocity_m_s: NDArray[np.float64] | None = None
     look_direction: NDArray[np.float64] | None = None
+    georeference: Georeference | None = None
 
     if TYPE_CHECKING:  # the constructor converts array_like arguments
 
@@ -92,6 +96,7 @@ class Echoes:
             pulse: Pulse | None = None,
             rx_velocity_m_s: ArrayLike | None = None,
             look_direction: ArrayLike | None = None,
+            georeference: Georeference | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:

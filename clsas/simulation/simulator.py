@@ -183,7 +183,7 @@ def simulate(
         _add_noise(samples, float(snr_db), seed)
     return Echoes(
         samples, start, rate, pulse.carrier_hz, geometry.tx_m, geometry.rx_m, sound, pulse,
-        geometry.rx_velocity_m_s, look,
+        geometry.rx_velocity_m_s, look, track.georeference,
     )  # fmt: skip
 
 

@@ -1,12 +1,13 @@
 """Kill mosaics with SIGKILL over and over, and check that finished patches stay intact.
 
-    python scripts/attack/kills.py --kills 200 --workers 0 2
+    python scripts/attack/kills.py --kills 200 --workers 0 2 --exports 100
 
 Every run is killed at a random moment: while it starts, or after some patches. Either all of its
 processes are killed, or only the main process, or one worker. After every kill the finished patches
 and their levels must equal those of a mosaic that was never killed. After 10 kills the run may
 finish. The store must then equal the other bit by bit, with all levels, and there must be no
-temporary files. Otherwise the exit code is 1.
+temporary files. Exports of the finished mosaic as GeoTIFF are killed too: the file before must
+still be there, or the whole new one. In all other cases the exit code is 1.
 """
 
 from __future__ import annotations
@@ -146,6 +147,9 @@ def main() -> None:
         default=[0, 2],
         help="numbers of workers; 0 for a single process",
     )
+    parser.add_argument(
+        "--exports", type=int, default=100, help="number of kills of exports as GeoTIFF"
+    )
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     chance = random.Random(options.seed)
@@ -153,6 +157,8 @@ def main() -> None:
         with tempfile.TemporaryDirectory(prefix="kills-") as folder:
             for workers in options.workers:
                 attack(Path(folder), workers, options.kills, chance)
+            if options.exports:
+                attack_exports(Path(folder), options.exports, chance)
     except Miss as miss:
         sys.exit(f"MISS: {miss}")
     print("no miss")
@@ -194,6 +200,40 @@ def attack(folder: Path, workers: int, kills: int, chance: random.Random) -> Non
         "all bit-identical, no temporary file left",
         flush=True,
     )
+
+
+def attack_exports(folder: Path, kills: int, chance: random.Random) -> None:
+    """Kill exports at random moments until there have been `kills` kills."""
+    scene, store = write_scene(folder), folder / "exported.zarr"
+    subprocess.run(command(scene, store), check=True, capture_output=True)
+    maps = folder / "maps"
+    maps.mkdir()
+    made, old = maps / "map.tif", b"the file before"
+    arguments = [sys.executable, "-m", "clsas", "export", str(store), str(made)]
+    arguments += ["--crs", "EPSG:32632"]
+    start = time.monotonic()
+    subprocess.run(arguments, check=True, capture_output=True)
+    usual_s = time.monotonic() - start
+    whole = made.read_bytes()
+    done = finished = 0
+    while done < kills:
+        made.write_bytes(old)
+        process = subprocess.Popen(
+            arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+        )
+        time.sleep(chance.uniform(0, 1.1 * usual_s))
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            done += 1
+        else:
+            finished += 1
+        process.wait()
+        if made.read_bytes() not in (old, whole):
+            raise Miss("a killed export left a file that is neither the old nor the new one")
+    subprocess.run(arguments, check=True, capture_output=True)
+    if made.read_bytes() != whole or [each.name for each in maps.iterdir()] != [made.name]:
+        raise Miss("an export after the kills differs, or leaves files behind")
+    print(f"exports: {done} kills, {finished} finished before, each file whole, none left over")
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from scipy.constants import speed_of_light
 import clsas
 from clsas import cli
 from clsas.core import validate
+from clsas.core.georeference import Georeference
 from clsas.core.validate import ClsasWarning
 from clsas.files import cphd, cphd_writing
 from clsas.files.cphd import read_cphd
@@ -94,6 +95,14 @@ LOOKS = {
     "both": np.tile([[0, 1.0, 0], [0, -1.0, 0]], (30, 1)),
     "unknown": None,
 }
+
+
+def test_the_georeference_is_kept(tmp_path):
+    place = Georeference.local(60.39, 5.32, -12.5, heading_deg=217, vertical_datum="NN2000")
+    path = tmp_path / "lines.cphd"
+    write_cphd(path, replace(sonar_lines(), georeference=place))
+    assert findings(path) == {}
+    assert read_cphd(path).georeference == place
 
 
 @pytest.mark.parametrize("name", LOOKS)

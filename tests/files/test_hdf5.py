@@ -3,12 +3,14 @@ import hashlib
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
 
 from clsas.core import validate
+from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -17,6 +19,8 @@ from clsas.files.hdf5 import FileFormatError, load, read_geometry, read_samples,
 from clsas.signal.echoes import Echoes
 from clsas.sonar.system import Pulse
 
+UTM = Georeference(crs="EPSG:32632", vertical_datum="NN2000")
+LOCAL = Georeference.local(60.39, 5.32, 1 / 3, heading_deg=217)
 PLANE = Grid.plane(x=(1e6, 1e6 + 0.7, 5), y=(40, 41 / 3, 3), z=-1 / 3)
 
 
@@ -40,6 +44,9 @@ def objects():
         "oriented": Grid.oriented(noise(3), noise(3), noise(3), (2, 3)),
         "height map": PLANE.with_height(noise(3, 5)),
         "points": Grid.points(noise(2, 3, 4, 3)),
+        "local": Grid.points(noise(2, 3), georeference=LOCAL),
+        "projected": Image(complex_noise(random, 3, 5), replace(PLANE, georeference=UTM)),
+        "placed lines": RangeLines(samples, 1, 0.1, tx_m, rx_m, 0, 1500, georeference=LOCAL),
         "image": Image(complex_noise(random, 3, 5), PLANE),
         "image of points": Image(complex_noise(random, 7), Grid.points(noise(7, 3))),
         "lines": RangeLines(samples, noise(4), 1 / 3, tx_m, rx_m, 1e6 / 3, 1500.1),

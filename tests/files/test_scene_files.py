@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pydantic_core import PydanticUndefined
 
+import clsas
 from clsas.files import scene_files as config
 from clsas.files.mistakes import models_in
 from clsas.files.scene_tables import SceneTables
@@ -580,3 +581,25 @@ def test_the_recording_to_process_may_be_elsewhere(tmp_path):
     scene = config.read_scene(path)
     assert scene.grid.shape == (4, 3)
     assert scene.process["lines"] == tmp_path / "nowhere.h5"
+
+
+def test_a_georeference_places_track_and_grid():
+    course = (
+        "[track]\nstart_m = [0.0, 0.0, 0.0]\nvelocity_m_s = [1.0, 0.0, 0.0]\npings = 2\n"
+        "ping_interval_s = 1.0\n[grid]\nx = { start_m = 0.0, stop_m = 1.0, count = 2 }\n"
+        "y = { start_m = 0.0, stop_m = 1.0, count = 2 }\n"
+    )
+    local = "[georeference]\nlatitude_deg = 60.39\nlongitude_deg = 5.32\nheading_deg = 217.0\n"
+    scene = parse(course + local)
+    expected = clsas.Georeference.local(60.39, 5.32, heading_deg=217)
+    assert scene.georeference == scene.track.georeference == scene.grid.georeference == expected
+    pytest.importorskip("pyproj")
+    scene = parse('[georeference]\ncrs = "EPSG:32632"\nvertical_datum = "NN2000"')
+    assert scene.georeference == clsas.Georeference("EPSG:32632", vertical_datum="NN2000")
+    for text, message in (
+        ("heading_deg = 0.0\nlatitude_deg = 1.0", "missing key 'longitude_deg'"),
+        ('crs = "EPSG:32632"\nheading_deg = 0.0', "crs and heading_deg exclude each other"),
+        ('crs = "EPSG:99999"', "crs must be one that PROJ knows"),
+        ("latitude_deg = 151.0\nlongitude_deg = -33.0\nheading_deg = 0.0", "probably swapped"),
+    ):
+        assert message in refused(f"[georeference]\n{text}")

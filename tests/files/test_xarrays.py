@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -148,3 +149,25 @@ def test_names_and_units_are_those_of_the_documentation():
         assert array[name].attrs["long_name"]
     assert to_xarray(OBJECTS["oriented"]).x.dims == ("row", "column")
     assert to_xarray(OBJECTS["image of points"]).dims == ("point_0",)
+
+
+def test_places_are_grid_mappings():
+    rioxarray = pytest.importorskip("rioxarray")
+    assert rioxarray
+    utm = Georeference.projected("EPSG:32632")
+    grid = Grid.plane((500_000, 500_010, 11), (6_700_000, 6_700_004, 5), georeference=utm)
+    array = to_xarray(Image(np.ones((5, 11), complex), grid))
+    assert array.rio.crs.to_epsg() == 32632
+    assert array.rio.transform()[:6] == pytest.approx(utm.affine(grid))
+    assert array.x.attrs["long_name"] == "Easting"
+    local = Georeference.local(60.39, 5.32, heading_deg=217)
+    placed = replace(grid, georeference=local)
+    array = to_xarray(Image(np.ones((5, 11), complex), placed))
+    on_map = local.to_map(placed.positions_m())
+    np.testing.assert_array_equal(array.easting, on_map[..., 0])
+    np.testing.assert_array_equal(array.northing, on_map[..., 1])
+    assert array.x.attrs["long_name"] == "Along-track"
+    stored = {k: v for k, v in array.spatial_ref.attrs.items() if k.startswith("clsas_")}
+    assert Georeference(**{k.removeprefix("clsas_"): v for k, v in stored.items()}) == local
+    lines = RangeLines(np.ones((1, 9), complex), 1, 1, np.zeros(3), np.zeros(3), 0, 1500)
+    assert "spatial_ref" in to_xarray(replace(lines, georeference=local)).coords

@@ -3,15 +3,18 @@
 import json
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cases import along_x, lines_over
 from click.testing import CliRunner
+from stores import change
 
 import clsas
 from clsas.cli import main
+from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.mosaics.documents import is_intact, read_attributes, read_document
 from clsas.mosaics.store import Store
@@ -340,3 +343,25 @@ def test_patches_that_do_not_fit_in_memory_leave_no_store(path, tmp_path):
     with pytest.raises(ValueError, match="a patch of pixels must ask for at most"):
         new.begin(inputs, grid, grid.shape)
     assert not new.path.exists()
+
+
+def test_a_store_keeps_the_place_and_refuses_another(tmp_path):
+    utm = Georeference(crs="EPSG:32632")
+    path, places = tmp_path / "placed.zarr", {"utm": utm, "none": None}
+    grids = {name: replace(GRID, georeference=place) for name, place in places.items()}
+    clsas.mosaic(replace(LINES, georeference=utm), grids["none"], path, **REQUEST)
+    store = Store.opened(path)
+    assert store.grid.georeference == utm
+    assert store.overview(8).georeference == utm
+    url = "http://www.opengis.net/def/crs/EPSG/0/32632"
+    assert store.pixels.attrs["_CRS"] == {"url": url}
+    assert clsas.mosaic(LINES, grids["utm"], path, **REQUEST).grid.georeference == utm
+    with pytest.raises(ValueError, match=r"georeference is .* in the store, None given"):
+        clsas.mosaic(LINES, grids["none"], path, **REQUEST)
+
+
+def test_a_store_of_an_early_version_has_no_place(path):
+    inputs = read_document(path)["inputs"]
+    change(path, inputs={name: inputs[name] for name in inputs if name != "georeference"})
+    assert Store.opened(path).grid.georeference is None
+    assert len(clsas.mosaic(LINES, GRID, path, **REQUEST).finished) == 6

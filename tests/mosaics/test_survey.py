@@ -8,6 +8,7 @@ import pytest
 from cases import along_x, lines_over
 
 from clsas.core.geometry import pairwise_range_m
+from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.exact.backprojection import backproject
@@ -165,6 +166,9 @@ def test_errors(folder, tmp_path):
         open_survey(folder)
     save(folder / "3.h5", replace(LINES, rx_velocity_m_s=[1.0, 0, 0]))
     with pytest.raises(ValueError, match="rx_velocity_m_s must be in all files"):
+        open_survey(folder)
+    save(folder / "3.h5", replace(LINES, georeference=Georeference(crs="EPSG:32632")))
+    with pytest.raises(ValueError, match=r"3.h5: georeference must equal .* None, got EPSG:32632"):
         open_survey(folder)
     save(folder / "3.h5", GRID)
     with pytest.raises(FileFormatError, match="must contain range lines, got 'grid'"):

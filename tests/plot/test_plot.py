@@ -1,10 +1,12 @@
 import os
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from clsas import plot
+from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -246,3 +248,36 @@ def test_missing_matplotlib_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"pip install 'matplotlib>=3\.10'"):
         plot.image_db(IMAGE)
+
+
+def test_axes_of_a_map_are_easting_and_northing():
+    on_map = replace(GRID, georeference=Georeference(crs="EPSG:32632"))
+    axes = plot.image_db(Image(PIXELS, on_map), north_arrow=True, scale_bar=True).axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("Easting (m)", "Northing (m)")
+    response = measure_point(Image(PIXELS, on_map), (X[80], Y[60]))
+    labels = [axes.get_xlabel() for axes in plot.cuts(response).axes]
+    assert labels == ["Easting from the peak (mm)", "Northing from the peak (mm)"]
+    north, bar = axes.texts
+    assert (north.get_text(), bar.get_text()) == ("N", "0.5 m")
+    (line,) = axes.get_lines()
+    assert np.ptp(line.get_xdata()) == pytest.approx(0.5)
+    tip, tail = np.array(north.get_position()), np.array(north.xy)
+    np.testing.assert_allclose((tip - tail)[0], 0, atol=1e-12)
+    assert tip[1] > tail[1]
+
+
+def test_the_arrow_points_to_the_north_of_a_rotated_scene():
+    """The x axis heads south-west, so north is back and to starboard of it."""
+    local = Georeference.local(60.39, 5.32, heading_deg=217)
+    square = Grid.plane((0, 1, 50), (1, 0, 50), georeference=local)  # rows run backwards
+    axes = plot.image_db(Image(np.ones((50, 50), complex), square), north_arrow=True).axes[0]
+    (north,) = axes.texts
+    along = axes.transAxes.transform([north.get_position(), north.xy])
+    along = along[0] - along[1]
+    expected = np.radians([217.0])
+    np.testing.assert_allclose(
+        along / np.hypot(*along), [np.cos(expected[0]), np.sin(expected[0])], atol=1e-9
+    )
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("Along-track (m)", "Across-track (m)")
+    with pytest.raises(ValueError, match="north_arrow needs an image with a georeference"):
+        plot.image_db(IMAGE, north_arrow=True)

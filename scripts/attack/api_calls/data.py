@@ -18,7 +18,8 @@ def data(folder: Path) -> dict[str, Call]:
     part = slice(2, 10, 2)
     points = clsas.Grid.points(grid.positions_m().reshape(-1, 3))
     axis = (0.0, 1.0, 5)
-    unset = {"rx_velocity_m_s": ("None",), "look_direction": ("None",)}
+    unset = {"rx_velocity_m_s": ("None",), "look_direction": ("None",), "georeference": ("None",)}
+    place = {"georeference": clsas.Georeference.local(60.39, 5.32, heading_deg=217.0)}
     return {
         "Grid": Call(
             clsas.Grid,
@@ -29,10 +30,11 @@ def data(folder: Path) -> dict[str, Call]:
                 "shape": (3, 4),
                 "height_m": np.arange(12.0).reshape(3, 4),
                 "points_m": None,
+                **place,
             },
-            accepts={"height_m": ("None",)},
+            accepts={"height_m": ("None",), "georeference": ("None",)},
         ),
-        "Grid.plane": Call(clsas.Grid.plane, {"x": axis, "y": (10.0, 12.0, 6), "z": -1.5}),
+        "Grid.plane": Call(clsas.Grid.plane, {"x": axis, "y": (10.0, 12.0, 6), "z": -1.5, **place}),
         "Grid.oriented": Call(
             clsas.Grid.oriented,
             {
@@ -40,13 +42,16 @@ def data(folder: Path) -> dict[str, Call]:
                 "row_step_m": np.array([0.0, 0.1, 0.0]),
                 "column_step_m": np.array([0.1, 0.0, 0.0]),
                 "shape": (3, 4),
+                **place,
             },
         ),
         "Grid.height_map": Call(
             clsas.Grid.height_map,
-            {"x": axis, "y": (10.0, 12.0, 6), "height_m": np.arange(30.0).reshape(6, 5)},
+            {"x": axis, "y": (10.0, 12.0, 6), "height_m": np.arange(30.0).reshape(6, 5), **place},
         ),
-        "Grid.points": Call(clsas.Grid.points, {"points_m": np.arange(12.0).reshape(2, 2, 3)}),
+        "Grid.points": Call(
+            clsas.Grid.points, {"points_m": np.arange(12.0).reshape(2, 2, 3), **place}
+        ),
         "Grid.with_height": Call(grid.with_height, {"height_m": np.zeros(grid.shape)}),
         "Grid.at": Call(
             grid.at, {"index": np.array([0, 5, 479])}, accepts={"index": ("empty array",)}
@@ -57,7 +62,7 @@ def data(folder: Path) -> dict[str, Call]:
         "RangeLines": Call(
             clsas.RangeLines,
             fields(lines)
-            | {"rx_velocity_m_s": np.ones((40, 3)), "look_direction": np.ones((40, 3))},
+            | {"rx_velocity_m_s": np.ones((40, 3)), "look_direction": np.ones((40, 3)), **place},
             accepts=unset | {"samples": ("an Image",)},
         ),
         "RangeLines.select": Call(lines.select, {"channels": np.array([1, 5, 30])}),
@@ -90,7 +95,7 @@ def data(folder: Path) -> dict[str, Call]:
         "Echoes": Call(
             clsas.Echoes,
             fields(s.echoes)
-            | {"rx_velocity_m_s": np.ones((40, 3)), "look_direction": np.ones((40, 3))},
+            | {"rx_velocity_m_s": np.ones((40, 3)), "look_direction": np.ones((40, 3)), **place},
             accepts=unset | {"pulse": ("None",), "samples": ("an Image",)},
         ),
         "Replica": Call(

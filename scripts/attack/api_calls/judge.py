@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import clsas
-from api_calls import data, files, imaging, pictures, sonars
+from api_calls import data, files, imaging, maps, pictures, sonars
 from api_calls.scene import Call, objects, write_files
 from api_calls.scene import public as public
 from api_calls.values import (
@@ -32,12 +32,14 @@ GROUPS: dict[str, Callable[[Path], dict[str, Call]]] = {
     "files": files.files,
     "results": files.results,
     "pictures": pictures.pictures,
+    "maps": maps.maps,
 }
 """Function that returns the valid calls of each group, given a folder for their files."""
 
 ATTACKED = (
-    clsas.BeamWindow, clsas.Echoes, clsas.Grid, clsas.Image, clsas.PointTargets, clsas.Pointing,
-    clsas.Pulse, clsas.RangeLines, clsas.Replica, clsas.Seabed, clsas.Sonar, clsas.Track,
+    clsas.BeamWindow, clsas.Echoes, clsas.Georeference, clsas.Grid, clsas.Image,
+    clsas.PointTargets, clsas.Pointing, clsas.Pulse, clsas.RangeLines, clsas.Replica, clsas.Seabed,
+    clsas.Sonar, clsas.Track,
 )  # fmt: skip
 """Classes whose properties are also read if a call returns one of their objects."""
 

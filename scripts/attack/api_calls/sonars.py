@@ -21,6 +21,8 @@ def sonars(folder: Path) -> dict[str, Call]:
     observer = Observer(np.array([0.0, 0.0, 2.0]))
     pointing = clsas.Pointing.squint(0.1)
     optional = ("None",)
+    place = clsas.Georeference.local(60.39, 5.32, heading_deg=217.0)
+    unplaced = {"georeference": optional}
     sizes = ("tx_length_m", "rx_length_m", "tx_height_m", "rx_height_m")
     motions = ("surge_m", "sway_m", "heave_m", "yaw_rad", "pitch_rad", "roll_rad")
     return {
@@ -54,7 +56,7 @@ def sonars(folder: Path) -> dict[str, Call]:
         "Sonar.edgetech": Call(clsas.Sonar.edgetech, {}),
         "Sonar.sensotek": Call(clsas.Sonar.sensotek, {}),
         "Sonar.thesis_wide_beam": Call(clsas.Sonar.thesis_wide_beam, {}),
-        "Track": Call(clsas.Track, fields(s.track)),
+        "Track": Call(clsas.Track, fields(s.track) | {"georeference": place}, accepts=unplaced),
         "Track.straight": Call(
             clsas.Track.straight,
             {

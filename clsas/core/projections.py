@@ -1,0 +1,117 @@
+"""Map projections and geographic coordinates, which pyproj knows."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import validate
+from clsas.core.extras import needed
+
+if TYPE_CHECKING:
+    import pyproj
+
+_SEMI_MAJOR_M, _SQUARED_ECCENTRICITY = 6378137.0, 0.0066943799901413165  # WGS 84
+
+
+def checked(
+    latitude_deg: Any, longitude_deg: Any, shape: tuple[int | None, ...] | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return latitudes and longitudes, checked; longitudes are from -180 up to 180 degrees.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is outside its limits; the message says so if both are probably swapped.
+    """
+    if shape == ():
+        latitude = np.array(validate.number("latitude_deg", latitude_deg, "degrees"))
+        longitude = np.array(validate.number("longitude_deg", longitude_deg, "degrees"))
+    else:
+        latitude = validate.array("latitude_deg", latitude_deg, np.float64, shape)
+        longitude = validate.array("longitude_deg", longitude_deg, np.float64, shape)
+    farthest = np.abs(latitude).max(initial=0.0)
+    if farthest > 90:
+        hint = ""
+        if farthest <= 360 and np.abs(longitude).max(initial=0.0) <= 90:
+            hint = "; latitude_deg and longitude_deg are probably swapped"
+        raise ValueError(
+            f"latitude_deg must be from -90 to 90 degrees, got {_worst(latitude):.10g}{hint}"
+        )
+    if longitude.size and (longitude.min() < -180 or longitude.max() > 360):
+        raise ValueError(
+            f"longitude_deg must be from -180 to 360 degrees, got {_worst(longitude):.10g}"
+        )
+    return latitude, np.where(longitude >= 180, longitude - 360, longitude)
+
+
+def alike(*arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Return latitudes, longitudes and perhaps heights, broadcast to the same shape."""
+    try:
+        return np.broadcast_arrays(*arrays)
+    except ValueError:
+        names = ("latitude_deg", "longitude_deg", "height_m")[: len(arrays)]
+        raise ValueError(
+            f"{', '.join(names)} must have the same shape, got "
+            f"{', '.join(str(each.shape) for each in arrays)}"
+        ) from None
+
+
+def _worst(values: NDArray[np.float64]) -> float:
+    """Return the value that is farthest from 0."""
+    return float(values.reshape(-1)[np.abs(values).argmax()])
+
+
+@lru_cache(maxsize=32)
+def known(name: str) -> pyproj.CRS:
+    """Return a projected coordinate reference system in metres; raise ValueError for others."""
+    with needed("coordinate reference systems"):
+        import pyproj
+        from pyproj.exceptions import CRSError
+    try:
+        found = pyproj.CRS.from_user_input(name)
+    except CRSError as error:
+        reason = str(error).partition("(Internal Proj Error: ")[2].rstrip(")") or "not a CRS"
+        raise ValueError(
+            f"crs must be one that PROJ knows, such as 'EPSG:32632', got {validate.shown(name)} "
+            f"({reason})"
+        ) from None
+    if not found.is_projected:
+        kind = "a geographic one" if found.is_geographic else "another kind"
+        raise ValueError(
+            f"crs must be a projection with easting and northing in metres, such as 'EPSG:32632', "
+            f"got {kind}: {validate.shown(name)}; for latitudes and longitudes use "
+            "Georeference.local"
+        )
+    units = {axis.unit_name for axis in found.axis_info}
+    if units - {"metre"}:
+        raise ValueError(
+            f"crs must be in metres, got {validate.shown(name)} in {', '.join(sorted(units))}"
+        )
+    return found
+
+
+@lru_cache(maxsize=32)
+def centred_on(latitude_deg: float, longitude_deg: float, height_m: float) -> pyproj.CRS:
+    """Return the transverse Mercator projection of WGS 84 centred on an origin.
+
+    Its scale there is that of the height, relative to the ellipsoid.
+    """
+    with needed("coordinate reference systems"):
+        from pyproj.crs import ProjectedCRS
+        from pyproj.crs.coordinate_operation import TransverseMercatorConversion
+    sine = math.sin(math.radians(latitude_deg))
+    # Gaussian radius of curvature
+    radius_m = _SEMI_MAJOR_M * math.sqrt(1 - _SQUARED_ECCENTRICITY)
+    radius_m /= 1 - _SQUARED_ECCENTRICITY * sine**2
+    conversion = TransverseMercatorConversion(
+        latitude_natural_origin=latitude_deg,
+        longitude_natural_origin=longitude_deg,
+        scale_factor_natural_origin=1 + height_m / radius_m,
+    )
+    name = f"Transverse Mercator about {latitude_deg:.8g}, {longitude_deg:.9g} (WGS 84)"
+    return ProjectedCRS(conversion, name=name, geodetic_crs="EPSG:4326")

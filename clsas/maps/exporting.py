@@ -1,0 +1,287 @@
+"""Export of images and mosaics to the files that other programs open."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from typing import Any
+
+from clsas.core import validate
+from clsas.core.georeference import Georeference
+from clsas.core.image import Image
+from clsas.core.lines import RangeLines
+from clsas.core.version import __version__
+from clsas.maps import geotiff, netcdf, world_files
+from clsas.maps.encoding import KINDS
+from clsas.maps.geotiff import Options, Progress
+from clsas.maps.orientation import Orientation
+from clsas.maps.sources import Source
+from clsas.mosaics.store import Store
+from clsas.plans.plan import Plan
+from clsas.plot.canvas import SUFFIXES as PICTURES
+from clsas.plot.colours import COLOUR_MAP
+from clsas.plot.levels import DYNAMIC_RANGE_DB
+
+SUFFIXES = (*geotiff.SUFFIXES, *netcdf.SUFFIXES, *PICTURES)
+"""Suffixes of the files that `export` writes."""
+
+
+def export(
+    source: Image | Store | str | os.PathLike,
+    path: str | os.PathLike,
+    *,
+    kind: str | None = None,
+    dynamic_range_db: float | None = None,
+    reference: float | None = None,
+    colour_map: str | None = None,
+    north_up: bool = False,
+    pixel_m: float | None = None,
+    georeference: Georeference | None = None,
+    plan: Plan | None = None,
+    lines: RangeLines | None = None,
+    north_arrow: bool = False,
+    scale_bar: bool = False,
+    progress: Progress | None = None,
+) -> None:
+    """Write an image or a mosaic as a file that other programs open.
+
+    The suffix of `path` determines the format:
+
+    - ``.tif``, a cloud-optimized GeoTIFF, for programs of maps. Its overviews are means of power.
+      A mosaic is read window by window and may be larger than memory.
+    - ``.nc``, a netCDF 4 file after the CF conventions, with level, real and imaginary parts.
+    - ``.png``, ``.pdf`` or ``.svg``, a picture as `clsas.plot.image_db` draws it. A PNG of an image
+      with a georeference gets a world file (``.pgw``) and a file with the coordinate reference
+      system (``.png.aux.xml``).
+
+    Parameters
+    ----------
+    source : Image, Store or path-like
+        Image, finished mosaic, or path of a file or store that contains one.
+    path : path-like
+        File to write. An existing one is replaced in one step.
+    kind : {"db", "complex", "8bit"}, optional
+        Pixels of a GeoTIFF: the amplitude in dB (float32, NaN where nothing was received; the
+        default), complex numbers (complex64), or 8-bit levels with a colour table.
+    dynamic_range_db : float, optional
+        Level of the first colour below that of the last one, for 8-bit levels and pictures; by
+        default 60 dB.
+    reference : float, optional
+        Amplitude of 0 dB. By default 1 for "db", so that maps of one survey agree, and the largest
+        amplitude for 8-bit levels and pictures.
+    colour_map : str, optional
+        Colours of 8-bit levels and pictures, as for `clsas.plot.image`; by default "inferno".
+    north_up : bool
+        True to resample a GeoTIFF so that its columns run east and its rows south. By default
+        pixels are kept, and the transform of the file states how they are rotated.
+    pixel_m : float, optional
+        With `north_up`, the size of the new pixels, metres; by default the distance of the image's.
+    georeference : Georeference, optional
+        Where the image lies on Earth, if it has no georeference of its own.
+    plan : Plan, optional
+        Plan of the image. Its tolerance, predicted error and stages become tags of the file. A
+        mosaic knows its own.
+    lines : RangeLines, optional
+        Range lines of the image. Their carrier and sound speed become tags of the file.
+    north_arrow, scale_bar : bool
+        True to draw an arrow to the north and a scale bar into a picture.
+    progress : callable, optional
+        Called as progress(done, total) while a GeoTIFF is written.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument has the wrong type, is outside its limits or has no effect on the format; if
+        a GeoTIFF has no georeference, its coordinate reference system is unknown, its grid is
+        vertical or consists of points, or complex pixels are to be resampled; or if a mosaic is
+        damaged, not finished, or changes meanwhile.
+    FileFormatError
+        If the file at `source` does not contain an image.
+    ImportError
+        If a package is missing (extra `maps`; `plot` for pictures and colours).
+    OSError
+        If a file cannot be read or written, for example on a full disk. Nothing is then written.
+
+    Warns
+    -----
+    ClsasWarning
+        If 8-bit levels leave out the heights of a height map.
+
+    See Also
+    --------
+    Georeference : Where an image lies on Earth.
+    save : Write an image to HDF5, bit for bit.
+    to_xarray : The same contents as netCDF, in memory.
+
+    Notes
+    -----
+    Rows and columns of a GeoTIFF are reversed or exchanged so that the image is never mirrored,
+    and its rows run from north to south as far as that is possible without resampling. Pixels in dB
+    of a height map have the heights as their second band.
+
+    With `north_up`, power is interpolated bilinearly. Complex pixels are not resampled, since
+    their phase cannot be interpolated where pixels are larger than a quarter of a wavelength: form
+    the image on the grid of `Georeference.north_up` instead.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> clsas.export("image.h5", "image.tif")  # doctest: +SKIP
+    >>> clsas.export(clsas.Store.opened("mosaic.zarr"), "mosaic.tif", kind="8bit")  # doctest: +SKIP
+    """
+    path = validate.path("path", path)
+    validate.suffix("path", path, *SUFFIXES)
+    suffix = path.suffix.lower()
+    if not suffix:
+        raise ValueError(f"path must end in one of {', '.join(SUFFIXES)}, got {path}")
+    given: dict[str, Any] = {
+        "kind": kind,
+        "dynamic_range_db": dynamic_range_db,
+        "reference": reference,
+        "colour_map": colour_map,
+        "north_up": validate.flag("north_up", north_up) or None,
+        "pixel_m": pixel_m,
+        "plan": plan,
+        "lines": lines,
+        "north_arrow": validate.flag("north_arrow", north_arrow) or None,
+        "scale_bar": validate.flag("scale_bar", scale_bar) or None,
+    }
+    _check(given, suffix)
+    validate.instance("georeference", georeference, Georeference, type(None))
+    validate.progress(progress)
+    opened = _opened(source)
+    if suffix in PICTURES:
+        picture = {name: value for name, value in given.items() if value is not None}
+        world_files.write_picture(path, _placed(opened, georeference), picture)
+        return
+    found = Source.of(opened, georeference)
+    tags = _tags(found, plan, lines)
+    if suffix in netcdf.SUFFIXES:
+        netcdf.write(path, found, tags)
+        return
+    _check_map(found, given)
+    options = Options(
+        kind=kind or "db",
+        north_up=north_up,
+        pixel_m=given["pixel_m"],
+        dynamic_range_db=given["dynamic_range_db"] or DYNAMIC_RANGE_DB,
+        reference=given["reference"],
+        colour_map=colour_map or COLOUR_MAP,
+    )
+    geotiff.write(path, found, options, tags, progress)
+
+
+def _check(given: dict[str, Any], suffix: str) -> None:
+    """Raise TypeError or ValueError for options that are wrong, or have no effect on a format."""
+    kind = given["kind"]
+    if kind is not None:
+        validate.one_of("kind", kind, KINDS)
+    for name in ("reference", "pixel_m"):
+        if given[name] is not None:
+            given[name] = validate.positive(name, given[name], "m" if name == "pixel_m" else "")
+    if given["dynamic_range_db"] is not None:
+        given["dynamic_range_db"] = validate.dynamic_range_db(given["dynamic_range_db"])
+    if given["colour_map"] is not None:
+        validate.text("colour_map", given["colour_map"])
+    validate.instance("plan", given["plan"], Plan, type(None))
+    validate.instance("lines", given["lines"], RangeLines, type(None))
+    drawn = {"dynamic_range_db", "reference", "colour_map"}
+    if suffix in geotiff.SUFFIXES:
+        known = {"kind", "north_up", "plan", "lines"}
+        known |= {"pixel_m"} if given["north_up"] else set()
+        known |= {"8bit": drawn, "complex": set()}.get(kind or "db", {"reference"})
+        what = f"{suffix} of kind {kind or 'db'!r}"
+        if not given["north_up"]:
+            what += " without north_up"
+    elif suffix in netcdf.SUFFIXES:
+        known, what = {"plan", "lines"}, suffix
+    else:
+        known, what = drawn | {"north_arrow", "scale_bar"}, suffix
+    unused = [name for name, value in given.items() if value is not None and name not in known]
+    if unused:
+        raise ValueError(f"{unused[0]} must be left out, since it has no effect on {what}")
+
+
+def _opened(source: Image | Store | str | os.PathLike) -> Image | Store:
+    """Return an image or a store, read from a path if one is given."""
+    if isinstance(source, Image | Store):
+        return source
+    path = validate.path("source", source)
+    if path.is_dir():
+        return Store.opened(path)
+    from clsas.files.formats import load
+
+    found = load(path)
+    if not isinstance(found, Image):
+        raise ValueError(f"source must contain an image, but {path} has {type(found).__name__}")
+    return found
+
+
+def _check_map(source: Source, given: dict[str, Any]) -> None:
+    """Raise ValueError for images that a GeoTIFF cannot show."""
+    grid = source.grid
+    if grid.points_m is not None:
+        raise ValueError("source must be on a plane or height map for a GeoTIFF, got points")
+    if grid.georeference is None:
+        raise ValueError(
+            "source must have a georeference for a GeoTIFF, since a map needs a place on Earth: "
+            "give georeference (on the command line --origin and --heading-deg, or --crs), or form "
+            "the image by a scene with a table [georeference]"
+        )
+    turned = Orientation.of((grid.shape[0], grid.shape[1]), grid.georeference.affine(grid))
+    resamples = given["north_up"] and (given["pixel_m"] is not None or not turned.is_north_up)
+    if given["kind"] == "complex" and resamples:
+        raise ValueError(
+            "north_up must be off for complex pixels, whose phase cannot be interpolated: form the "
+            "image on the grid of Georeference.north_up, or export it rotated"
+        )
+    if grid.height_m is not None and given["kind"] == "8bit":
+        validate.warn(
+            "8-bit levels leave out the heights of the grid; the kind 'db' has them as second band"
+        )
+
+
+def _tags(source: Source, plan: Plan | None, lines: RangeLines | None) -> dict[str, str]:
+    """Return what is known of an image's origin, as tags of a file."""
+    place, inputs = source.grid.georeference, source.inputs
+    errors = [r.predicted_error_db for r in source.records.values() if r.has_pixels]
+    known: dict[str, Any] = {
+        "CLSAS_VERSION": __version__,
+        "CARRIER_HZ": inputs.get("carrier_hz"),
+        "SOUND_SPEED_M_S": inputs.get("sound_speed_m_s"),
+        "TOLERANCE_DB": inputs.get("tolerance_db"),
+        "ACCURACY_DB": inputs.get("accuracy_db"),
+        "PREDICTED_ERROR_DB": max((e for e in errors if e is not None), default=None),
+        "PATCHES": len(source.records) or None,
+    }
+    if lines is not None:
+        known |= {"CARRIER_HZ": lines.carrier_hz, "SOUND_SPEED_M_S": lines.sound_speed_m_s}
+    if plan is not None:
+        known |= {
+            "TOLERANCE_DB": plan.tolerance_db,
+            "PREDICTED_ERROR_DB": plan.predicted_error_db,
+            "PLAN": repr(plan),
+        }
+    if place is not None:
+        known["VERTICAL_DATUM"] = place.vertical_datum
+        if not place.is_projected:
+            known |= {
+                "ORIGIN_LATITUDE_DEG": place.latitude_deg,
+                "ORIGIN_LONGITUDE_DEG": place.longitude_deg,
+                "ORIGIN_HEIGHT_M": place.height_m,
+                "X_AXIS_HEADING_DEG": place.heading_deg,
+            }
+    return {
+        name: value if isinstance(value, str) else f"{value:.12g}"
+        for name, value in known.items()
+        if value is not None
+    }
+
+
+def _placed(source: Image | Store, georeference: Georeference | None) -> Image:
+    """Return the image that a picture shows, with the georeference of the export."""
+    found = Source.of(source, georeference)
+    shown = source.overview() if isinstance(source, Store) else source
+    if shown.georeference == found.grid.georeference:
+        return shown
+    return Image(shown.pixels, replace(shown.grid, georeference=found.grid.georeference))

@@ -1,0 +1,406 @@
+"""Cloud-optimized GeoTIFF of images and mosaics, written window by window in bounded memory.
+
+GDAL's driver for cloud-optimized files copies a file and its overviews in the required order. The
+file and each overview are first written here, since GDAL would average decibels or complex numbers
+instead of power.
+"""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import math
+import os
+import shutil
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import reprs
+from clsas.core.atomic import assembling
+from clsas.core.extras import needed
+from clsas.maps.encoding import Encoding, colour_table
+from clsas.maps.orientation import Orientation
+from clsas.maps.resampling import Resampling, north_up, steps_m
+from clsas.maps.sources import Source, windows_of
+
+SUFFIXES = (".tif", ".tiff")
+"""Suffixes of GeoTIFF files."""
+
+_MOST_FINER = 16  # times that new pixels may be smaller than the image's: a plain choice
+_TILE = 512  # side of a tile in pixels, as GDAL and web servers prefer
+_CACHE_MB = 128  # GDAL's cache of tiles: a plain choice; its default is a share of the memory
+_COMPRESSION: dict[str, dict[str, str]] = {
+    "complex": {"COMPRESS": "NONE"},  # noise does not compress
+    "db": {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "LEVEL": "1"},
+    "8bit": {"COMPRESS": "DEFLATE", "PREDICTOR": "NO"},
+}
+
+_FULL_BYTES = 1 << 24  # free space of a disk on which a write failed because it is full
+# Free space per pixel that an export needs at least, in bytes: the file, its overviews and, for
+# complex pixels, which are not compressed, their copy.
+_SPACE_BYTES = {"complex": 21, "db": 9, "8bit": 6}
+
+Progress = Callable[[int, int], object]
+
+
+@dataclass(frozen=True)
+class Options:
+    """How an image becomes a GeoTIFF.
+
+    Attributes
+    ----------
+    kind : str
+        One of `clsas.maps.encoding.KINDS`.
+    north_up : bool
+        True to resample the image on the axes of the map.
+    pixel_m : float or None
+        Size of the pixels then, metres; None for the distance of the image's.
+    dynamic_range_db : float
+    reference : float or None
+        Amplitude of 0 dB; None for 1, or for the largest amplitude if the kind is "8bit".
+    colour_map : str
+    """
+
+    kind: str
+    north_up: bool
+    pixel_m: float | None
+    dynamic_range_db: float
+    reference: float | None
+    colour_map: str
+
+
+def write(
+    path: Path, source: Source, options: Options, tags: dict[str, str], progress: Progress | None
+) -> None:
+    """Write a cloud-optimized GeoTIFF; an existing file is replaced in one step.
+
+    Raises
+    ------
+    ValueError
+        If the grid is vertical, or the source is damaged or changes.
+    OSError
+        If the file cannot be written, for example on a full disk.
+    ImportError
+        If rasterio or pyproj is not installed, or matplotlib for 8-bit levels.
+    """
+    with needed("GeoTIFF files"):
+        import rasterio
+    colours = colour_table(options.colour_map) if options.kind == "8bit" else None
+    with assembling(path) as folder, rasterio.Env(GDAL_CACHEMAX=_CACHE_MB):
+        _check_space(folder, _SPACE_BYTES[options.kind] * source.grid.size)
+        try:
+            _Export(folder, source, options, progress).write(folder / path.name, tags, colours)
+        except Exception as error:
+            if not type(error).__module__.startswith("rasterio"):
+                raise
+            # GDAL prints the cause of a failed write, but does not report it.
+            if shutil.disk_usage(folder).free < _FULL_BYTES:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
+            raise OSError(errno.EIO, f"GDAL cannot write the file ({error})") from error
+        source.check_unchanged()
+
+
+def _check_space(folder: Path, least_bytes: int) -> None:
+    """Raise OSError if a folder has too little space. GDAL's own message would be less clear."""
+    free_bytes = shutil.disk_usage(folder).free
+    if free_bytes < least_bytes:
+        raise OSError(
+            errno.ENOSPC,
+            f"the export needs {reprs.quantity(least_bytes, 'bytes')} of free space in the folder "
+            f"of the file, which has {reprs.quantity(free_bytes, 'bytes')}",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """An overview, or the raster itself.
+
+    Attributes
+    ----------
+    amplitude : Path
+        File with its amplitudes.
+    path : Path
+        File with its encoded pixels, which may be the same.
+    shape : (rows, columns)
+    height_m : ndarray or None
+        Heights of its pixels.
+    """
+
+    amplitude: Path
+    path: Path
+    shape: tuple[int, int]
+    height_m: NDArray | None = None
+
+    def below(self, folder: Path) -> _Level | None:
+        """Return the overview with half as many rows and columns, or None if none is needed."""
+        if max(self.shape) <= _TILE:
+            return None
+        # GDAL finds the overviews of a file in file.ovr, and further ones in file.ovr.ovr.
+        path = self.path.with_name(f"{self.path.name}.ovr")
+        shape = (self.shape[0] + 1) // 2, (self.shape[1] + 1) // 2
+        heights = None if self.height_m is None else _halved(self.height_m)
+        return _Level(folder / f"amplitude-{shape[0]}-{shape[1]}.tif", path, shape, heights)
+
+
+class _Steps:
+    """Pixels done of all passes over an image, for a progress bar."""
+
+    def __init__(self, progress: Progress | None, total: int) -> None:
+        self._progress, self._total, self._done = progress, total, 0
+
+    def add(self, pixels: int) -> None:
+        self._done += pixels
+        if self._progress is not None:
+            self._progress(min(self._done, self._total), self._total)
+
+
+class _Export:
+    """One export: the passes over the image, with files in a temporary folder."""
+
+    def __init__(
+        self, folder: Path, source: Source, options: Options, progress: Progress | None
+    ) -> None:
+        place = source.grid.georeference
+        assert place is not None  # the caller has checked it
+        self._folder, self._source, self._options = folder, source, options
+        self._crs = place.wkt()
+        shape = source.grid.shape
+        self._turned = Orientation.of((shape[0], shape[1]), place.affine(source.grid))
+        self._shape, self._affine = self._turned.shape, self._turned.affine
+        self._largest = 0.0
+        height_m = source.grid.height_m
+        self._height_m: NDArray | None = None
+        if height_m is not None and options.kind != "8bit":
+            self._height_m = self._turned.turned(height_m)
+        self._steps = _Steps(progress, 4 * source.grid.size)
+
+    def write(self, path: Path, tags: dict[str, str], colours: dict | None) -> None:
+        """Write the file from the passes: read, resample, encode with overviews, and copy."""
+        is_complex = self._options.kind == "complex"
+        first = self._folder / "first.tif"
+        self._read(first, np.complex64 if is_complex else np.float32)
+        resamples = not self._turned.is_north_up or self._options.pixel_m is not None
+        if self._options.north_up and resamples:
+            first = self._resampled(first)
+        reference = self._options.reference
+        if reference is None:
+            reference = self._largest if self._options.kind == "8bit" and self._largest else 1.0
+        encoding = Encoding(self._options.kind, reference, self._options.dynamic_range_db)
+        base = self._levels(first, encoding, tags, colours)
+        self._copy(base, path)
+        _check_whole(path)
+
+    def _read(self, path: Path, dtype: Any) -> None:
+        """Write the pixels, or their amplitudes, in the order of the raster."""
+        with self._created(path, self._shape, dtype) as file:
+            for rows, columns in self._source.windows():
+                pixels = self._source.read(rows, columns)
+                amplitude = np.abs(pixels)
+                self._largest = max(self._largest, float(amplitude.max()))
+                given = pixels if dtype is np.complex64 else amplitude
+                self._put(file, self._turned.window(rows, columns), self._turned.turned(given))
+                self._steps.add(pixels.size)
+        _check_whole(path)
+
+    def _resampled(self, given: Path) -> Path:
+        """Write the amplitudes on the axes of the map; return the file."""
+        finest_m = min(steps_m(self._affine))
+        pixel_m = self._options.pixel_m or finest_m
+        if pixel_m < finest_m / _MOST_FINER:
+            raise ValueError(
+                f"pixel_m must be at least the distance of the pixels over {_MOST_FINER}, "
+                f"{finest_m / _MOST_FINER:g} m, got {pixel_m:g} m"
+            )
+        shape, affine = north_up(self._shape, self._affine, pixel_m)
+        resampling = Resampling(self._shape, self._affine, affine)
+        heights = None if self._height_m is None else np.empty(shape, np.float32)
+        self._shape, self._affine = shape, affine
+        path = self._folder / "north_up.tif"
+        share = self._source.grid.size / (shape[0] * shape[1])
+        with _opened(given) as file, self._created(path, shape, np.float32) as new:
+            for rows, columns in windows_of(shape, (_TILE, _TILE)):
+                values = resampling.at(rows, columns, lambda *part: _get(file, part))
+                self._put(new, (rows, columns), values)
+                if heights is not None:
+                    heights[rows, columns] = resampling.at(
+                        rows, columns, self._heights_at, of_power=False
+                    )
+                self._steps.add(int(values.size * share))
+        _check_whole(path)
+        given.unlink()
+        self._height_m = heights
+        return path
+
+    def _heights_at(self, rows: slice, columns: slice) -> NDArray:
+        """Return the heights of a window of the raster, metres."""
+        assert self._height_m is not None
+        return self._height_m[rows, columns]
+
+    def _levels(
+        self, first: Path, encoding: Encoding, tags: dict[str, str], colours: dict | None
+    ) -> Path:
+        """Write the encoded file and its overviews beside it; return the file."""
+        base = self._folder / "base.tif"
+        level: _Level | None = _Level(first, base, self._shape, self._height_m)
+        if encoding.kind == "complex" and self._height_m is None:  # encoded already
+            level = _Level(first.rename(base), base, self._shape)
+        while level is not None:
+            below = level.below(self._folder)
+            self._encode(level, below, encoding)
+            if level.path == base:
+                self._describe(base, encoding, tags, colours)
+            if level.amplitude != level.path:
+                level.amplitude.unlink()
+            level = below
+        return base
+
+    def _encode(self, level: _Level, below: _Level | None, encoding: Encoding) -> None:
+        """Write a level from its amplitudes, and the amplitudes of the level below it."""
+        with ExitStack() as opened:
+            file = opened.enter_context(_opened(level.amplitude))
+            encoded = smaller = None
+            if level.path != level.amplitude:
+                encoded = opened.enter_context(self._created_for(level, encoding))
+            if below is not None:
+                smaller = opened.enter_context(
+                    self._created(below.amplitude, below.shape, np.float32)
+                )
+            for rows, columns in windows_of(level.shape):
+                values = _get(file, (rows, columns))
+                if encoded is not None:
+                    pixels = values if values.dtype.kind == "c" else encoding.encode(values)
+                    self._put(encoded, (rows, columns), pixels)
+                    if level.height_m is not None:
+                        self._put(encoded, (rows, columns), level.height_m[rows, columns], band=2)
+                if smaller is not None:
+                    halves = (slice(p.start // 2, (p.stop + 1) // 2) for p in (rows, columns))
+                    self._put(smaller, tuple(halves), _mean_power(np.abs(values)))
+                self._steps.add(values.size * 3 // 4)
+        for written in (level.path, None if below is None else below.amplitude):
+            if written is not None:
+                _check_whole(written)
+
+    def _describe(
+        self, path: Path, encoding: Encoding, tags: dict[str, str], colours: dict | None
+    ) -> None:
+        """Add tags, colours and the meaning of the bands to a file."""
+        with _opened(path, "r+") as file:
+            file.update_tags(**tags)
+            words = {
+                "complex": "Complex pixels",
+                "db": f"Amplitude (dB re {encoding.reference:.9g})",
+                "8bit": f"Amplitude (dB re {encoding.reference:.9g})",
+            }
+            heights = ["Height (m)"] * (file.count - 1)
+            file.descriptions = [words[encoding.kind], *heights]
+            file.units = ["" if encoding.kind == "complex" else "dB", *["m"] * (file.count - 1)]
+            if colours is not None:
+                file.write_colormap(1, colours)
+                scale, offset = encoding.scale_and_offset
+                file.scales, file.offsets = (scale,), (offset,)
+
+    def _copy(self, base: Path, path: Path) -> None:
+        """Copy a file with its overviews in the order of a cloud-optimized file."""
+        from rasterio.shutil import copy
+
+        copy(
+            base, path, driver="COG", OVERVIEWS="FORCE_USE_EXISTING", BLOCKSIZE=_TILE,
+            BIGTIFF="IF_SAFER", NUM_THREADS="ALL_CPUS", **_COMPRESSION[self._options.kind],
+        )  # fmt: skip
+        self._steps.add(4 * self._source.grid.size)
+
+    def _created_for(self, level: _Level, encoding: Encoding) -> Any:
+        """Return a new file for the pixels of a level, open for writing."""
+        bands = 1 if level.height_m is None else 2
+        return self._created(level.path, level.shape, encoding.dtype, bands, encoding.nodata)
+
+    def _created(
+        self,
+        path: Path,
+        shape: tuple[int, int],
+        dtype: Any,
+        bands: int = 1,
+        nodata: float | None = None,
+    ) -> Any:
+        """Return a new file of plain tiles, open for writing, that covers the whole raster."""
+        import rasterio
+
+        a, b, c, d, e, f = self._affine
+        across, down = self._shape[1] / shape[1], self._shape[0] / shape[0]
+        affine = rasterio.Affine(a * across, b * down, c, d * across, e * down, f)
+
+        tiles = math.prod(math.ceil(n / _TILE) for n in shape)
+        _check_space(self._folder, bands * tiles * _TILE**2 * np.dtype(dtype).itemsize)
+        tiled = {"tiled": True, "blockxsize": _TILE, "blockysize": _TILE, "BIGTIFF": "YES"}
+        return rasterio.open(
+            path, "w", driver="GTiff", height=shape[0], width=shape[1], count=bands, dtype=dtype,
+            crs=self._crs, transform=affine, nodata=nodata,
+            INTERLEAVE="BAND", **tiled,
+        )  # fmt: skip
+
+    def _put(self, file: Any, window: Any, values: NDArray, band: int = 1) -> None:
+        from rasterio.windows import Window
+
+        file.write(
+            np.ascontiguousarray(values, file.dtypes[0]), band, window=Window.from_slices(*window)
+        )
+
+
+def _opened(path: Path, mode: str = "r") -> Any:
+    import rasterio
+
+    return rasterio.open(path, mode)
+
+
+def _get(file: Any, window: tuple[slice, slice]) -> NDArray:
+    """Return a window of the first band of a file."""
+    from rasterio.windows import Window
+
+    return file.read(1, window=Window.from_slices(*window))
+
+
+def _mean_power(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the amplitude of the mean power of 2 x 2 pixels, of those where it is not 0."""
+    received = amplitude != 0
+    power = _summed(amplitude.astype(np.float64) ** 2)
+    count = _summed(received.astype(np.uint8))
+    return np.sqrt(power / np.maximum(count, 1)).astype(np.float32)
+
+
+def _halved(values: NDArray) -> NDArray:
+    """Return the means of 2 x 2 values; fewer at the last row and column of odd shapes."""
+    return (_summed(values) / _summed(np.ones(values.shape, np.uint8))).astype(np.float32)
+
+
+def _summed(values: NDArray) -> NDArray:
+    """Return the sums of 2 x 2 values; fewer at the last row and column of odd shapes."""
+    odd = [n % 2 for n in values.shape]
+    even = np.pad(values, [(0, n) for n in odd]) if any(odd) else values
+    rows = even[::2] + even[1::2]
+    return rows[:, ::2] + rows[:, 1::2]
+
+
+def _check_whole(path: Path) -> None:
+    """Raise OSError if a file or an overview in it lacks a tile.
+
+    GDAL does not report a full disk if it notices that only when a file is closed.
+    """
+    size_bytes = path.stat().st_size
+    with _opened(path) as file:
+        for band in range(1, file.count + 1):
+            for level in (None, *range(len(file.overviews(band)))):
+                factor = 1 if level is None else 2 ** (level + 1)
+                down, across = (math.ceil(n / factor / _TILE) for n in file.shape)
+                for row, column in itertools.product(range(down), range(across)):
+                    place, length = (
+                        int(file.get_tag_item(f"{name}_{column}_{row}", "TIFF", band, level) or 0)
+                        for name in ("BLOCK_OFFSET", "BLOCK_SIZE")
+                    )
+                    if not place or place + length > size_bytes:
+                        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

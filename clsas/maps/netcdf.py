@@ -1,0 +1,87 @@
+"""netCDF 4 files of images, after the CF conventions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clsas.core import validate
+from clsas.core.atomic import replacing
+from clsas.core.extras import needed
+from clsas.core.image import Image
+from clsas.core.version import __version__
+from clsas.files.xarrays import GRID_MAPPING, to_xarray
+from clsas.maps.sources import Source
+
+if TYPE_CHECKING:
+    import xarray
+
+SUFFIXES = (".nc",)
+"""Suffix of netCDF files."""
+
+_BYTES = 40  # memory of a pixel: complex number, level, coordinates, and the file in memory
+_ALONG = {"x": "Along-track", "y": "Across-track"}
+
+
+def write(path: Path, source: Source, tags: dict[str, str]) -> None:
+    """Write a netCDF 4 file; an existing file is replaced in one step.
+
+    Raises
+    ------
+    ValueError
+        If the image does not fit into memory.
+    ImportError
+        If xarray or h5netcdf is not installed, or pyproj for an image with a georeference.
+    OSError
+        If the file cannot be written.
+    """
+    with needed("netCDF files"):
+        import h5netcdf  # noqa: F401  xarray's message would not say how to install it
+        import xarray  # noqa: F401
+    validate.memory("the image as netCDF", _BYTES * source.grid.size)
+    pixels = source.read(slice(None), slice(None)) if source.image is None else source.image.pixels
+    data = _dataset(Image(pixels, source.grid), tags)
+    source.check_unchanged()
+    # HDF5 does not recover from a full disk, so the file is assembled in memory.
+    content = data.to_netcdf(engine="h5netcdf")
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _dataset(image: Image, tags: dict[str, str]) -> xarray.Dataset:
+    """Return an image with coordinates of the CF conventions."""
+    grid = image.grid
+    array = to_xarray(image)
+    reference = array.attrs["reference"]
+    array.attrs = {name: v for name, v in array.attrs.items() if name != "Conventions"}
+    data = array.to_dataset().reset_coords(["pixels_real", "pixels_imag"])
+    if grid.georeference is not None:
+        for name in data.data_vars:
+            data[name].attrs["grid_mapping"] = GRID_MAPPING
+        if grid.has_axes and not grid.georeference.is_north_up:
+            data = _with_places_on_map(data)
+    origin: dict[str, Any] = {
+        "Conventions": "CF-1.11",
+        "title": "Synthetic aperture image",
+        "source": f"clsas {__version__}",
+        "reference_amplitude": reference,
+        **{name.lower(): value for name, value in tags.items()},
+    }
+    compressed = {"zlib": True, "complevel": 1, "shuffle": True}
+    for name in data.data_vars:
+        data[name].encoding = {**compressed, "_FillValue": None}
+    for name in data.coords:
+        data[name].encoding = {"_FillValue": None}
+    return data.assign_attrs(origin)
+
+
+def _with_places_on_map(data: xarray.Dataset) -> xarray.Dataset:
+    """Return an image along a track with rows and columns as dimensions.
+
+    Programs take x and y for easting and northing if there is a grid mapping. The distances along
+    and across the track therefore get other names.
+    """
+    renamed = data.rename_dims(x="column", y="row").rename_vars(x="along_track", y="across_track")
+    for name in ("along_track", "across_track"):
+        del renamed[name].attrs["axis"]
+    return renamed.reset_index(["along_track", "across_track"], drop=False)

@@ -1,0 +1,159 @@
+"""Resampling of amplitudes on grids whose rows and columns are the axes of the map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from clsas.core.map_grids import Affine, cover
+
+_CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
+_MOST_AVERAGED = 16  # samples per pixel and axis; coarser pixels are refused
+
+
+def north_up(
+    shape: tuple[int, int], affine: Affine, pixel_m: float
+) -> tuple[tuple[int, int], Affine]:
+    """Return the shape and the transform of the smallest north-up raster that covers another one.
+
+    Edges of its pixels are at whole multiples of their size, so that neighbouring maps fit.
+
+    Parameters
+    ----------
+    shape : (rows, columns)
+    affine : tuple of float
+        Transform from columns and rows to easting and northing.
+    pixel_m : float
+        Size of the new pixels, metres.
+    """
+    left, bottom, rows, columns = cover(shape, affine, pixel_m)
+    return (rows, columns), (
+        *(pixel_m, 0.0, left * pixel_m),
+        *(0.0, -pixel_m, (bottom + rows) * pixel_m),
+    )
+
+
+def steps_m(affine: Affine) -> tuple[float, float]:
+    """Return the distances between rows and between columns of a raster, metres."""
+    a, b, _, d, e, _ = affine
+    return math.hypot(b, e), math.hypot(a, d)
+
+
+class Resampling:
+    """Amplitudes of a raster at the pixels of another one, by interpolation of power.
+
+    Power is interpolated bilinearly between pixels where something was received. New pixels that
+    are larger than the old ones are means of several interpolated powers.
+
+    Parameters
+    ----------
+    shape : (rows, columns)
+        Shape of the given raster.
+    affine : tuple of float
+        Its transform.
+    onto : tuple of float
+        Transform of the new raster.
+    """
+
+    def __init__(self, shape: tuple[int, int], affine: Affine, onto: Affine) -> None:
+        self._shape = shape
+        a, b, c, d, e, f = affine
+        forward = np.array([[a, b, c], [d, e, f], [0, 0, 1]])
+        p, q, r, s, t, u = onto
+        self._to_source = np.linalg.inv(forward) @ np.array([[p, q, r], [s, t, u], [0, 0, 1]])
+        finest = min(steps_m(affine))
+        self._averaged = max(math.ceil(max(steps_m(onto)) / finest - 1e-6), 1)
+        if self._averaged > _MOST_AVERAGED:
+            raise ValueError(
+                f"pixel_m must be at most {_MOST_AVERAGED} times the distance of the pixels, "
+                f"{_MOST_AVERAGED * finest:g} m, got {max(steps_m(onto)):g} m"
+            )
+
+    def at(
+        self,
+        rows: slice,
+        columns: slice,
+        read: Callable[[slice, slice], NDArray[np.float32]],
+        *,
+        of_power: bool = True,
+    ) -> NDArray[np.float32]:
+        """Return a window of the new raster, [rows, columns].
+
+        Parameters
+        ----------
+        rows, columns : slice
+        read : callable
+            Called as read(rows, columns); returns a window of the given raster.
+        of_power : bool
+            True to interpolate the squares of amplitudes that are not 0; False to interpolate the
+            values themselves, such as heights.
+        """
+        count = self._averaged
+        matrix, offset = self._from_samples(rows, columns)
+        shape = (rows.stop - rows.start) * count, (columns.stop - columns.start) * count
+        inside = self._inside(matrix, offset, shape)
+        if inside is not None and not inside.any():
+            return np.zeros((shape[0] // count, shape[1] // count), np.float32)
+        corners = offset + [matrix @ [i * (shape[0] - 1), j * (shape[1] - 1)] for i, j in _CORNERS]
+        parts = [
+            slice(max(math.floor(low), 0), min(math.ceil(high) + 1, most))
+            for low, high, most in zip(
+                corners.min(axis=0), corners.max(axis=0), self._shape, strict=True
+            )
+        ]
+        # Samples within half a pixel of the border may lie beyond the outermost centres.
+        parts = [
+            slice(min(part.start, most - 1), max(part.stop, 1))
+            for part, most in zip(parts, self._shape, strict=True)
+        ]
+        values = read(*parts).astype(np.float64)
+        first = np.array([part.start for part in parts])
+
+        def interpolated(given: NDArray[np.float64]) -> NDArray[np.float64]:
+            return ndimage.affine_transform(
+                given, matrix, offset - first, shape, order=1, mode="nearest"
+            )
+
+        received = values != 0 if of_power else np.ones(values.shape, bool)
+        total = interpolated(values**2 if of_power else values)
+        weight = np.ones(shape) if received.all() else interpolated(received.astype(np.float64))
+        if inside is not None:
+            total *= inside
+            weight *= inside
+        blocks = shape[0] // count, count, shape[1] // count, count
+        total, weight = (each.reshape(blocks).sum(axis=(1, 3)) for each in (total, weight))
+        seen = weight >= count**2 / 2  # at least half of the pixel
+        mean = np.divide(total, weight, out=np.zeros_like(total), where=seen)
+        return (np.sqrt(mean) if of_power else mean).astype(np.float32)
+
+    def _from_samples(
+        self, rows: slice, columns: slice
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the matrix and offset from samples of a window to indices of the given raster."""
+        to, count = self._to_source, self._averaged
+        # Sample s of a row lies at row + (s + 0.5)/count; indices count from the centre of pixels.
+        centre = np.array([columns.start, rows.start]) + 0.5 / count
+        column, row = to[:2, :2] @ centre + to[:2, 2] - 0.5
+        matrix = np.array([[to[1, 1], to[1, 0]], [to[0, 1], to[0, 0]]]) / count
+        return matrix, np.array([row, column])
+
+    def _inside(
+        self, matrix: NDArray[np.float64], offset: NDArray[np.float64], shape: tuple[int, int]
+    ) -> NDArray[np.bool_] | None:
+        """Return which samples lie on pixels of the given raster; None if all do."""
+        ends = offset + [matrix @ [i * (shape[0] - 1), j * (shape[1] - 1)] for i, j in _CORNERS]
+        most = np.array(self._shape) - 0.5
+        if (ends >= -0.5).all() and (ends <= most).all():
+            return None
+        if (ends.max(axis=0) < -0.5).any() or (ends.min(axis=0) > most).any():
+            return np.zeros(shape, bool)
+        down, across = np.ogrid[: shape[0], : shape[1]]
+        inside = np.ones(shape, bool)
+        for axis in (0, 1):
+            place = offset[axis] + matrix[axis, 0] * down + matrix[axis, 1] * across
+            inside &= (place >= -0.5) & (place <= most[axis])
+        return inside

@@ -1,0 +1,89 @@
+"""Pictures, and the files that place them on a map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from clsas.core.atomic import replacing
+from clsas.core.image import Image
+from clsas.core.map_grids import Affine
+from clsas.plot import image_db
+from clsas.plot.canvas import PADDING_IN, PNG_DPI, length_unit, save
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def write_picture(path: Path, image: Image, options: dict[str, Any]) -> None:
+    """Write a picture of an image. A PNG of a georeferenced image gets two files beside it.
+
+    These are a world file (.pgw) and GDAL's auxiliary file (.png.aux.xml), which has the coordinate
+    reference system. If they cannot be written, the picture remains.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed, or pyproj for the coordinate reference system.
+    ValueError
+        If the image is vertical and has a georeference.
+    OSError
+        If a file cannot be written.
+    """
+    figure = image_db(image, **options)
+    place = image.georeference
+    if path.suffix.lower() != ".png" or place is None or image.grid.points_m is not None:
+        save(figure, path)
+        return
+    wkt = place.wkt()
+    affine = _of_picture(figure, image)
+    save(figure, path)
+    a, b, c, d, e, f = affine
+    # World files count from the centre of the first pixel.
+    centre = c + (a + b) / 2, f + (d + e) / 2
+    lines = "".join(f"{number!r}\n" for number in (a, d, b, e, *centre))
+    with replacing(path.with_suffix(".pgw")) as temporary:
+        temporary.write_text(lines)
+    numbers = ", ".join(repr(number) for number in (c, a, b, f, d, e))
+    described = (
+        f"<PAMDataset>\n  <SRS>{escape(wkt)}</SRS>\n"
+        f"  <GeoTransform>{numbers}</GeoTransform>\n</PAMDataset>\n"
+    )
+    with replacing(path.with_name(f"{path.name}.aux.xml")) as temporary:
+        temporary.write_text(described)
+
+
+def _of_picture(figure: Figure, image: Image) -> Affine:
+    """Return the transform from dots of the saved picture to easting and northing."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure.set_dpi(PNG_DPI)  # the layout depends on it
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    axes = figure.axes[0]
+    # What `save` writes: the figure with its labels, and a margin.
+    box = figure.get_tightbbox(canvas.get_renderer()).padded(PADDING_IN)
+    left, top = box.x0 * PNG_DPI, box.y0 * PNG_DPI + int(box.height * PNG_DPI)
+    dots = np.array([[left, top], [left + 1, top], [left, top - 1]])
+    shown = axes.transData.inverted().transform(dots)
+    origin, right, down = (_on_map(image, *place) for place in shown)
+    (a, d), (b, e) = right - origin, down - origin
+    return float(a), float(b), float(origin[0]), float(d), float(e), float(origin[1])
+
+
+def _on_map(image: Image, across: float, upward: float) -> np.ndarray:
+    """Return easting and northing of a place on the axes of a picture."""
+    grid = image.grid
+    assert grid.georeference is not None
+    sides = grid.sides
+    factor, _ = length_unit(max(float(np.abs(side.places_m).max()) for side in sides))
+    column, row = (
+        (place / factor - side.places_m[0]) / (side.step_m or 1.0)
+        for place, side in zip((across, upward), sides, strict=True)
+    )
+    a, b, c, d, e, f = grid.georeference.affine(grid)
+    column, row = column + 0.5, row + 0.5
+    return np.array([a * column + b * row + c, d * column + e * row + f])

@@ -1,0 +1,116 @@
+"""The command `clsas export`."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from placed import UTM_NORTH, local, scene
+from stores import LINES, PLANE
+
+import clsas
+from clsas.cli import main
+
+rasterio = pytest.importorskip("rasterio")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with an image that has a place, and one that has none."""
+    image, _ = scene(local(217.0))
+    clsas.save(tmp_path / "image.h5", image)
+    nowhere = clsas.Image(image.pixels, replace(image.grid, georeference=None))
+    clsas.save(tmp_path / "nowhere.h5", nowhere)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(*arguments):
+    done = CliRunner().invoke(main, ["export", *map(str, arguments)], catch_exceptions=False)
+    return done.exit_code, done.output
+
+
+def test_an_image_becomes_a_map(folder):
+    code, output = run("image.h5", "a.tif", "--as", "8bit", "--db", 40, "--north-up", "--json")
+    assert code == 0
+    said = json.loads(output)
+    assert said["file"] == "a.tif"
+    assert said["bytes"] == (folder / "a.tif").stat().st_size
+    with rasterio.open(folder / "a.tif") as file:
+        assert file.dtypes == ("uint8",)
+        assert file.transform.b == 0
+        assert file.scales[0] == pytest.approx(40 / 254)
+    code, output = run("image.h5", "a.nc")
+    assert (code, output[:6]) == (0, "a.nc: ")
+
+
+def test_options_place_an_image(folder):
+    for options, place in (
+        (("--origin", "60.39,5.32,-12", "--heading-deg", 217), local(217.0)),
+        (("--crs", "EPSG:32632"), UTM_NORTH),
+    ):
+        assert run("nowhere.h5", "a.tif", *options)[0] == 0
+        with rasterio.open(folder / "a.tif") as file:
+            expected = rasterio.crs.CRS.from_wkt(place.wkt())
+            assert file.crs == expected
+    clsas.save("lines.h5", LINES)
+    plan = clsas.plan(LINES, PLANE, tolerance_db=-40)
+    (folder / "plan.json").write_text(plan.to_json())
+    assert run("image.h5", "a.tif", "--plan", "plan.json", "--lines", "lines.h5")[0] == 0
+    with rasterio.open(folder / "a.tif") as file:
+        assert float(file.tags()["TOLERANCE_DB"]) == -40
+        assert float(file.tags()["CARRIER_HZ"]) == LINES.carrier_hz
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("nowhere.h5", "a.tif"), 1, "source must have a georeference for a GeoTIFF"),
+        (("nowhere.h5", "a.tif", "--origin", "60,5"), 2, "must be given together"),
+        (("nowhere.h5", "a.tif", "--origin", "x"), 2, "LATITUDE,LONGITUDE in degrees"),
+        (("nowhere.h5", "a.tif", "--crs", "EPSG:1", "--origin", "60,5"), 2, "--crs excludes"),
+        (("nowhere.h5", "a.tif", "--crs", "EPSG:99999"), 1, "crs must be one that PROJ knows"),
+        (
+            ("nowhere.h5", "a.tif", "--origin", "151.2,-33.9", "--heading-deg", 0), 1,
+            "are probably swapped",
+        ),
+        (("image.h5", "a.tif", "--crs", "EPSG:32632"), 1, "georeference must be left out"),
+        (("image.h5", "a.bmp"), 2, "must end in .tif or .tiff or .nc or .png"),
+        (("image.h5", "a.nc", "--as", "db"), 1, "kind must be left out"),
+        (("image.h5", "image.h5"), 2, "must be two files"),
+        (("none.h5", "a.tif"), 2, "does not exist"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_one_message(folder, arguments, code, message):
+    found, output = run(*arguments)
+    assert (found, message in output) == (code, True), output
+    assert not (folder / "a.tif").exists()
+
+
+def test_images_keep_the_place_of_a_scene(folder):
+    """From the scene file over the command line to the map."""
+    (folder / "scene.toml").write_text(
+        "[georeference]\nlatitude_deg = 60.39\nlongitude_deg = 5.32\nheading_deg = 217.0\n"
+        "[grid]\nx = { start_m = -1.0, stop_m = 1.0, count = 11 }\n"
+        "y = { start_m = 30.0, stop_m = 31.0, count = 6 }\n"
+    )
+    clsas.save("lines.h5", LINES)
+    for options in ((), ("--x", "-1:1:11", "--y", "30:31:6")):
+        arguments = ["image", "lines.h5", "--scene", "scene.toml", "-o", "new.h5", *options]
+        done = CliRunner().invoke(main, [*arguments, "--exact"], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+        image = clsas.load("new.h5")
+        assert image.georeference == clsas.Georeference.local(60.39, 5.32, heading_deg=217)
+        assert np.abs(image.pixels).max() > 0
+
+
+def test_show_draws_the_marks_of_a_map(folder, figures):
+    command = ["show", "image.h5", "--north-arrow", "--scale-bar"]
+    assert CliRunner().invoke(main, command, catch_exceptions=False).exit_code == 0
+    (figure,) = figures
+    assert [text.get_text() for text in figure.axes[0].texts] == ["N", "10 m"]
+    clsas.save("lines.h5", LINES)
+    done = CliRunner().invoke(main, ["show", "lines.h5", "--scale-bar"])
+    assert done.exit_code == 2
+    assert "--scale-bar cannot be used with range lines" in done.output

@@ -1,0 +1,100 @@
+"""netCDF files, and pictures with world files."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from placed import TARGET_M, UTM_NORTH, at, local, scene
+
+import clsas
+
+rasterio = pytest.importorskip("rasterio")
+xarray = pytest.importorskip("xarray")
+pytest.importorskip("h5netcdf")
+
+
+@pytest.mark.parametrize("place", [UTM_NORTH, local(90.0), local(217.0), None], ids=str)
+def test_netcdf_restores_the_image_and_its_place(place, tmp_path):
+    pytest.importorskip("rioxarray")
+    image, _ = scene(place or UTM_NORTH)
+    image = clsas.Image(image.pixels, replace(image.grid, georeference=place))
+    clsas.export(image, tmp_path / "a.nc")
+    assert (tmp_path / "a.nc").read_bytes()[:4] == b"\x89HDF"  # netCDF 4
+    with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as data:
+        data.load()
+    assert data.attrs["Conventions"] == "CF-1.11"
+    pixels = data.pixels_real.values + 1j * data.pixels_imag.values
+    np.testing.assert_array_equal(pixels, image.pixels)
+    np.testing.assert_allclose(
+        data.amplitude_db, image.db(reference=data.attrs["reference_amplitude"]), atol=1e-4
+    )
+    if place is None:
+        assert data.amplitude_db.dims == ("y", "x")
+        assert "spatial_ref" not in data.coords
+        return
+    crs = place.map_crs()
+    assert data.rio.crs.to_wkt() == rasterio.crs.CRS.from_wkt(crs.to_wkt()).to_wkt()
+    on_map = place.to_map(image.grid.positions_m())
+    if place.is_north_up:
+        assert data.amplitude_db.dims == ("y", "x")
+        east, north = np.meshgrid(data.x, data.y)
+        names = {"x": "projection_x_coordinate", "y": "projection_y_coordinate"}
+        with rasterio.open(f"netcdf:{tmp_path / 'a.nc'}:amplitude_db") as file:
+            turn, read = file.transform, file.read(1)
+        assert (turn.a, turn.e) == pytest.approx((0.25, -0.2))
+        row, column = np.unravel_index(np.nanargmax(read), read.shape)
+        np.testing.assert_allclose(
+            at(turn, column + 0.5, row + 0.5), TARGET_M[:2] + on_map[0, 0, :2] - [10, 40], atol=0.15
+        )
+    else:
+        assert data.amplitude_db.dims == ("row", "column")
+        east, north = data.easting, data.northing
+        names = {"easting": "projection_x_coordinate", "northing": "projection_y_coordinate"}
+        assert "x" not in data.coords
+    np.testing.assert_allclose(east, on_map[..., 0], atol=1e-9)
+    np.testing.assert_allclose(north, on_map[..., 1], atol=1e-9)
+    for name, standard in names.items():
+        assert data[name].attrs["standard_name"] == standard
+    for name in ("amplitude_db", "pixels_real", "pixels_imag"):
+        assert "spatial_ref" in (data[name].attrs | data[name].encoding)["grid_mapping"]
+
+
+@pytest.mark.parametrize("place", [UTM_NORTH, local(217.0)], ids=str)
+def test_a_png_has_its_place_on_the_map(place, tmp_path):
+    pytest.importorskip("matplotlib")
+    image, _ = scene(place)
+    dark = clsas.Image(np.where(np.abs(image.pixels) > 1, image.pixels, 1e-6), image.grid)
+    clsas.export(dark, tmp_path / "a.png", colour_map="gray", north_arrow=False)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.pgw", "a.png", "a.png.aux.xml"]
+    shift = [500_000, 6_700_000, 0] if place.is_projected else 0
+    east, north, _ = place.to_map(TARGET_M + shift)
+    with rasterio.open(tmp_path / "a.png") as file:
+        column, row = at(~file.transform, east, north)
+        picture = file.read(1)
+        wkt = file.crs.to_wkt()
+        placed = file.transform
+    assert ("UTM" if place.is_projected else "Transverse Mercator about 60.39") in wkt
+    window = picture[int(row) - 12 : int(row) + 13, int(column) - 12 : int(column) + 13]
+    rows, columns = np.nonzero(window > 100)
+    assert abs(rows.mean() + 0.5 + int(row) - 12 - row) < 1
+    assert abs(columns.mean() + 0.5 + int(column) - 12 - column) < 1
+    # Programs without GDAL read the world file, whose origin is the centre of the first pixel.
+    a, d, b, e, c, f = map(float, (tmp_path / "a.pgw").read_text().split())
+    np.testing.assert_allclose((a, b, d, e), (placed.a, placed.b, placed.d, placed.e))
+    np.testing.assert_allclose((c, f), at(placed, 0.5, 0.5))
+
+
+def test_pictures_without_a_place_stand_alone(tmp_path):
+    pytest.importorskip("matplotlib")
+    image, _ = scene(UTM_NORTH)
+    nowhere = clsas.Image(image.pixels, replace(image.grid, georeference=None))
+    clsas.export(nowhere, tmp_path / "a.png", scale_bar=True)
+    clsas.export(image, tmp_path / "a.pdf", dynamic_range_db=40.0)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.pdf", "a.png"]
+    with pytest.raises(ValueError, match=r"kind must be left out, since it has no effect on \.png"):
+        clsas.export(image, tmp_path / "b.png", kind="db")
+    with pytest.raises(ValueError, match=r"reference must be left out, .* on \.nc"):
+        clsas.export(image, tmp_path / "b.nc", reference=1.0)
+    clsas.save(tmp_path / "grid.h5", image.grid)
+    with pytest.raises(ValueError, match=r"source must contain an image, but .*grid.h5 has Grid"):
+        clsas.export(tmp_path / "grid.h5", tmp_path / "b.tif")

@@ -1,0 +1,92 @@
+"""Tracks of latitudes and longitudes."""
+
+import numpy as np
+import pytest
+
+import clsas
+
+pyproj = pytest.importorskip("pyproj")
+
+EARTH = pyproj.Geod(ellps="WGS84")
+
+
+def course(azimuth_deg, pings=20, latitude=60.41, longitude=5.4, step_m=1.5):
+    """Latitudes and longitudes of a straight course."""
+    ahead = step_m * np.arange(pings)
+    ends = EARTH.fwd(*(np.full(pings, v) for v in (longitude, latitude, azimuth_deg)), ahead)
+    return ends[1], ends[0]
+
+
+@pytest.mark.parametrize("place", ["default", "local", "projected", "south"])
+def test_the_bow_points_along_the_course(place):
+    """Also 4 km off the origin, where the map's north differs from true north."""
+    latitude = -33.85 if place == "south" else 60.41
+    at = course(250.0, latitude=latitude)
+    frame = {
+        "local": clsas.Georeference.local(60.39, 5.32, -20, heading_deg=217),
+        "projected": clsas.Georeference.projected("EPSG:32632"),
+    }.get(place)
+    track = clsas.Track.from_geographic(
+        *at, -20.0, 250.0, 0.5 * np.arange(20), pitch_deg=2.0, roll_deg=3.0, georeference=frame
+    )
+    moved = np.diff(track.positions_m, axis=0)
+    yaw = np.arctan2(moved[:, 1], moved[:, 0])
+    np.testing.assert_allclose(np.angle(np.exp(1j * (track.yaw_rad[1:] - yaw))), 0, atol=2e-5)
+    scale = 1e-3 if frame is not None and frame.is_projected else 1e-6
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 1.5, rtol=4 * scale)
+    np.testing.assert_allclose(
+        track.velocity_m_s[:, :2], np.tile(2 * moved[0, :2], (20, 1)), rtol=1e-4, atol=1e-4
+    )
+    np.testing.assert_allclose(np.degrees(track.pitch_rad), -2)
+    np.testing.assert_allclose(np.degrees(track.roll_rad), 3)
+    geographic = track.georeference.to_geographic(track.positions_m)
+    np.testing.assert_allclose(geographic[:, :2].T, at, atol=1e-11)
+    np.testing.assert_allclose(geographic[:, 2], -20, atol=1e-9)
+    if place == "default":
+        assert track.georeference.heading_deg == 250.0
+        assert np.abs(track.positions_m.mean(axis=0)).max() < 0.2
+
+
+def test_headings_in_radians_and_swapped_angles_are_refused():
+    latitude, longitude = course(250.0)
+    time_s = np.arange(20.0)
+    with pytest.raises(ValueError, match=r"heading_deg must be in degrees.* numpy\.degrees"):
+        clsas.Track.from_geographic(latitude, longitude, 0.0, np.radians(250.0), time_s)
+    clsas.Track.from_geographic(*course(3.0), 0.0, np.full(20, 3.0), time_s)  # as degrees right
+    with pytest.raises(ValueError, match="probably swapped"):
+        clsas.Track.from_geographic(100 + latitude, longitude, 0.0, 250.0, time_s)
+    with pytest.raises(ValueError, match="longitude_deg must have shape"):
+        clsas.Track.from_geographic(latitude, longitude[1:], 0.0, 250.0, time_s)
+    with pytest.raises(ValueError, match="heading_deg must be from"):
+        clsas.Track.from_geographic(latitude, longitude, 0.0, 400.0, time_s)
+
+
+def test_a_track_across_the_date_line_lies_together():
+    track = clsas.Track.from_geographic(
+        *course(90.0, longitude=179.9999), 0.0, 90.0, np.arange(20.0)
+    )
+    assert np.ptp(track.positions_m[:, 0]) == pytest.approx(1.5 * 19, rel=1e-5)
+
+
+def test_the_place_of_a_track_reaches_the_image():
+    """Through echoes, lines and grid."""
+    track = clsas.Track.from_geographic(
+        *course(250.0, pings=5, step_m=0.02), 0.0, 250.0, np.arange(5.0)
+    )
+    sonar = clsas.Sonar(clsas.Pulse(30e3, 10e3, 1e-3), [[0.0, 0.0, 0.0]])
+    echoes = clsas.simulate(sonar, track, clsas.PointTargets([[0, 20, 0]]))
+    lines = clsas.compress(echoes)
+    grid = clsas.Grid.plane((-0.1, 0.1, 3), (19.9, 20.1, 3))
+    for image in (
+        clsas.backproject(lines, grid),
+        clsas.factorize(lines, grid, -40),
+        clsas.mosaic(lines, grid).image(),
+    ):
+        assert image.georeference == track.georeference
+    utm = clsas.Georeference.projected("EPSG:32632")
+    elsewhere = clsas.Grid.plane((-0.1, 0.1, 3), (19.9, 20.1, 3), georeference=utm)
+    for form in (clsas.backproject, clsas.wavenumber, clsas.mosaic):
+        with pytest.raises(ValueError, match="grid must have the georeference of the lines"):
+            form(lines, elsewhere)
+    with pytest.raises(ValueError, match="grid must have the georeference of the lines"):
+        clsas.plan(lines, elsewhere, tolerance_db=-40)
