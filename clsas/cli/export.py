@@ -14,15 +14,27 @@ from clsas.cli import options
 from clsas.cli.inputs import read_levels
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, ORIGIN, File, Output, keep_out
+from clsas.cli.view import Folder, size_of
 from clsas.core import reading, validate
 from clsas.files.hdf5 import read_geometry
 from clsas.maps.encoding import KINDS
 from clsas.maps.exporting import SUFFIXES
 
 
+class _Target(File):
+    """A file of a known suffix, or a folder for a viewer."""
+
+    written = True
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Path:
+        """Return the path; a usage error if nothing can be written there."""
+        kind = Output(*SUFFIXES) if Path(value).suffix else Folder()
+        return kind.convert(value, param, ctx)
+
+
 @click.command()
 @click.argument("source", metavar="INPUT", type=File(exists=True))
-@click.argument("output", metavar="OUTPUT", type=Output(*SUFFIXES))
+@click.argument("output", metavar="OUTPUT", type=_Target())
 @click.option(
     "--as", "kind", type=click.Choice(KINDS),
     help="Pixels of a GeoTIFF: amplitude in dB, complex numbers, or 8-bit levels with colours. "
@@ -81,11 +93,12 @@ def export(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Write an image or a mosaic as GeoTIFF, netCDF or a picture.
+    """Write an image or a mosaic as GeoTIFF, netCDF, a picture or a web page.
 
     INPUT is an image in HDF5 or the Zarr store of a finished mosaic, which may be larger than
     memory. The suffix of OUTPUT decides: .tif is a cloud-optimized GeoTIFF, .nc is netCDF 4, and
-    .png, .pdf and .svg are pictures. A PNG of an image with a georeference gets a world file.
+    .png, .pdf and .svg are pictures. A PNG of an image with a georeference gets a world file. Without
+    a suffix, OUTPUT is a folder that any browser shows, as clsas view writes it.
 
     \b
     Example:  clsas export mosaic.zarr mosaic.tif --as 8bit
@@ -106,7 +119,7 @@ def export(
             **levels, **given, **known,
         )  # fmt: skip
     seconds = time.perf_counter() - start
-    size_bytes = output.stat().st_size
+    size_bytes = size_of(output) if output.is_dir() else output.stat().st_size
     report(
         as_json,
         f"{printable(output)}: {size_bytes / 1e6:.3g} MB in {seconds:.2f} s",

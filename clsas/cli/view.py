@@ -88,8 +88,7 @@ def view(
             **levels,
         )
     seconds = time.perf_counter() - start
-    page = made / viewer.PAGE
-    size_bytes = sum(each.stat().st_size for each in made.rglob("*.*"))
+    page, size_bytes = made / viewer.PAGE, size_of(made)
     report(
         as_json,
         f"{printable(page)}: {size_bytes / 1e6:.3g} MB in {seconds:.2f} s",
@@ -97,6 +96,11 @@ def view(
     )  # fmt: skip
     if not no_open and not webbrowser.open(page.resolve().as_uri()):
         warn("no browser was found: open the page yourself")
+
+
+def size_of(folder: Path) -> int:
+    """Return the bytes of all files in a folder."""
+    return sum(each.stat().st_size for each in folder.rglob("*.*"))
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from clsas.core.georeference import Georeference
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.core.version import __version__
-from clsas.maps import geotiff, netcdf, world_files
+from clsas.maps import geotiff, netcdf, viewer, world_files
 from clsas.maps.encoding import KINDS
 from clsas.maps.geotiff import Options, Progress
 from clsas.maps.orientation import Orientation
@@ -53,24 +53,28 @@ def export(
     - ``.png``, ``.pdf`` or ``.svg``, a picture as `clsas.plot.image_db` draws it. A PNG of an image
       with a georeference gets a world file (``.pgw``) and a file with the coordinate reference
       system (``.png.aux.xml``).
+    - no suffix, a folder whose ``index.html`` shows the image in any browser, as `clsas view` does.
+      A mosaic may be larger than memory.
 
     Parameters
     ----------
     source : Image, Store or path-like
         Image, finished mosaic, or path of a file or store that contains one.
     path : path-like
-        File to write. An existing one is replaced in one step.
+        File to write, or folder. An existing one is replaced in one step, but a folder only if it
+        contains a viewer.
     kind : {"db", "complex", "8bit"}, optional
         Pixels of a GeoTIFF: the amplitude in dB (float32, NaN where nothing was received; the
         default), complex numbers (complex64), or 8-bit levels with a colour table.
     dynamic_range_db : float, optional
-        Level of the first colour below that of the last one, for 8-bit levels and pictures; by
-        default 60 dB.
+        Level of the first colour below that of the last one, for 8-bit levels, pictures and
+        folders; by default 60 dB.
     reference : float, optional
         Amplitude of 0 dB. By default 1 for "db", so that maps of one survey agree, and the largest
         amplitude for 8-bit levels and pictures.
     colour_map : str, optional
-        Colours of 8-bit levels and pictures, as for `clsas.plot.image`; by default "inferno".
+        Colours of 8-bit levels, pictures and folders, as for `clsas.plot.image`; by default
+        "inferno".
     north_up : bool
         True to resample a GeoTIFF so that its columns run east and its rows south. By default
         pixels are kept, and the transform of the file states how they are rotated.
@@ -86,7 +90,7 @@ def export(
     north_arrow, scale_bar : bool
         True to draw an arrow to the north and a scale bar into a picture.
     progress : callable, optional
-        Called as progress(done, total) while a GeoTIFF is written.
+        Called as progress(done, total) while a GeoTIFF or a folder is written.
 
     Raises
     ------
@@ -132,8 +136,6 @@ def export(
     path = validate.path("path", path)
     validate.suffix("path", path, *SUFFIXES)
     suffix = path.suffix.lower()
-    if not suffix:
-        raise ValueError(f"path must end in one of {', '.join(SUFFIXES)}, got {path}")
     given: dict[str, Any] = {
         "kind": kind,
         "dynamic_range_db": dynamic_range_db,
@@ -150,6 +152,16 @@ def export(
     validate.instance("georeference", georeference, Georeference, type(None))
     validate.progress(progress)
     opened = _opened(source)
+    if not suffix:
+        viewer.write(
+            opened,
+            path,
+            dynamic_range_db=given["dynamic_range_db"],
+            colour_map=colour_map,
+            georeference=georeference,
+            progress=progress,
+        )
+        return
     if suffix in PICTURES:
         picture = {name: value for name, value in given.items() if value is not None}
         world_files.write_picture(path, _placed(opened, georeference), picture)
@@ -195,6 +207,8 @@ def _check(given: dict[str, Any], suffix: str) -> None:
             what += " without north_up"
     elif suffix in netcdf.SUFFIXES:
         known, what = {"plan", "lines"}, suffix
+    elif not suffix:
+        known, what = {"dynamic_range_db", "colour_map"}, "a folder"
     else:
         known, what = drawn | {"north_arrow", "scale_bar"}, suffix
     unused = [name for name, value in given.items() if value is not None and name not in known]

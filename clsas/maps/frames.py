@@ -71,8 +71,7 @@ def geographic_of(grid: Grid) -> Callable[[NDArray[np.float64]], NDArray[np.floa
     Positions are float64 [..., 3], metres. The result has latitude and longitude in degrees, and
     possibly more, along its last axis.
     """
-    georeference = getattr(grid, "georeference", None)
-    return None if georeference is None else georeference.to_geographic
+    return None if grid.georeference is None else grid.georeference.to_geographic
 
 
 def fitted_degrees(

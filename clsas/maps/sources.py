@@ -54,19 +54,14 @@ class Source:
         if isinstance(source, Store):
             records = source.records()
             rows, columns = (
-                math.ceil(n / m) for n, m in zip(grid.shape, source.pixels.chunks, strict=True)
+                math.ceil(n / m) for n, m in zip(grid.shape, _patch_shape(source), strict=True)
             )
             if len(records) < rows * columns:
                 raise ValueError(
                     f"source must be finished, but {len(records)} of the {rows * columns} patches "
                     f"of {source.path} are: finish it by clsas mosaic with the same inputs"
                 )
-        if georeference is not None:
-            if grid.georeference not in (None, georeference):
-                raise ValueError(
-                    f"georeference must be left out, since the source has one: {grid.georeference}"
-                )
-            grid = replace(grid, georeference=georeference)
+        grid = placed(grid, georeference)
         if isinstance(source, Store):
             return cls(grid, None, source, records)
         return cls(grid, source, None, records)
@@ -79,7 +74,7 @@ class Source:
     def windows(self) -> Iterator[tuple[slice, slice]]:
         """Yield windows that cover the image. Those of a store are whole patches."""
         rows, columns = self.grid.shape
-        height, width = (_WINDOW, _WINDOW) if self.store is None else self.store.pixels.chunks
+        height, width = (_WINDOW, _WINDOW) if self.store is None else _patch_shape(self.store)
         yield from windows_of((rows, columns), (height, width))
 
     def read(self, rows: slice, columns: slice) -> NDArray[np.complex64]:
@@ -96,6 +91,29 @@ class Source:
                 f"source must not change, but patches of {self.store.path} were formed again "
                 "during the export: repeat it when the mosaic is finished"
             )
+
+
+def placed(grid: Grid, georeference: Georeference | None) -> Grid:
+    """Return a grid with a georeference, if one is given.
+
+    Raises
+    ------
+    ValueError
+        If the grid has another one.
+    """
+    if georeference is None:
+        return grid
+    if grid.georeference not in (None, georeference):
+        raise ValueError(
+            f"georeference must be left out, since the source has one: {grid.georeference}"
+        )
+    return replace(grid, georeference=georeference)
+
+
+def _patch_shape(store: Store) -> tuple[int, int]:
+    shape = store.patch_shape
+    assert shape is not None  # the store exists
+    return shape
 
 
 def windows_of(

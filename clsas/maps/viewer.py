@@ -16,10 +16,12 @@ import numpy as np
 from clsas.core import validate
 from clsas.core.atomic import replacing_folder
 from clsas.core.decibels import largest_amplitude
+from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.version import __version__
 from clsas.maps.frames import Frame, fitted_degrees, geographic_of
+from clsas.maps.sources import placed
 from clsas.maps.tiles import BRIGHTEST, SIDE, STEP_DB, Levels, Pyramid, Source, levels_of
 from clsas.mosaics.store import Store
 from clsas.plot.colours import COLOUR_MAP
@@ -45,6 +47,7 @@ def write(
     names: Sequence[str] = ("image", "other image"),
     dynamic_range_db: float | None = None,
     colour_map: str | None = None,
+    georeference: Georeference | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> None:
     """Write a folder that shows an image or a mosaic in a browser.
@@ -68,6 +71,8 @@ def write(
         Dynamic range that is shown at first, dB; by default 60. The page can change it.
     colour_map : str, optional
         Colours that are shown at first, as for `clsas.plot.image`; by default "inferno".
+    georeference : Georeference, optional
+        Where the images lie on Earth, if they have no georeference of their own.
     progress : callable, optional
         Called as progress(done, total) while pixels are read.
 
@@ -79,7 +84,8 @@ def write(
     FileExistsError
         If the folder contains anything but a viewer.
     ImportError
-        If Matplotlib is not installed (extra `plot`).
+        If Matplotlib is not installed (extra `plot`), or an image has a georeference and pyproj is
+        not installed (extra `maps`).
     OSError
         If the folder cannot be written, for example on a full disk. Nothing is then written.
 
@@ -101,8 +107,9 @@ def write(
         range_db = validate.dynamic_range_db(dynamic_range_db)
     colour_map = COLOUR_MAP if colour_map is None else validate.text("colour_map", colour_map)
     tables = {name: _table(name) for name in dict.fromkeys((colour_map, *_COLOURS))}
+    validate.instance("georeference", georeference, Georeference, type(None))
     validate.progress(progress)
-    grids = [each.grid for each in sources]
+    grids = [placed(each.grid, georeference) for each in sources]
     _check_grids(grids)
     check_folder(folder)
     records = [each.records() if isinstance(each, Store) else None for each in sources]

@@ -45,6 +45,18 @@ def test_an_image_becomes_a_map(folder):
     assert (code, output[:6]) == (0, "a.nc: ")
 
 
+def test_a_folder_is_a_viewer(folder):
+    place = ("--origin", "60.39,5.32,-12", "--heading-deg", 217)
+    code, output = run("nowhere.h5", "web/", *place, "--db", 40, "--json")
+    assert code == 0
+    said = json.loads(output)
+    assert said["file"] == "web"
+    assert said["bytes"] > 1000
+    assert '"latitude"' in (folder / "web" / "scene.js").read_text()
+    code, output = run("image.h5", "web", "--as", "8bit")
+    assert (code, "kind must be left out" in output) == (1, True)
+
+
 def test_options_place_an_image(folder):
     for options, place in (
         (("--origin", "60.39,5.32,-12", "--heading-deg", 217), local(217.0)),
