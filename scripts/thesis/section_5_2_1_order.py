@@ -21,7 +21,7 @@ from clsas.planning.planner import planned
 from clsas.planning.request import Request
 from clsas.planning.search import Allowed, Tree
 
-FACTORS = ((4, 2), (8, 2), (4, 4), (4, 2, 2), (16, 2), (8, 4), (8, 2, 2), (4, 4, 2))  # QR
+FACTORS = ((8, 2), (4, 4), (4, 2, 2), (16, 2), (8, 4), (8, 2, 2), (4, 4, 2))  # QR
 RATIOS = (1, 2)  # QI over QR, the same in each stage
 TOLERANCE_DB = -40.0
 
