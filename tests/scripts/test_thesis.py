@@ -46,7 +46,9 @@ def test_every_script_is_known():
 @pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_script_runs(script, tmp_path):
-    options = ["--out", tmp_path, "--pixels", "64"]
+    # 16 pixels remain along each side after the divisions of the orders.
+    pixels = "256" if script == "section_5_2_1_order" else "64"
+    options = ["--out", tmp_path, "--pixels", pixels]
     if script == "figures_39_45":
         clsas.save(tmp_path / "lines.h5", _points_beside_a_track())
         options += ["--lines", tmp_path / "lines.h5"]
