@@ -253,8 +253,12 @@ def equal_stages(number: int) -> Stages:
     return [(2, 2)] * (number - 1)
 
 
-def in_turn(work: dict[object, Callable[[], object]], repeats: int) -> dict[object, float]:
-    """Return the median seconds of each piece of work, done in turns after a warm-up."""
+def in_turn(
+    work: dict[object, Callable[[], object]],
+    repeats: int,
+    take: Callable[[Sequence[float]], float] = statistics.median,
+) -> dict[object, float]:
+    """Return the median seconds of each piece of work, or others, done in turns after a warm-up."""
     taken: dict[object, list[float]] = {key: [] for key in work}
     for repeat in range(repeats + 1):
         for key, do in work.items():
@@ -262,7 +266,7 @@ def in_turn(work: dict[object, Callable[[], object]], repeats: int) -> dict[obje
             do()
             if repeat:
                 taken[key].append(time.perf_counter() - start)
-    return {key: statistics.median(each) for key, each in taken.items()}
+    return {key: take(each) for key, each in taken.items()}
 
 
 @dataclass(frozen=True)
