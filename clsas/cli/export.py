@@ -97,8 +97,8 @@ def export(
 
     INPUT is an image in HDF5 or the Zarr store of a finished mosaic, which may be larger than
     memory. The suffix of OUTPUT decides: .tif is a cloud-optimized GeoTIFF, .nc is netCDF 4, and
-    .png, .pdf and .svg are pictures. A PNG of an image with a georeference gets a world file. Without
-    a suffix, OUTPUT is a folder that any browser shows, as clsas view writes it.
+    .png, .pdf and .svg are pictures. A PNG of an image with a georeference gets a world file.
+    Without a suffix, OUTPUT is a folder that any browser shows, as clsas view writes it.
 
     \b
     Example:  clsas export mosaic.zarr mosaic.tif --as 8bit

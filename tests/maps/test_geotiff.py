@@ -344,7 +344,7 @@ def test_images_without_a_place_on_a_map_are_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             clsas.export(source, path, **how)
-    with pytest.raises(ValueError, match="reference must be left out, .* a folder"):
+    with pytest.raises(ValueError, match=r"reference must be left out, .* a folder"):
         clsas.export(image, tmp_path / "folder", reference=1.0)
     clsas.export(nowhere, path, georeference=local(217.0))  # with its place it is written
     assert os.listdir(tmp_path) == ["a.tif"]
