@@ -89,7 +89,7 @@ def complete(
     attributes: dict[str, Any],
     digest: str,
     read: Callable[[slice, slice], NDArray[np.complex64]],
-    tell: Callable[[int, int], object] | None,
+    progress: Callable[[int, int], object] | None,
 ) -> None:
     """Compute the levels of a mosaic that mix patches, and write their record.
 
@@ -103,8 +103,8 @@ def complete(
         Digest of the finished patches.
     read : callable
         Called as read(rows, columns) with slices; returns pixels of the mosaic.
-    tell : callable or None
-        Called as tell(chunks computed so far, number of chunks).
+    progress : callable or None
+        Called as progress(chunks computed so far, number of chunks).
     """
     folder = path / LEVELS
     check_own(path, folder)
@@ -125,8 +125,8 @@ def complete(
         level = _level(path, attributes, factor, window, read)
         for array in same:
             write_values(path, attributes, array.name, window, level.values_of(array))
-        if tell is not None:
-            tell(done, len(work))
+        if progress is not None:
+            progress(done, len(work))
     chunks = {array.name: chunk_checksums(path, array, _all_chunks(array)) for array in arrays}
     write_attributes(folder, with_checksum({_PATCHES: digest, _CHUNKS: chunks}))
 

@@ -270,13 +270,13 @@ class Store:
                 found[index] = record
         return found
 
-    def damage(self, tell: Callable[[int, int], object] | None = None) -> dict[PatchIndex, str]:
+    def damage(self, progress: Callable[[int, int], object] | None = None) -> dict[PatchIndex, str]:
         """Read every finished patch, and return those that are damaged.
 
         Parameters
         ----------
-        tell : callable, optional
-            Called as tell(patches read so far, number of patches).
+        progress : callable, optional
+            Called as progress(patches read so far, number of patches).
 
         Returns
         -------
@@ -288,7 +288,7 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        validate.function("tell", tell)
+        validate.progress(progress)
         _ = self.pixels  # raises if their metadata are damaged
         found, indices = {}, self._files.indices()
         for done, index in enumerate(indices, 1):
@@ -296,8 +296,8 @@ class Store:
                 self._files.verify(index, self._opened)
             except DamageError as error:
                 found[index] = str(error)
-            if tell is not None:
-                tell(done, len(indices))
+            if progress is not None:
+                progress(done, len(indices))
         return found
 
     def write(
@@ -362,15 +362,15 @@ class Store:
             _arrays().write_values(self.path, attributes, array.name, window, values)
         write_attributes(folder, record.attributes(self._files.checksums((row, column))))
 
-    def complete_levels(self, tell: Callable[[int, int], object] | None = None) -> bool:
+    def complete_levels(self, progress: Callable[[int, int], object] | None = None) -> bool:
         """Compute the levels that mix patches, unless they already are those of the patches.
 
         A run does so when all patches are finished. Only one process may do so at a time.
 
         Parameters
         ----------
-        tell : callable, optional
-            Called as tell(chunks computed so far, number of chunks).
+        progress : callable, optional
+            Called as progress(chunks computed so far, number of chunks).
 
         Returns
         -------
@@ -384,16 +384,16 @@ class Store:
         OSError
             If the store cannot be read or written.
         """
-        validate.function("tell", tell)
+        validate.progress(progress)
         if not self._mosaic_arrays or self._is_complete():
             return False
         digest = self._digest()
         with needed("stores of mosaics"):
             from clsas.mosaics import completing
-        completing.complete(self.path, read_document(self.path), digest, self.read, tell)
+        completing.complete(self.path, read_document(self.path), digest, self.read, progress)
         return True
 
-    def add_levels(self, tell: Callable[[int, int], object] | None = None) -> bool:
+    def add_levels(self, progress: Callable[[int, int], object] | None = None) -> bool:
         """Add levels to a store of an early version, computed from its pixels.
 
         Patches and records stay as they are. If patches are formed later, run it again, or let the
@@ -401,8 +401,8 @@ class Store:
 
         Parameters
         ----------
-        tell : callable, optional
-            Called as tell(chunks computed so far, number of chunks).
+        progress : callable, optional
+            Called as progress(chunks computed so far, number of chunks).
 
         Returns
         -------
@@ -416,12 +416,12 @@ class Store:
         OSError
             If the store cannot be read or written.
         """
-        validate.function("tell", tell)
+        validate.progress(progress)
         if stored_levels(read_document(self.path)).coarsest is None:
             _arrays().add_levels(self.path)
             for name in ("_files", "_mosaic_arrays"):
                 self.__dict__.pop(name, None)
-        return self.complete_levels(tell)
+        return self.complete_levels(progress)
 
     def read(
         self, rows: slice = slice(None), columns: slice = slice(None)

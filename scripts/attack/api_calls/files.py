@@ -94,7 +94,7 @@ def files(folder: Path) -> dict[str, Call]:
         ),
         "Store.records": Call(opened.records, {}),
         "Store.array_damage": Call(opened.array_damage, {}),
-        "Store.damage": Call(opened.damage, {"tell": nothing}, accepts={"tell": optional}),
+        "Store.damage": Call(opened.damage, {"progress": nothing}, accepts={"progress": optional}),
         "Store.begin": Call(
             opened.begin,
             {"inputs": inputs, "grid": s.grid, "patch_shape": tuple(patch_shape)},
@@ -106,9 +106,11 @@ def files(folder: Path) -> dict[str, Call]:
             {"factor": 2, "rows": slice(0, 1), "columns": slice(1, 5), "coherent": True},
         ),
         "Store.complete_levels": Call(
-            opened.complete_levels, {"tell": nothing}, accepts={"tell": optional}
+            opened.complete_levels, {"progress": nothing}, accepts={"progress": optional}
         ),
-        "Store.add_levels": Call(opened.add_levels, {"tell": nothing}, accepts={"tell": optional}),
+        "Store.add_levels": Call(
+            opened.add_levels, {"progress": nothing}, accepts={"progress": optional}
+        ),
         "Store.write": Call(
             opened.write,
             {
