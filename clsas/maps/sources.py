@@ -59,7 +59,8 @@ class Source:
             if len(records) < rows * columns:
                 raise ValueError(
                     f"source must be finished, but {len(records)} of the {rows * columns} patches "
-                    f"of {source.path} are: finish it by clsas mosaic with the same inputs"
+                    f"of {source.path} are, without damage: run clsas mosaic again with the same "
+                    "inputs, which forms the others"
                 )
         grid = placed(grid, georeference)
         if isinstance(source, Store):

@@ -256,8 +256,8 @@ class Store:
     def records(self) -> dict[PatchIndex, Record]:
         """Return the records of all finished patches, by row and column.
 
-        Patches whose record, or the checksum behind whose pixels, is damaged are left out. The
-        pixels themselves are not read; `damage` reads them too.
+        Patches are left out if their record is damaged, or a checksum behind their pixels or their
+        part of the levels. The values themselves are not read; `damage` reads them too.
         """
         found = {}
         _ = self.pixels  # raises if their metadata are damaged
