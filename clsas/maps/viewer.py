@@ -20,7 +20,7 @@ from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.version import __version__
-from clsas.maps.frames import Frame, fitted_degrees, geographic_of
+from clsas.maps.frames import Frame, fitted_degrees, geographic_of, steps_of
 from clsas.maps.sources import placed
 from clsas.maps.tiles import BRIGHTEST, SIDE, STEP_DB, Levels, Pyramid, Source, levels_of
 from clsas.mosaics.store import Store
@@ -208,7 +208,7 @@ def _check_grids(grids: Sequence[Grid]) -> None:
     if len(grids) < 2:
         return
     one, other = grids
-    steps_m = min(float(np.linalg.norm(step)) for step in one.vectors_m[1:])
+    steps_m = min(float(np.linalg.norm(step)) for step in steps_of(one))
     most_m = max(
         float(np.abs(mine - theirs).max()) * count
         for mine, theirs, count in zip(one.vectors_m, other.vectors_m, (1, *one.shape), strict=True)

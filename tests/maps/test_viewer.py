@@ -146,6 +146,43 @@ def test_a_plane_is_seen_from_above_and_never_mirrored(row_step, column_step, ri
         assert described["screen_column_step"][axis] == pytest.approx(column_step @ along)
 
 
+@pytest.mark.parametrize(
+    ("row_step", "column_step", "shape", "right", "up"),
+    [
+        (0 * X, 2 * X, (1, 5), X, Y),
+        (2 * X, 2 * X, (1, 5), X, Y),  # a row step along the row
+        (2 * Y, 0 * X, (5, 1), X, Y),
+        (2 * (Y - X), 0 * X, (5, 1), (X + Y) / np.sqrt(2), (Y - X) / np.sqrt(2)),
+        (0 * X, 2 * Z, (1, 5), Y, Z),
+        (0 * X, 2 * Z + 1e-15 * Y, (1, 5), X, Z),
+        (2 * Z, 0 * X, (5, 1), X, Z),
+        (0 * X, 0 * X, (1, 1), X, Y),
+        (2 * X, 2 * X, (1, 1), X, Y),
+    ],
+)
+def test_a_single_row_or_column_is_as_wide_as_its_pixels(
+    tmp_path, row_step, column_step, shape, right, up
+):
+    grid = clsas.Grid.oriented((1, 2, 3), row_step, column_step, shape)
+    frame = Frame.of(grid)
+    np.testing.assert_allclose([frame.right, frame.up], [right, up], atol=1e-12)
+    viewer.write(clsas.Image(speckle(shape), grid), tmp_path / "web")
+    described = scene_of(tmp_path / "web")["frame"]
+    steps = [described["row_step"], described["column_step"]]
+    assert np.ptp(np.linalg.norm(steps, axis=1)) < 1e-12
+    assert np.dot(*steps) == pytest.approx(0, abs=1e-12)
+    for found, step, n in zip(steps, (row_step, column_step), shape, strict=True):
+        assert n == 1 or found == pytest.approx(step)
+
+
+def test_degrees_beside_a_single_row_show_the_north():
+    """The page turns its arrow by the slopes along rows and columns."""
+    grid = clsas.Grid.plane((0, 100, 51), (20, 20, 1))
+    found = fitted_degrees(grid, lambda at: 60 + at[..., [1, 0]] * 1e-5)
+    edges = np.polynomial.chebyshev.chebval2d([-1, 1], [0, 0], found["latitude"])
+    assert np.diff(edges) == pytest.approx(2e-5)  # 2 m
+
+
 @pytest.mark.parametrize("longitude_deg", [5.3, 179.99])
 def test_degrees_are_right_to_a_centimetre(longitude_deg):
     """On a sphere, at a latitude of 75 degrees, in a scene of 20 km."""
