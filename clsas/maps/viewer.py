@@ -64,7 +64,8 @@ def write(
         Folder to write, whose parent must exist. It must be new, empty, or an earlier viewer, which
         is replaced at the end.
     against : Image or Store, optional
-        Second image on the same grid, to blink or swipe against the first.
+        Second image on the same grid, to blink or swipe against the first. If only one of both has
+        a georeference, it counts for both.
     names : sequence of str
         Names of the images, for the page.
     dynamic_range_db : float, optional
@@ -80,7 +81,7 @@ def write(
     ------
     TypeError, ValueError
         If an argument has the wrong type or is outside its limits, an image is on points, the two
-        images have different grids, or a mosaic is damaged or changes meanwhile.
+        images have different grids or georeferences, or a mosaic is damaged or changes meanwhile.
     FileExistsError
         If the folder contains anything but a viewer.
     ImportError
@@ -119,7 +120,8 @@ def write(
     reference = max(_largest(reader, report) for reader in readers) or 1.0
     levels = Levels(reference, max(STEP_DB, range_db / (BRIGHTEST - 1)))
     scene = {"names": names, "range_db": range_db, "colours": tables}
-    scene |= _described(readers[0].shape, grids[0], levels)
+    known = next((grid for grid in grids if grid.georeference is not None), grids[0])
+    scene |= _described(readers[0].shape, known, levels)
     scene |= {"patches": _patches(source) if isinstance(source, Store) else []}
     with replacing_folder(folder) as made:
         for name in _FILES:
@@ -216,6 +218,12 @@ def _check_grids(grids: Sequence[Grid]) -> None:
     if one.shape != other.shape or most_m > _SAME * steps_m:
         raise ValueError(
             f"against must be on the grid of source, {one}, got {other}: form it on that grid"
+        )
+    places = [grid.georeference for grid in grids]
+    if None not in places and places[0] != places[1]:
+        raise ValueError(
+            f"against must have the georeference of source, {places[0]}, got {places[1]}: form "
+            "both with the same one"
         )
 
 

@@ -5,6 +5,7 @@ import json
 import os
 import re
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -277,6 +278,32 @@ def test_what_the_viewer_cannot_show_is_refused(image, tmp_path):
     with pytest.raises(ValueError, match="names must have 2 entries, got 1"):
         viewer.write(image, tmp_path / "web", against=image, names=["one"])
     assert not list(tmp_path.iterdir())
+
+
+class TestGeoreferences:
+    """Of two images."""
+
+    @pytest.fixture
+    def images(self, image):
+        places = [None, *(clsas.Georeference.local(60, 5, heading_deg=h) for h in (0, 90))]
+        grid = image.grid.window(slice(5), slice(5))
+        grids = [replace(grid, georeference=place) for place in places]
+        return [clsas.Image(image.pixels[:5, :5], each) for each in grids]
+
+    def test_that_differ_are_refused(self, images, tmp_path):
+        _, one, other = images
+        with pytest.raises(
+            ValueError, match="against must have the georeference of source, latitude"
+        ):
+            viewer.write(one, tmp_path / "web", against=other)
+        assert not list(tmp_path.iterdir())
+
+    def test_of_one_image_counts_for_both(self, images, tmp_path):
+        for index, pair in enumerate((images[:2], images[1::-1], images[1:2] * 2)):
+            viewer.write(pair[0], tmp_path / str(index), against=pair[1])
+        known = [scene_of(tmp_path / str(index))["geographic"] for index in range(3)]
+        assert known[0] == known[1] == known[2]
+        assert known[0] is not None
 
 
 @pytest.fixture(scope="module")
