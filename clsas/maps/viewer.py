@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from importlib import resources
 from itertools import product
@@ -146,10 +147,25 @@ def check_folder(folder: Path) -> None:
         If the folder contains anything but a viewer, or is a file.
     FileNotFoundError
         If its parent does not exist.
+    OSError
+        If the folder cannot be renamed, or its parent cannot be written.
     """
-    if not folder.absolute().parent.is_dir():
+    parent = folder.absolute().parent
+    if not parent.is_dir():
         raise FileNotFoundError(f"cannot write {folder}: there is no folder {folder.parent}")
-    if not os.path.lexists(folder):
+    current = Path.cwd().is_relative_to(os.path.realpath(folder))
+    if current or os.path.ismount(folder) or folder.name == "..":
+        raise OSError(
+            f"cannot write the folder {folder}: the current folder, those above it and mount "
+            "points cannot be renamed; choose a new folder"
+        )
+    try:
+        exists = _exists(folder)
+        with tempfile.TemporaryFile(dir=parent):
+            pass
+    except OSError as error:
+        raise type(error)(f"{folder} cannot be written: {error.strerror}") from error
+    if not exists:
         return
     if not folder.is_dir() or folder.is_symlink():
         raise FileExistsError(f"cannot write the folder {folder}: it is a file or a link")
@@ -158,6 +174,15 @@ def check_folder(folder: Path) -> None:
             f"cannot write the folder {folder}: it contains files, and is no viewer of clsas; "
             "choose a new folder"
         )
+
+
+def _exists(path: Path) -> bool:
+    """Return whether there is a file, folder or link; raise OSError for too long a name."""
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def is_viewer(folder: Path) -> bool:

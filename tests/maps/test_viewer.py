@@ -6,6 +6,7 @@ import os
 import re
 import zlib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -235,6 +236,19 @@ class TestFolder:
         with pytest.raises(FileNotFoundError, match="there is no folder"):
             viewer.write(small, tmp_path / "new" / "web")
 
+    def test_that_cannot_be_renamed_is_refused_before_pixels_are_read(
+        self, image, tmp_path, monkeypatch
+    ):
+        monkeypatch.setattr(viewer, "_reader", None)
+        (tmp_path / "here" / "below").mkdir(parents=True)
+        monkeypatch.chdir(tmp_path / "here")
+        for folder in (".", tmp_path / "here", "below/..", "/proc"):
+            with pytest.raises(OSError, match=r"cannot write the folder .* be renamed; choose"):
+                viewer.check_folder(Path(folder))
+        for folder in ("/proc/web", "n" * 300):
+            with pytest.raises(OSError, match=f"{folder} cannot be written: "):
+                viewer.write(image, folder)
+
     @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
     def test_of_an_interrupted_export_is_the_one_before(self, image, tmp_path, monkeypatch, error):
         small = clsas.Image(image.pixels[:20, :30], image.grid.window(slice(20), slice(30)))
@@ -392,6 +406,8 @@ class TestCommand:
         (tmp_path / "full").mkdir()
         (tmp_path / "full" / "a.txt").touch()
         assert "is no viewer of clsas" in self.run(store, tmp_path / "full", code=2)
+        assert "the current folder" in self.run(store, ".", code=2)
+        assert "cannot be written" in self.run(store, "/proc/web", code=2)
         assert "must not lie in the store" in self.run(store, store / "web", code=2)
         assert "--no-open requires FOLDER" in self.run(store, "--no-open", code=2)
         clsas.save(tmp_path / "lines.h5", LINES)
