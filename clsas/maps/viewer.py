@@ -37,6 +37,7 @@ _START = "window.clsasScene = "  # of that file, by which folders of viewers are
 _SCRIPTS = ("geometry", "view", "tiles", "marks", "controls", "events")
 _FILES = (PAGE, "viewer.css", *(f"{name}.js" for name in _SCRIPTS))
 _COLOURS = ("inferno", "sonar", "gray")
+_ADDED = {".DS_Store", "Thumbs.db", "desktop.ini"}  # by file browsers, which show folders
 _SAME = 1e-6  # of a pixel, by which positions of two images may differ
 
 
@@ -169,7 +170,7 @@ def check_folder(folder: Path) -> None:
         return
     if not folder.is_dir() or folder.is_symlink():
         raise FileExistsError(f"cannot write the folder {folder}: it is a file or a link")
-    if any(folder.iterdir()) and not is_viewer(folder):
+    if _names_in(folder) and not is_viewer(folder):
         raise FileExistsError(
             f"cannot write the folder {folder}: it contains files, and is no viewer of clsas; "
             "choose a new folder"
@@ -185,9 +186,17 @@ def _exists(path: Path) -> bool:
     return True
 
 
+def _names_in(folder: Path) -> set[str]:
+    """Return the names in a folder, except those that file browsers add."""
+    return {each.name for each in folder.iterdir()} - _ADDED
+
+
 def is_viewer(folder: Path) -> bool:
-    """Return whether a folder contains a viewer of clsas and nothing else."""
-    if {each.name for each in folder.iterdir()} != {*_FILES, _SCENE, "tiles"}:
+    """Return whether a folder contains a viewer of clsas and nothing else.
+
+    Files that file browsers add do not count.
+    """
+    if _names_in(folder) != {*_FILES, _SCENE, "tiles"}:
         return False
     with (folder / _SCENE).open(encoding="ascii", errors="replace") as file:
         return file.read(len(_START)) == _START

@@ -249,6 +249,16 @@ class TestFolder:
             with pytest.raises(OSError, match=f"{folder} cannot be written: "):
                 viewer.write(image, folder)
 
+    @pytest.mark.parametrize("name", [".DS_Store", "Thumbs.db", "desktop.ini"])
+    def test_may_contain_what_file_browsers_add(self, image, tmp_path, name):
+        small = clsas.Image(image.pixels[:20, :30], image.grid.window(slice(20), slice(30)))
+        folder = tmp_path / "web"
+        folder.mkdir()
+        for _ in range(2):
+            (folder / name).touch()
+            viewer.write(small, folder)
+            assert not (folder / name).exists()
+
     @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
     def test_of_an_interrupted_export_is_the_one_before(self, image, tmp_path, monkeypatch, error):
         small = clsas.Image(image.pixels[:20, :30], image.grid.window(slice(20), slice(30)))
