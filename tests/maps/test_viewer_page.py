@@ -180,6 +180,30 @@ def test_the_address_keeps_the_view(page, folder):
     assert position(page) == pytest.approx(BRIGHT[0], abs=2e-3)
 
 
+@pytest.mark.parametrize(
+    ("address", "low", "high"),
+    [
+        ("#colours=constructor", -60, 0),
+        ("#low=5&high=10", -1, 0),
+        ("#low=-300&high=-200", -101, -100),
+        ("#low=-3.0&high=-2.9", -3.9, -2.9),
+        ("#low=-3&high=Infinity", -60, 0),
+    ],
+)
+def test_a_wrong_address_is_brought_within_limits(page, folder, address, low, high):
+    page.open(folder / "index.html", address=address)
+    found = [page.text(f"#{end}-db").replace("−", "-") for end in ("low", "high")]
+    assert found == [f"{low:.1f} dB", f"{high:.1f} dB"]
+    assert page.js("document.querySelector('#colours').value") == "gray"
+
+
+def test_an_address_far_away_ends_beside_the_image(page, folder):
+    page.open(folder / "index.html", address="#u=1e300&v=-1e300&scale=1e300")
+    u, v = page.js("[view.u, view.v]")
+    assert abs(u) < 50
+    assert abs(v) < 100
+
+
 def test_fits_a_narrow_window(page, folder):
     page.open(folder / "index.html", width=400, height=700)
     assert page.js("document.querySelector('#panel').hidden")
