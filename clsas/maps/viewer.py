@@ -23,7 +23,7 @@ from clsas.core.image import Image
 from clsas.core.version import __version__
 from clsas.maps.frames import Frame, fitted_degrees, geographic_of, steps_of
 from clsas.maps.sources import placed
-from clsas.maps.tiles import BRIGHTEST, SIDE, STEP_DB, Levels, Pyramid, Source, levels_of
+from clsas.maps.tiles import BRIGHTEST, SIDE, STEP_DB, Levels, Pyramid, Source, scales_of
 from clsas.mosaics.store import Store
 from clsas.plot.colours import COLOUR_MAP
 from clsas.plot.colours import colour_map as colours_of
@@ -272,12 +272,12 @@ def _check_unchanged(store: Store, records: object) -> None:
 
 def _described(shape: tuple[int, int], grid: Grid, levels: Levels) -> dict[str, Any]:
     """Return what the page needs to know of a grid and of the tiles."""
-    scales, to_geographic = levels_of(shape), geographic_of(grid)
+    scales, to_geographic = scales_of(shape), geographic_of(grid)
     return {
         "version": __version__,
         "shape": shape,
         "side": SIDE,
-        "levels": [scales[0], scales[-1]],
+        "scales": [scales[0], scales[-1]],
         "reference": levels.reference,
         "step_db": levels.step_db,
         "frame": Frame.of(grid).describe(grid),

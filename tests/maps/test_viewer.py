@@ -17,7 +17,7 @@ import clsas
 from clsas.cli import main
 from clsas.maps import tiles, viewer
 from clsas.maps.frames import Frame, fitted_degrees
-from clsas.maps.tiles import Levels, Pyramid, levels_of
+from clsas.maps.tiles import Levels, Pyramid, scales_of
 
 SHAPE = (700, 1300)
 PLANE = clsas.Grid.plane((-13, 12.98, 1300), (40, 53.98, 700))
@@ -47,18 +47,18 @@ def scene_of(folder):
     return json.loads(re.fullmatch(r"window\.clsasScene = (.*);\n", text)[1])
 
 
-def level_of(folder, shape, level, image=0):
-    """All levels of a pyramid's level, assembled from its tiles."""
-    factor = 2 ** (levels_of(shape)[-1] - level)
+def levels_at(folder, shape, scale, image=0):
+    """All levels at one scale of a pyramid, assembled from its tiles."""
+    factor = 2 ** (scales_of(shape)[-1] - scale)
     rows, columns = (-(-n // factor) for n in shape)
     found = np.zeros((rows, columns), np.uint8)
-    names = {path.name for path in (folder / str(image) / str(level)).iterdir()}
+    names = {path.name for path in (folder / str(image) / str(scale)).iterdir()}
     for row in range(0, rows, tiles.SIDE):
         for column in range(0, columns, tiles.SIDE):
             name = f"{column // tiles.SIDE}_{row // tiles.SIDE}"
             part = found[row : row + tiles.SIDE, column : column + tiles.SIDE]
-            text = (folder / str(image) / str(level) / f"{name}.js").read_text()
-            packed = re.fullmatch(rf'clsasTile\("{image}/{level}/{name}","(.*)"\);\n', text)[1]
+            text = (folder / str(image) / str(scale) / f"{name}.js").read_text()
+            packed = re.fullmatch(rf'clsasTile\("{image}/{scale}/{name}","(.*)"\);\n', text)[1]
             values = np.frombuffer(zlib.decompress(base64.b64decode(packed)), np.uint8)
             part[:] = values.reshape(part.shape)
             names.remove(f"{name}.js")
@@ -68,8 +68,8 @@ def level_of(folder, shape, level, image=0):
 
 def test_tiles_have_every_pixel_to_half_a_step(image, written):
     scene = scene_of(written)
-    assert scene["levels"] == [9, 11]  # 2048 is the first power of two that is not below 1300
-    found = level_of(written / "tiles", SHAPE, 11)
+    assert scene["scales"] == [9, 11]  # 2048 is the first power of two that is not below 1300
+    found = levels_at(written / "tiles", SHAPE, 11)
     nothing = image.pixels == 0
     assert np.array_equal(found == tiles.NOTHING, nothing)
     level_db = (found[~nothing].astype(float) - tiles.BRIGHTEST) * scene["step_db"]
@@ -78,7 +78,7 @@ def test_tiles_have_every_pixel_to_half_a_step(image, written):
 
 
 def test_coarse_tiles_are_means_of_power(image, written):
-    found = level_of(written / "tiles", SHAPE, 9)
+    found = levels_at(written / "tiles", SHAPE, 9)
     power = np.abs(image.pixels[:, : 4 * 325].astype(complex)) ** 2
     mean = power.reshape(175, 4, 325, 4).mean(axis=(1, 3)) / power.max()
     some = mean > 0
@@ -353,7 +353,7 @@ class TestStore:
         assert seen == [(done, 12) for done in range(1, 13)]
         monkeypatch.undo()
         pixels = opened.read()
-        found = level_of(tmp_path / "web" / "tiles", GRID.shape, levels_of(GRID.shape)[-1])
+        found = levels_at(tmp_path / "web" / "tiles", GRID.shape, scales_of(GRID.shape)[-1])
         expected = tiles.BRIGHTEST + clsas.Image(pixels, GRID).db() / 0.4
         assert np.abs(found - np.maximum(expected, 1)).max() <= 0.51
         patches = scene_of(tmp_path / "web")["patches"]
@@ -406,9 +406,9 @@ class TestCommand:
         assert scene["names"] == ["a.zarr", "image.h5"]
         assert scene["range_db"] == 40
         assert next(iter(scene["colours"])) == "gray"
-        level = scene["levels"][1]
+        scale = scene["scales"][1]
         one, other = (
-            level_of(tmp_path / "web" / "tiles", image.shape, level, index) for index in (0, 1)
+            levels_at(tmp_path / "web" / "tiles", image.shape, scale, index) for index in (0, 1)
         )
         assert np.array_equal(one, other)
 

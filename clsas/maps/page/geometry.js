@@ -21,7 +21,7 @@ if (!scene) trouble("scene.js is missing: copy the whole folder, not only this p
 if (!window.DecompressionStream) trouble("This browser is too old: any from 2023 on will do.");
 
 const [ROWS, COLUMNS] = scene.shape;
-const [COARSEST, FINEST] = scene.levels;
+const [COARSEST, FINEST] = scene.scales; // numbered as levels of Deep Zoom
 const SIDE = scene.side;
 const BRIGHTEST = 255; // level of 0 dB; 0 where nothing was received
 const LOWEST_DB = -Math.floor((BRIGHTEST - 1) * scene.step_db);
