@@ -26,12 +26,7 @@ def affine(place: Georeference, grid: Grid) -> Affine:
     validate.instance("grid", grid, Grid)
     origin_m, row_step_m, column_step_m = grid.vectors_m
     right, down = (_on_map(place, step) for step in (column_step_m, row_step_m))
-    rows, columns = grid.shape
-    # A single row or column has no step: it is as wide as the pixels of the other axis.
-    if rows == 1 and not down.any():
-        down = np.array([-right[1], right[0]])
-    if columns == 1 and not right.any():
-        right = np.array([down[1], -down[0]])
+    down, right = completed_steps((grid.shape[0], grid.shape[1]), down, right)
     lengths = math.hypot(*right) * math.hypot(*down)
     if abs(right[0] * down[1] - right[1] * down[0]) <= _PARALLEL * lengths:
         raise ValueError(
@@ -42,6 +37,23 @@ def affine(place: Georeference, grid: Grid) -> Affine:
         *(float(right[0]), float(down[0]), float(corner[0])),
         *(float(right[1]), float(down[1]), float(corner[1])),
     )
+
+
+def completed_steps(
+    shape: tuple[int, int], row_step: NDArray[np.float64], column_step: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the row step and the column step of a grid, with those that are zero replaced.
+
+    A single row or column may have no step: it is then as wide as the pixels of the other axis,
+    which is turned by a quarter about the vertical. Steps have two or three coordinates. They stay
+    zero where the other one is zero or vertical.
+    """
+    rows, columns = shape
+    if rows == 1 and not row_step.any():
+        row_step = _turned(column_step)
+    if columns == 1 and not column_step.any():
+        column_step = -_turned(row_step)
+    return row_step, column_step
 
 
 def north_up(place: Georeference, grid: Grid, pixel_m: float | None = None) -> Grid:
@@ -91,6 +103,13 @@ def cover(
     left, bottom = (math.floor(min(each) / pixel_m + 1e-6) for each in (east, north))
     right, top = (math.ceil(max(each) / pixel_m - 1e-6) for each in (east, north))
     return left, bottom, top - bottom, right - left
+
+
+def _turned(step: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the horizontal part of a step, turned by a quarter from x to y."""
+    turned = np.zeros_like(step)
+    turned[:2] = -step[1], step[0]
+    return turned
 
 
 def _on_map(place: Georeference, step_m: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -156,6 +156,7 @@ def export(
         viewer.write(
             opened,
             path,
+            names=[_name_of(source)],
             dynamic_range_db=given["dynamic_range_db"],
             colour_map=colour_map,
             georeference=georeference,
@@ -229,6 +230,13 @@ def _opened(source: Image | Store | str | os.PathLike) -> Image | Store:
     if not isinstance(found, Image):
         raise ValueError(f"source must contain an image, but {path} has {type(found).__name__}")
     return found
+
+
+def _name_of(source: Image | Store | str | os.PathLike) -> str:
+    """Return the name of an image for the page of a folder: that of its file, if it has one."""
+    if isinstance(source, Image | Store):
+        return "image"
+    return validate.printable(validate.path("source", source).resolve().name)
 
 
 def _check_map(source: Source, given: dict[str, Any]) -> None:

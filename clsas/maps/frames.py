@@ -10,6 +10,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from clsas.core.grid import Grid
+from clsas.core.map_grids import completed_steps
 
 _LEVEL = 0.5  # cosine between the normal of a plane and the vertical above which it is a map
 _DEGREE = 5  # of polynomials for latitudes and longitudes
@@ -38,7 +39,7 @@ class Frame:
         is turned by quarters until x points to the right as far as possible. Another plane is
         turned until z points up, and its other coordinate increases to the right.
         """
-        _, row_step_m, column_step_m = grid.vectors_m
+        row_step_m, column_step_m = steps_of(grid)
         along = _unit(column_step_m)
         across = _unit(row_step_m - (row_step_m @ along) * along)
         normal = np.cross(along, across)
@@ -56,13 +57,37 @@ class Frame:
         Positions on the screen are ``origin + row_step * row + column_step * column``, in metres
         along `right` and `up`.
         """
-        vectors = dict(zip(("origin", "row_step", "column_step"), grid.vectors_m, strict=True))
+        steps_m = steps_of(grid)
+        vectors = {"origin": grid.vectors_m[0], "row_step": steps_m[0], "column_step": steps_m[1]}
         axes = np.stack([self.right, self.up])
         return {
             "axes": axes.tolist(),
             **{name: vector.tolist() for name, vector in vectors.items()},
             **{f"screen_{name}": (axes @ vector).tolist() for name, vector in vectors.items()},
         }
+
+
+def steps_of(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the row step and the column step of a plane or height map, metres.
+
+    A single row or column whose step is zero, or parallel to the other one, is as wide as the
+    pixels of the other axis. A single pixel without steps has sides of 1 m.
+    """
+    _, row_step_m, column_step_m = grid.vectors_m
+    rows, columns = grid.shape
+    if not np.cross(row_step_m, column_step_m).any():
+        row_step_m = row_step_m * (rows > 1 or columns == 1)
+        column_step_m = column_step_m * (columns > 1)
+    given_m = row_step_m, column_step_m
+    length_m = max(float(np.linalg.norm(step)) for step in given_m) or 1.0
+    row_step_m, column_step_m = completed_steps((rows, columns), row_step_m, column_step_m)
+    # What is still missing is beside a vertical step, or there are no steps.
+    row_step_m = row_step_m if row_step_m.any() else np.array([0.0, 1.0, 0.0])
+    column_step_m = column_step_m if column_step_m.any() else np.array([1.0, 0.0, 0.0])
+    return (
+        row_step_m if given_m[0].any() else length_m * _unit(row_step_m),
+        column_step_m if given_m[1].any() else length_m * _unit(column_step_m),
+    )
 
 
 def geographic_of(grid: Grid) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
@@ -80,7 +105,8 @@ def fitted_degrees(
     """Return Chebyshev series of latitude and longitude over rows and columns.
 
     The page evaluates the series where the cursor is, without a library for map projections. Rows
-    and columns from the first to the last pixel become arguments from -1 to 1.
+    and columns from the first to the last pixel become arguments from -1 to 1; for a single one,
+    these are its edges.
 
     Returns
     -------
@@ -90,9 +116,10 @@ def fitted_degrees(
     """
     nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     row, column = np.meshgrid(nodes, nodes, indexing="ij")
-    origin_m, row_step_m, column_step_m = grid.vectors_m
+    origin_m, (row_step_m, column_step_m) = grid.vectors_m[0], steps_of(grid)
     rows, columns = (
-        (n - 1) / 2 * (1 + at) for n, at in zip(grid.shape, (row, column), strict=True)
+        (n - 1) / 2 + max(n - 1, 1) / 2 * at
+        for n, at in zip(grid.shape, (row, column), strict=True)
     )
     positions_m = origin_m + rows[..., None] * row_step_m + columns[..., None] * column_step_m
     degrees = np.asarray(to_geographic(positions_m))[..., :2].reshape(-1, 2)

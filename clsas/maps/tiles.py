@@ -113,12 +113,12 @@ class _Tile:
     missing: int  # pixels that have not been added yet
 
 
-def levels_of(shape: tuple[int, int]) -> range:
-    """Return the levels of a pyramid, coarsest first.
+def scales_of(shape: tuple[int, int]) -> range:
+    """Return the scales of a pyramid, coarsest first.
 
-    They are numbered as in Deep Zoom: level 0 would be a single pixel, and each has twice as many
-    pixels as the one before along either side. The coarsest level here is the largest that fits
-    into one tile.
+    They are numbered as the levels of Deep Zoom: scale 0 would be a single pixel, and each has
+    twice as many pixels as the one before along either side. The coarsest scale here is the largest
+    that fits into one tile.
     """
     finest = math.ceil(math.log2(max(shape)))
     return range(finest - max(0, math.ceil(math.log2(max(shape) / SIDE))), finest + 1)
@@ -126,7 +126,7 @@ def levels_of(shape: tuple[int, int]) -> range:
 
 @dataclass(eq=False)
 class Pyramid:
-    """Tiles of an image at all levels, which are written as soon as all their pixels are known.
+    """Tiles of an image at all scales, which are written as soon as all their pixels are known.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ class Pyramid:
         Shape of the image.
     levels : Levels
     folder : Path
-        Folder of the tiles: LEVEL/COLUMN_ROW.js.
+        Folder of the tiles: SCALE/COLUMN_ROW.js.
     name : str
         Name of the image, by which its tiles call the page.
     """
@@ -147,20 +147,20 @@ class Pyramid:
 
     def __post_init__(self) -> None:
         """Create the folders."""
-        for level in levels_of(self.shape):
-            (self.folder / str(level)).mkdir(parents=True)
+        for scale in scales_of(self.shape):
+            (self.folder / str(scale)).mkdir(parents=True)
 
     def add(self, rows: slice, columns: slice, pixels: NDArray[np.complex64]) -> None:
-        """Add the pixels of a window to the tiles of all levels. Windows must not overlap."""
+        """Add the pixels of a window to the tiles of all scales. Windows must not overlap."""
         power = self.levels.power(pixels)
-        self._add(levels_of(self.shape)[-1], rows.start, columns.start, power)
+        self._add(scales_of(self.shape)[-1], rows.start, columns.start, power)
 
-    def _add(self, level: int, top: int, left: int, power: NDArray[np.float32]) -> None:
-        """Add power at a place of a level, and what it completes to coarser levels."""
+    def _add(self, scale: int, top: int, left: int, power: NDArray[np.float32]) -> None:
+        """Add power at a place of a scale, and what it completes to coarser scales."""
         bottom, right = top + power.shape[0], left + power.shape[1]
         for row in range(top // SIDE, (bottom - 1) // SIDE + 1):
             for column in range(left // SIDE, (right - 1) // SIDE + 1):
-                tile = self._tile(level, row, column)
+                tile = self._tile(scale, row, column)
                 rows, columns = (
                     slice(max(first, index * SIDE), min(last, (index + 1) * SIDE))
                     for first, last, index in ((top, bottom, row), (left, right, column))
@@ -173,12 +173,12 @@ class Pyramid:
                 )
                 tile.missing -= part.size
                 if not tile.missing:
-                    self._finish(level, row, column)
+                    self._finish(scale, row, column)
 
-    def _tile(self, level: int, row: int, column: int) -> _Tile:
-        key = level, row, column
+    def _tile(self, scale: int, row: int, column: int) -> _Tile:
+        key = scale, row, column
         if key not in self._pending:
-            factor = 1 << (levels_of(self.shape)[-1] - level)
+            factor = 1 << (scales_of(self.shape)[-1] - scale)
             height, width = (
                 min(math.ceil(n / factor) - index * SIDE, SIDE)
                 for n, index in zip(self.shape, (row, column), strict=True)
@@ -186,14 +186,14 @@ class Pyramid:
             self._pending[key] = _Tile(np.empty((height, width), np.float32), height * width)
         return self._pending[key]
 
-    def _finish(self, level: int, row: int, column: int) -> None:
-        """Write a tile, and add its means to the next coarser level."""
-        power = self._pending.pop((level, row, column)).power
-        path = self.folder / str(level) / f"{column}_{row}.js"
+    def _finish(self, scale: int, row: int, column: int) -> None:
+        """Write a tile, and add its means to the next coarser scale."""
+        power = self._pending.pop((scale, row, column)).power
+        path = self.folder / str(scale) / f"{column}_{row}.js"
         packed = base64.b64encode(_packed(self.levels.encode(power))).decode()
-        path.write_text(f'clsasTile("{self.name}/{level}/{column}_{row}","{packed}");\n')
-        if level > levels_of(self.shape)[0]:
-            self._add(level - 1, row * SIDE // 2, column * SIDE // 2, halved(power))
+        path.write_text(f'clsasTile("{self.name}/{scale}/{column}_{row}","{packed}");\n')
+        if scale > scales_of(self.shape)[0]:
+            self._add(scale - 1, row * SIDE // 2, column * SIDE // 2, halved(power))
 
 
 def halved(power: NDArray[np.float32]) -> NDArray[np.float32]:

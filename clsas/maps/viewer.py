@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from importlib import resources
 from itertools import product
@@ -20,9 +21,9 @@ from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.version import __version__
-from clsas.maps.frames import Frame, fitted_degrees, geographic_of
+from clsas.maps.frames import Frame, fitted_degrees, geographic_of, steps_of
 from clsas.maps.sources import placed
-from clsas.maps.tiles import BRIGHTEST, SIDE, STEP_DB, Levels, Pyramid, Source, levels_of
+from clsas.maps.tiles import BRIGHTEST, SIDE, STEP_DB, Levels, Pyramid, Source, scales_of
 from clsas.mosaics.store import Store
 from clsas.plot.colours import COLOUR_MAP
 from clsas.plot.colours import colour_map as colours_of
@@ -36,6 +37,7 @@ _START = "window.clsasScene = "  # of that file, by which folders of viewers are
 _SCRIPTS = ("geometry", "view", "tiles", "marks", "controls", "events")
 _FILES = (PAGE, "viewer.css", *(f"{name}.js" for name in _SCRIPTS))
 _COLOURS = ("inferno", "sonar", "gray")
+_ADDED = {".DS_Store", "Thumbs.db", "desktop.ini"}  # by file browsers, which show folders
 _SAME = 1e-6  # of a pixel, by which positions of two images may differ
 
 
@@ -64,7 +66,8 @@ def write(
         Folder to write, whose parent must exist. It must be new, empty, or an earlier viewer, which
         is replaced at the end.
     against : Image or Store, optional
-        Second image on the same grid, to blink or swipe against the first.
+        Second image on the same grid, to blink or swipe against the first. If only one of both has
+        a georeference, it counts for both.
     names : sequence of str
         Names of the images, for the page.
     dynamic_range_db : float, optional
@@ -80,7 +83,7 @@ def write(
     ------
     TypeError, ValueError
         If an argument has the wrong type or is outside its limits, an image is on points, the two
-        images have different grids, or a mosaic is damaged or changes meanwhile.
+        images have different grids or georeferences, or a mosaic is damaged or changes meanwhile.
     FileExistsError
         If the folder contains anything but a viewer.
     ImportError
@@ -119,7 +122,8 @@ def write(
     reference = max(_largest(reader, report) for reader in readers) or 1.0
     levels = Levels(reference, max(STEP_DB, range_db / (BRIGHTEST - 1)))
     scene = {"names": names, "range_db": range_db, "colours": tables}
-    scene |= _described(readers[0].shape, grids[0], levels)
+    known = next((grid for grid in grids if grid.georeference is not None), grids[0])
+    scene |= _described(readers[0].shape, known, levels)
     scene |= {"patches": _patches(source) if isinstance(source, Store) else []}
     with replacing_folder(folder) as made:
         for name in _FILES:
@@ -144,23 +148,55 @@ def check_folder(folder: Path) -> None:
         If the folder contains anything but a viewer, or is a file.
     FileNotFoundError
         If its parent does not exist.
+    OSError
+        If the folder cannot be renamed, or its parent cannot be written.
     """
-    if not folder.absolute().parent.is_dir():
+    parent = folder.absolute().parent
+    if not parent.is_dir():
         raise FileNotFoundError(f"cannot write {folder}: there is no folder {folder.parent}")
-    if not os.path.lexists(folder):
+    current = Path.cwd().is_relative_to(os.path.realpath(folder))
+    if current or os.path.ismount(folder) or folder.name == "..":
+        raise OSError(
+            f"cannot write the folder {folder}: the current folder, those above it and mount "
+            "points cannot be renamed; choose a new folder"
+        )
+    try:
+        exists = _exists(folder)
+        with tempfile.TemporaryFile(dir=parent):
+            pass
+    except OSError as error:
+        raise type(error)(f"{folder} cannot be written: {error.strerror}") from error
+    if not exists:
         return
     if not folder.is_dir() or folder.is_symlink():
         raise FileExistsError(f"cannot write the folder {folder}: it is a file or a link")
-    if any(folder.iterdir()) and not is_viewer(folder):
+    if _names_in(folder) and not is_viewer(folder):
         raise FileExistsError(
             f"cannot write the folder {folder}: it contains files, and is no viewer of clsas; "
             "choose a new folder"
         )
 
 
+def _exists(path: Path) -> bool:
+    """Return whether there is a file, folder or link; raise OSError for too long a name."""
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def _names_in(folder: Path) -> set[str]:
+    """Return the names in a folder, except those that file browsers add."""
+    return {each.name for each in folder.iterdir()} - _ADDED
+
+
 def is_viewer(folder: Path) -> bool:
-    """Return whether a folder contains a viewer of clsas and nothing else."""
-    if {each.name for each in folder.iterdir()} != {*_FILES, _SCENE, "tiles"}:
+    """Return whether a folder contains a viewer of clsas and nothing else.
+
+    Files that file browsers add do not count.
+    """
+    if _names_in(folder) != {*_FILES, _SCENE, "tiles"}:
         return False
     with (folder / _SCENE).open(encoding="ascii", errors="replace") as file:
         return file.read(len(_START)) == _START
@@ -208,7 +244,7 @@ def _check_grids(grids: Sequence[Grid]) -> None:
     if len(grids) < 2:
         return
     one, other = grids
-    steps_m = min(float(np.linalg.norm(step)) for step in one.vectors_m[1:])
+    steps_m = min(float(np.linalg.norm(step)) for step in steps_of(one))
     most_m = max(
         float(np.abs(mine - theirs).max()) * count
         for mine, theirs, count in zip(one.vectors_m, other.vectors_m, (1, *one.shape), strict=True)
@@ -216,6 +252,12 @@ def _check_grids(grids: Sequence[Grid]) -> None:
     if one.shape != other.shape or most_m > _SAME * steps_m:
         raise ValueError(
             f"against must be on the grid of source, {one}, got {other}: form it on that grid"
+        )
+    places = [grid.georeference for grid in grids]
+    if None not in places and places[0] != places[1]:
+        raise ValueError(
+            f"against must have the georeference of source, {places[0]}, got {places[1]}: form "
+            "both with the same one"
         )
 
 
@@ -230,12 +272,12 @@ def _check_unchanged(store: Store, records: object) -> None:
 
 def _described(shape: tuple[int, int], grid: Grid, levels: Levels) -> dict[str, Any]:
     """Return what the page needs to know of a grid and of the tiles."""
-    scales, to_geographic = levels_of(shape), geographic_of(grid)
+    scales, to_geographic = scales_of(shape), geographic_of(grid)
     return {
         "version": __version__,
         "shape": shape,
         "side": SIDE,
-        "levels": [scales[0], scales[-1]],
+        "scales": [scales[0], scales[-1]],
         "reference": levels.reference,
         "step_db": levels.step_db,
         "frame": Frame.of(grid).describe(grid),

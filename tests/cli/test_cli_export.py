@@ -53,6 +53,7 @@ def test_a_folder_is_a_viewer(folder):
     assert said["file"] == "web"
     assert said["bytes"] > 1000
     assert '"latitude"' in (folder / "web" / "scene.js").read_text()
+    assert '"names": ["nowhere.h5"]' in (folder / "web" / "scene.js").read_text()
     code, output = run("image.h5", "web", "--as", "8bit")
     assert (code, "kind must be left out" in output) == (1, True)
 

@@ -5,6 +5,8 @@ import json
 import os
 import re
 import zlib
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ import clsas
 from clsas.cli import main
 from clsas.maps import tiles, viewer
 from clsas.maps.frames import Frame, fitted_degrees
-from clsas.maps.tiles import Levels, Pyramid, levels_of
+from clsas.maps.tiles import Levels, Pyramid, scales_of
 
 SHAPE = (700, 1300)
 PLANE = clsas.Grid.plane((-13, 12.98, 1300), (40, 53.98, 700))
@@ -45,18 +47,18 @@ def scene_of(folder):
     return json.loads(re.fullmatch(r"window\.clsasScene = (.*);\n", text)[1])
 
 
-def level_of(folder, shape, level, image=0):
-    """All levels of a pyramid's level, assembled from its tiles."""
-    factor = 2 ** (levels_of(shape)[-1] - level)
+def levels_at(folder, shape, scale, image=0):
+    """All levels at one scale of a pyramid, assembled from its tiles."""
+    factor = 2 ** (scales_of(shape)[-1] - scale)
     rows, columns = (-(-n // factor) for n in shape)
     found = np.zeros((rows, columns), np.uint8)
-    names = {path.name for path in (folder / str(image) / str(level)).iterdir()}
+    names = {path.name for path in (folder / str(image) / str(scale)).iterdir()}
     for row in range(0, rows, tiles.SIDE):
         for column in range(0, columns, tiles.SIDE):
             name = f"{column // tiles.SIDE}_{row // tiles.SIDE}"
             part = found[row : row + tiles.SIDE, column : column + tiles.SIDE]
-            text = (folder / str(image) / str(level) / f"{name}.js").read_text()
-            packed = re.fullmatch(rf'clsasTile\("{image}/{level}/{name}","(.*)"\);\n', text)[1]
+            text = (folder / str(image) / str(scale) / f"{name}.js").read_text()
+            packed = re.fullmatch(rf'clsasTile\("{image}/{scale}/{name}","(.*)"\);\n', text)[1]
             values = np.frombuffer(zlib.decompress(base64.b64decode(packed)), np.uint8)
             part[:] = values.reshape(part.shape)
             names.remove(f"{name}.js")
@@ -66,8 +68,8 @@ def level_of(folder, shape, level, image=0):
 
 def test_tiles_have_every_pixel_to_half_a_step(image, written):
     scene = scene_of(written)
-    assert scene["levels"] == [9, 11]  # 2048 is the first power of two that is not below 1300
-    found = level_of(written / "tiles", SHAPE, 11)
+    assert scene["scales"] == [9, 11]  # 2048 is the first power of two that is not below 1300
+    found = levels_at(written / "tiles", SHAPE, 11)
     nothing = image.pixels == 0
     assert np.array_equal(found == tiles.NOTHING, nothing)
     level_db = (found[~nothing].astype(float) - tiles.BRIGHTEST) * scene["step_db"]
@@ -76,7 +78,7 @@ def test_tiles_have_every_pixel_to_half_a_step(image, written):
 
 
 def test_coarse_tiles_are_means_of_power(image, written):
-    found = level_of(written / "tiles", SHAPE, 9)
+    found = levels_at(written / "tiles", SHAPE, 9)
     power = np.abs(image.pixels[:, : 4 * 325].astype(complex)) ** 2
     mean = power.reshape(175, 4, 325, 4).mean(axis=(1, 3)) / power.max()
     some = mean > 0
@@ -146,6 +148,43 @@ def test_a_plane_is_seen_from_above_and_never_mirrored(row_step, column_step, ri
         assert described["screen_column_step"][axis] == pytest.approx(column_step @ along)
 
 
+@pytest.mark.parametrize(
+    ("row_step", "column_step", "shape", "right", "up"),
+    [
+        (0 * X, 2 * X, (1, 5), X, Y),
+        (2 * X, 2 * X, (1, 5), X, Y),  # a row step along the row
+        (2 * Y, 0 * X, (5, 1), X, Y),
+        (2 * (Y - X), 0 * X, (5, 1), (X + Y) / np.sqrt(2), (Y - X) / np.sqrt(2)),
+        (0 * X, 2 * Z, (1, 5), Y, Z),
+        (0 * X, 2 * Z + 1e-15 * Y, (1, 5), X, Z),
+        (2 * Z, 0 * X, (5, 1), X, Z),
+        (0 * X, 0 * X, (1, 1), X, Y),
+        (2 * X, 2 * X, (1, 1), X, Y),
+    ],
+)
+def test_a_single_row_or_column_is_as_wide_as_its_pixels(
+    tmp_path, row_step, column_step, shape, right, up
+):
+    grid = clsas.Grid.oriented((1, 2, 3), row_step, column_step, shape)
+    frame = Frame.of(grid)
+    np.testing.assert_allclose([frame.right, frame.up], [right, up], atol=1e-12)
+    viewer.write(clsas.Image(speckle(shape), grid), tmp_path / "web")
+    described = scene_of(tmp_path / "web")["frame"]
+    steps = [described["row_step"], described["column_step"]]
+    assert np.ptp(np.linalg.norm(steps, axis=1)) < 1e-12
+    assert np.dot(*steps) == pytest.approx(0, abs=1e-12)
+    for found, step, n in zip(steps, (row_step, column_step), shape, strict=True):
+        assert n == 1 or found == pytest.approx(step)
+
+
+def test_degrees_beside_a_single_row_show_the_north():
+    """The page turns its arrow by the slopes along rows and columns."""
+    grid = clsas.Grid.plane((0, 100, 51), (20, 20, 1))
+    found = fitted_degrees(grid, lambda at: 60 + at[..., [1, 0]] * 1e-5)
+    edges = np.polynomial.chebyshev.chebval2d([-1, 1], [0, 0], found["latitude"])
+    assert np.diff(edges) == pytest.approx(2e-5)  # 2 m
+
+
 @pytest.mark.parametrize("longitude_deg", [5.3, 179.99])
 def test_degrees_are_right_to_a_centimetre(longitude_deg):
     """On a sphere, at a latitude of 75 degrees, in a scene of 20 km."""
@@ -197,6 +236,29 @@ class TestFolder:
         with pytest.raises(FileNotFoundError, match="there is no folder"):
             viewer.write(small, tmp_path / "new" / "web")
 
+    def test_that_cannot_be_renamed_is_refused_before_pixels_are_read(
+        self, image, tmp_path, monkeypatch
+    ):
+        monkeypatch.setattr(viewer, "_reader", None)
+        (tmp_path / "here" / "below").mkdir(parents=True)
+        monkeypatch.chdir(tmp_path / "here")
+        for folder in (".", tmp_path / "here", "below/..", "/proc"):
+            with pytest.raises(OSError, match=r"cannot write the folder .* be renamed; choose"):
+                viewer.check_folder(Path(folder))
+        for folder in ("/proc/web", "n" * 300):
+            with pytest.raises(OSError, match=f"{folder} cannot be written: "):
+                viewer.write(image, folder)
+
+    @pytest.mark.parametrize("name", [".DS_Store", "Thumbs.db", "desktop.ini"])
+    def test_may_contain_what_file_browsers_add(self, image, tmp_path, name):
+        small = clsas.Image(image.pixels[:20, :30], image.grid.window(slice(20), slice(30)))
+        folder = tmp_path / "web"
+        folder.mkdir()
+        for _ in range(2):
+            (folder / name).touch()
+            viewer.write(small, folder)
+            assert not (folder / name).exists()
+
     @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
     def test_of_an_interrupted_export_is_the_one_before(self, image, tmp_path, monkeypatch, error):
         small = clsas.Image(image.pixels[:20, :30], image.grid.window(slice(20), slice(30)))
@@ -242,6 +304,32 @@ def test_what_the_viewer_cannot_show_is_refused(image, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+class TestGeoreferences:
+    """Of two images."""
+
+    @pytest.fixture
+    def images(self, image):
+        places = [None, *(clsas.Georeference.local(60, 5, heading_deg=h) for h in (0, 90))]
+        grid = image.grid.window(slice(5), slice(5))
+        grids = [replace(grid, georeference=place) for place in places]
+        return [clsas.Image(image.pixels[:5, :5], each) for each in grids]
+
+    def test_that_differ_are_refused(self, images, tmp_path):
+        _, one, other = images
+        with pytest.raises(
+            ValueError, match="against must have the georeference of source, latitude"
+        ):
+            viewer.write(one, tmp_path / "web", against=other)
+        assert not list(tmp_path.iterdir())
+
+    def test_of_one_image_counts_for_both(self, images, tmp_path):
+        for index, pair in enumerate((images[:2], images[1::-1], images[1:2] * 2)):
+            viewer.write(pair[0], tmp_path / str(index), against=pair[1])
+        known = [scene_of(tmp_path / str(index))["geographic"] for index in range(3)]
+        assert known[0] == known[1] == known[2]
+        assert known[0] is not None
+
+
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
     path = tmp_path_factory.mktemp("store") / "a.zarr"
@@ -265,7 +353,7 @@ class TestStore:
         assert seen == [(done, 12) for done in range(1, 13)]
         monkeypatch.undo()
         pixels = opened.read()
-        found = level_of(tmp_path / "web" / "tiles", GRID.shape, levels_of(GRID.shape)[-1])
+        found = levels_at(tmp_path / "web" / "tiles", GRID.shape, scales_of(GRID.shape)[-1])
         expected = tiles.BRIGHTEST + clsas.Image(pixels, GRID).db() / 0.4
         assert np.abs(found - np.maximum(expected, 1)).max() <= 0.51
         patches = scene_of(tmp_path / "web")["patches"]
@@ -318,9 +406,9 @@ class TestCommand:
         assert scene["names"] == ["a.zarr", "image.h5"]
         assert scene["range_db"] == 40
         assert next(iter(scene["colours"])) == "gray"
-        level = scene["levels"][1]
+        scale = scene["scales"][1]
         one, other = (
-            level_of(tmp_path / "web" / "tiles", image.shape, level, index) for index in (0, 1)
+            levels_at(tmp_path / "web" / "tiles", image.shape, scale, index) for index in (0, 1)
         )
         assert np.array_equal(one, other)
 
@@ -328,6 +416,8 @@ class TestCommand:
         (tmp_path / "full").mkdir()
         (tmp_path / "full" / "a.txt").touch()
         assert "is no viewer of clsas" in self.run(store, tmp_path / "full", code=2)
+        assert "the current folder" in self.run(store, ".", code=2)
+        assert "cannot be written" in self.run(store, "/proc/web", code=2)
         assert "must not lie in the store" in self.run(store, store / "web", code=2)
         assert "--no-open requires FOLDER" in self.run(store, "--no-open", code=2)
         clsas.save(tmp_path / "lines.h5", LINES)

@@ -1,6 +1,7 @@
 """The viewer in a headless Chromium: what a user sees, clicks and types."""
 
 import re
+import shutil
 from io import BytesIO
 
 import numpy as np
@@ -180,6 +181,30 @@ def test_the_address_keeps_the_view(page, folder):
     assert position(page) == pytest.approx(BRIGHT[0], abs=2e-3)
 
 
+@pytest.mark.parametrize(
+    ("address", "low", "high"),
+    [
+        ("#colours=constructor", -60, 0),
+        ("#low=5&high=10", -1, 0),
+        ("#low=-300&high=-200", -101, -100),
+        ("#low=-3.0&high=-2.9", -3.9, -2.9),
+        ("#low=-3&high=Infinity", -60, 0),
+    ],
+)
+def test_a_wrong_address_is_brought_within_limits(page, folder, address, low, high):
+    page.open(folder / "index.html", address=address)
+    found = [page.text(f"#{end}-db").replace("−", "-") for end in ("low", "high")]
+    assert found == [f"{low:.1f} dB", f"{high:.1f} dB"]
+    assert page.js("document.querySelector('#colours').value") == "gray"
+
+
+def test_an_address_far_away_ends_beside_the_image(page, folder):
+    page.open(folder / "index.html", address="#u=1e300&v=-1e300&scale=1e300")
+    u, v = page.js("[view.u, view.v]")
+    assert abs(u) < 50
+    assert abs(v) < 100
+
+
 def test_fits_a_narrow_window(page, folder):
     page.open(folder / "index.html", width=400, height=700)
     assert page.js("document.querySelector('#panel').hidden")
@@ -263,6 +288,31 @@ def test_a_slanted_grid_with_a_georeference_and_patches(browser, tmp_path, monke
     north = "document.querySelector('#north svg').style.transform"
     assert float(browser.js(north)[7:-4]) == pytest.approx(30, abs=0.5)
     assert browser.errors == []
+
+
+@pytest.mark.parametrize("damage", ["removed", "empty", "cut"])
+def test_missing_tiles_are_named(browser, folder, tmp_path, damage):
+    shutil.copytree(folder, tmp_path / "web")
+    browser.open(tmp_path / "web" / "index.html")
+    assert browser.text("#missing") == ""
+    for path in (tmp_path / "web" / "tiles").rglob("*.js"):
+        if damage == "removed":
+            path.unlink()
+        else:
+            name = path.relative_to(tmp_path / "web" / "tiles").with_suffix("").as_posix()
+            path.write_text("" if damage == "empty" else f'clsasTile("{name}","AA==");')
+    browser.open(tmp_path / "web" / "index.html")
+    browser.move(500, 300)
+    browser.settle()
+    assert browser.text("#missing") == "tile missing: copy the whole folder"
+    assert browser.text("#level") == "missing"
+
+
+def test_a_level_is_loading_before_its_tile_has_come(page):
+    page.move(500, 300)
+    page.js("tiles.forEach(tile => { tile.levels = null; })")
+    page.js("showReadout()")
+    assert page.text("#level") == "loading"
 
 
 def test_an_incomplete_copy_says_what_is_missing(browser, folder, tmp_path):

@@ -166,13 +166,19 @@ function readAddress() {
   const parts = new URLSearchParams(location.hash.slice(1));
   const number = (name) => (parts.get(name) === null ? NaN : Number(parts.get(name)));
   if ([number("low"), number("high")].every(Number.isFinite) && number("high") > number("low")) {
-    levels.low = Math.max(number("low"), LOWEST_DB);
-    levels.high = Math.min(number("high"), 0);
+    levels.high = Math.min(Math.max(number("high"), LOWEST_DB + LEAST_DB), 0);
+    levels.low = Math.min(Math.max(number("low"), LOWEST_DB), levels.high - LEAST_DB);
   }
-  if (parts.get("colours") in scene.colours) levels.colours = parts.get("colours");
+  if (Object.hasOwn(scene.colours, parts.get("colours"))) levels.colours = parts.get("colours");
   if (number("scale") > 0 && Number.isFinite(number("u")) && Number.isFinite(number("v"))) {
     Object.assign(view, { u: number("u"), v: number("v"), scale: number("scale") });
-    zoom(1); // within limits
+    // Within limits. The middle of the view may be beside the image, where controls cover a part.
+    const most = Math.max(...bounds.map(([low, high]) => high - low));
+    ["u", "v"].forEach((name, axis) => {
+      const [low, high] = bounds[axis];
+      view[name] = Math.min(Math.max(view[name], low - most), high + most);
+    });
+    zoom(1);
   } else {
     fit();
   }

@@ -21,7 +21,7 @@ if (!scene) trouble("scene.js is missing: copy the whole folder, not only this p
 if (!window.DecompressionStream) trouble("This browser is too old: any from 2023 on will do.");
 
 const [ROWS, COLUMNS] = scene.shape;
-const [COARSEST, FINEST] = scene.levels;
+const [COARSEST, FINEST] = scene.scales; // numbered as levels of Deep Zoom
 const SIDE = scene.side;
 const BRIGHTEST = 255; // level of 0 dB; 0 where nothing was received
 const LOWEST_DB = -Math.floor((BRIGHTEST - 1) * scene.step_db);
@@ -74,11 +74,14 @@ function chebyshev(at, count) {
   return terms;
 }
 
+// Index as the argument of a series: from -1 to 1 between the first and last pixel.
+const inUnits = (index, count) => (2 * index - (count - 1)) / Math.max(count - 1, 1);
+
 // Latitude and longitude of a pixel, degrees.
 function geographic(column, row) {
   const sum = (table) => {
-    const rows = chebyshev(ROWS > 1 ? (2 * row) / (ROWS - 1) - 1 : 0, table.length);
-    const columns = chebyshev(COLUMNS > 1 ? (2 * column) / (COLUMNS - 1) - 1 : 0, table[0].length);
+    const rows = chebyshev(inUnits(row, ROWS), table.length);
+    const columns = chebyshev(inUnits(column, COLUMNS), table[0].length);
     return table.reduce((all, line, i) =>
       all + line.reduce((part, factor, j) => part + factor * rows[i] * columns[j], 0), 0);
   };

@@ -168,7 +168,10 @@ function showReadout() {
   const parts = shownAxes.map((axis) => `${AXES[axis]} ${minus(inMetres(position[axis] ?? 0))} m`);
   show("cursor", inside ? parts.join(", ") : "");
   const db = inside ? levelAt(imageAt(), c, r) : null;
-  show("level", !inside ? "" : db === null ? "no data" : `${minus(db.toFixed(1))} dB`);
+  const unknown = isMissing(imageAt(), c, r) ? "missing" : "loading";
+  const level = db === undefined ? unknown : db === null ? "no data" : `${minus(db.toFixed(1))} dB`;
+  show("level", inside ? level : "");
+  show("missing", missing.size ? "tile missing: copy the whole folder" : "");
   let text = "";
   if (inside && scene.geographic) {
     const [latitude, longitude] = geographic(column, row);

@@ -8,6 +8,7 @@ const AT_ONCE = 8; // scripts that are loaded at the same time
 const MOST_TILES = 300; // that are kept: 1.3 MB each
 
 const tiles = new Map(); // by "image/level/column_row", oldest use first
+const missing = new Set(); // names of tiles that could not be loaded
 let wanted = [], loading = 0, palette = null, paletteVersion = 0;
 
 const levelShape = (level) => {
@@ -18,13 +19,17 @@ const levelShape = (level) => {
 window.clsasTile = async (name, text) => {
   const tile = tiles.get(name);
   if (!tile) return;
+  tile.received = true;
   loading += 1; // until it is unpacked
   try {
     const packed = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
     const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
     const unpacked = new Uint8Array(await new Response(stream).arrayBuffer());
     if (unpacked.length === tile.width * tile.height) tile.levels = unpacked;
+  } catch {
+    // A damaged tile is a missing one.
   } finally {
+    if (!tile.levels) missing.add(name);
     loading -= 1;
     redraw();
   }
@@ -51,11 +56,12 @@ function loadWanted() {
     const [rows, columns] = levelShape(level);
     tiles.set(name, {
       width: Math.min(SIDE, columns - column * SIDE), height: Math.min(SIDE, rows - row * SIDE),
-      levels: null, canvas: null, version: -1,
+      levels: null, canvas: null, version: -1, received: false,
     });
     const script = document.createElement("script");
     const done = () => {
       script.remove();
+      if (!tiles.get(name)?.received) missing.add(name);
       loading -= 1;
       redraw();
     };
@@ -186,7 +192,8 @@ function drawCoarser(paper, image, level, column, row, x, y) {
   }
 }
 
-// Level of a pixel in the finest loaded tile that has it, dB; null if it is unknown or nothing.
+// Level of a pixel in the finest loaded tile that has it, dB; null if nothing was received there,
+// and undefined if no tile is loaded.
 function levelAt(image, column, row) {
   for (let level = levelInView(); level >= COARSEST; level -= 1) {
     const factor = 2 ** (FINEST - level);
@@ -196,5 +203,12 @@ function levelAt(image, column, row) {
     const value = tile.levels[(r % SIDE) * tile.width + (c % SIDE)];
     return value ? (value - BRIGHTEST) * scene.step_db : null;
   }
-  return null;
+  return undefined;
+}
+
+// Whether the tile of a pixel, in the level that is drawn, could not be loaded.
+function isMissing(image, column, row) {
+  const level = levelInView();
+  const [c, r] = [column, row].map((index) => Math.floor(index / 2 ** (FINEST - level) / SIDE));
+  return missing.has(`${image}/${level}/${c}_${r}`);
 }
