@@ -203,13 +203,14 @@ def test_a_mosaic_and_a_part_of_it(store, figures):
 @pytest.mark.slow
 def test_a_mosaic_is_read_patch_by_patch(store, monkeypatch):
     """So one larger than memory is drawn as well."""
-    read, sizes = clsas.Store.read, []
+    read, sizes = clsas.Store._read, []
 
-    def recorded(self, rows, columns):
-        sizes.append((rows.stop - rows.start) * (columns.stop - columns.start))
-        return read(self, rows, columns)
+    def recorded(self, *window):
+        found = read(self, *window)
+        sizes.append(found.size)
+        return found
 
-    monkeypatch.setattr(clsas.Store, "read", recorded)
+    monkeypatch.setattr(clsas.Store, "_read", recorded)
     run(store)
     assert sum(sizes) == PLANE.size
     assert max(sizes) <= 14 * 21  # pixels of a patch

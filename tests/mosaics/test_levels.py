@@ -402,7 +402,9 @@ class TestOtherPrograms:
         assert data.amplitude_db.attrs["units"] == "dB"
         amplitude = np.where(expected(8)[0] > 0, expected(8)[0], np.nan)
         np.testing.assert_allclose(data.amplitude_db, 20 * np.log10(amplitude), atol=1e-4)
+        pyplot = pytest.importorskip("matplotlib.pyplot")
         assert data.amplitude_db.plot() is not None
+        pyplot.close()
         level = xarray.open_zarr(store.path, group="4x", consolidated=False)
         np.testing.assert_allclose(level.amplitude, expected(4)[0], rtol=1e-6)
         middles = [np.mean(GRID.axes_m[0][i : i + 4]) for i in range(0, 84, 4)]
