@@ -587,6 +587,7 @@ def halved(case, tolerance_db):
     return changed(planned(case, tolerance_db), half_precision=True)
 
 
+@pytest.mark.slow
 def test_half_precision_adds_what_is_predicted(device):
     chosen = halved(swaying, -50)
     single = changed(chosen, half_precision=False)
