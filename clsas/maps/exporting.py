@@ -62,7 +62,8 @@ def export(
         Image, finished mosaic, or path of a file or store that contains one.
     path : path-like
         File to write, or folder. An existing one is replaced in one step, but a folder only if it
-        contains a viewer.
+        contains a viewer. Files beside it that describe the one it replaces, such as statistics in
+        ``.aux.xml``, are removed.
     kind : {"db", "complex", "8bit"}, optional
         Pixels of a GeoTIFF: the amplitude in dB (float32, NaN where nothing was received; the
         default), complex numbers (complex64), or 8-bit levels with a colour table.
@@ -170,6 +171,7 @@ def export(
     tags = _tags(found, plan, lines)
     if suffix in netcdf.SUFFIXES:
         netcdf.write(path, found, tags)
+        world_files.remove_sidecars(path)
         return
     _check_map(found, given)
     options = Options(
@@ -181,6 +183,7 @@ def export(
         colour_map=colour_map or COLOUR_MAP,
     )
     geotiff.write(path, found, options, tags, progress)
+    world_files.remove_sidecars(path)
 
 
 def _check(given: dict[str, Any], suffix: str) -> None:

@@ -22,7 +22,8 @@ def write_picture(path: Path, image: Image, options: dict[str, Any]) -> None:
     """Write a picture of an image. A PNG of a georeferenced image gets two files beside it.
 
     These are a world file (.pgw) and GDAL's auxiliary file (.png.aux.xml), which has the coordinate
-    reference system. If they cannot be written, the picture remains.
+    reference system. If they cannot be written, the picture remains. Beside a PNG without a place
+    on a map, such files of an earlier picture are removed, since they would put it at a wrong one.
 
     Raises
     ------
@@ -37,6 +38,7 @@ def write_picture(path: Path, image: Image, options: dict[str, Any]) -> None:
     place = image.georeference
     if path.suffix.lower() != ".png" or place is None or image.grid.points_m is not None:
         save(figure, path)
+        remove_sidecars(path)
         return
     wkt = place.wkt()
     affine = _of_picture(figure, image)
@@ -54,6 +56,25 @@ def write_picture(path: Path, image: Image, options: dict[str, Any]) -> None:
     )
     with replacing(path.with_name(f"{path.name}.aux.xml")) as temporary:
         temporary.write_text(described)
+
+
+def remove_sidecars(path: Path) -> None:
+    """Remove files beside a new file that describe the one it replaced.
+
+    GDAL and programs for maps keep statistics, a georeference and overviews in them, and believe
+    them rather than the file.
+
+    Raises
+    ------
+    OSError
+        If such a file cannot be removed.
+    """
+    path.with_name(f"{path.name}.aux.xml").unlink(missing_ok=True)
+    suffix = path.suffix.lower()
+    if suffix == ".png":
+        path.with_suffix(".pgw").unlink(missing_ok=True)
+    elif suffix in (".tif", ".tiff"):
+        path.with_name(f"{path.name}.ovr").unlink(missing_ok=True)
 
 
 def _of_picture(figure: Figure, image: Image) -> Affine:

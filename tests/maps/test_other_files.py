@@ -84,6 +84,20 @@ def test_a_png_has_its_place_on_the_map(place, tmp_path):
     np.testing.assert_allclose((c, f), at(placed, 0.5, 0.5))
 
 
+def test_files_beside_a_replaced_file_do_not_describe_the_new_one(tmp_path):
+    pytest.importorskip("matplotlib")
+    image, _ = scene(local(217.0))
+    nowhere = clsas.Image(image.pixels, replace(image.grid, georeference=None))
+    clsas.export(image, tmp_path / "a.png")
+    for name in ("b.tif.aux.xml", "b.tif.ovr", "c.nc.aux.xml", "b.pgw"):
+        (tmp_path / name).touch()
+    clsas.export(nowhere, tmp_path / "a.png")
+    clsas.export(image, tmp_path / "b.tif")
+    clsas.export(nowhere, tmp_path / "c.nc")
+    names = sorted(p.name for p in tmp_path.iterdir())
+    assert names == ["a.png", "b.pgw", "b.tif", "c.nc"]  # b.pgw belongs to another picture
+
+
 def test_pictures_without_a_place_stand_alone(tmp_path):
     pytest.importorskip("matplotlib")
     image, _ = scene(UTM_NORTH)
