@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import pyproj
 
 _SEMI_MAJOR_M, _SQUARED_ECCENTRICITY = 6378137.0, 0.0066943799901413165  # WGS 84
+_VERTICAL = ("up", "down")  # directions of the third axis
 
 
 def checked(
@@ -68,7 +69,13 @@ def _worst(values: NDArray[np.float64]) -> float:
 
 @lru_cache(maxsize=32)
 def known(name: str) -> pyproj.CRS:
-    """Return a projected coordinate reference system in metres; raise ValueError for others."""
+    """Return a projected coordinate reference system that `Georeference.projected` accepts.
+
+    Raises
+    ------
+    ValueError
+        If it is unknown, not a projection in metres, or its axes do not point east and north.
+    """
     with needed("coordinate reference systems"):
         import pyproj
         from pyproj.exceptions import CRSError
@@ -91,6 +98,14 @@ def known(name: str) -> pyproj.CRS:
     if units - {"metre"}:
         raise ValueError(
             f"crs must be in metres, got {validate.shown(name)} in {', '.join(sorted(units))}"
+        )
+    # The order of the axes does not matter: coordinates are always given easting first.
+    directions = [axis.direction for axis in found.axis_info if axis.direction not in _VERTICAL]
+    if sorted(directions) != ["east", "north"]:
+        raise ValueError(
+            "crs must have axes that point east and north, got one whose axes point "
+            f"{' and '.join(directions)}: {validate.shown(name)}; use a local georeference "
+            "(latitude, longitude and heading), also near the poles, or UTM"
         )
     return found
 

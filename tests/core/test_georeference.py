@@ -90,6 +90,7 @@ def test_equal_places_are_equal():
     )
     assert clsas.Georeference.projected("epsg:32632") == UTM
     assert str(UTM) == "EPSG:32632"
+    assert str(clsas.Georeference.projected("EPSG:31467")) == "EPSG:31467"  # northing first
 
 
 @pytest.mark.parametrize(
@@ -98,6 +99,9 @@ def test_equal_places_are_equal():
         (lambda: clsas.Georeference.projected("EPSG:99999"), "crs must be one that PROJ knows"),
         (lambda: clsas.Georeference.projected("EPSG:4326"), "got a geographic one: 'EPSG:4326'"),
         (lambda: clsas.Georeference.projected("EPSG:2263"), "must be in metres"),
+        (lambda: clsas.Georeference.projected("EPSG:2048"), "axes point west and south: 'EPSG:2048'"),
+        (lambda: clsas.Georeference.projected("EPSG:3031"), "north and north: .*, or UTM$"),
+        (lambda: clsas.Georeference(crs="EPSG:3413").wkt(), "axes point south and south"),
         (lambda: clsas.Georeference(crs="EPSG:99999").wkt(), "crs must be one that PROJ knows"),
         (lambda: clsas.Georeference(), "latitude_deg must be given unless crs is"),
         (lambda: replace(UTM, heading_deg=3.0), "heading_deg must be left out with crs"),
