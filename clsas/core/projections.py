@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import pyproj
 
 _SEMI_MAJOR_M, _SQUARED_ECCENTRICITY = 6378137.0, 0.0066943799901413165  # WGS 84
+_DEGREE_KM = 111.3  # of latitude, to 1 %
 _VERTICAL = ("up", "down")  # directions of the third axis
 
 
@@ -108,6 +109,31 @@ def known(name: str) -> pyproj.CRS:
             "(latitude, longitude and heading), also near the poles, or UTM"
         )
     return found
+
+
+def outside_km(crs: pyproj.CRS, latitude_deg: float, longitude_deg: float) -> float:
+    """Return about how far a place lies outside the area of use of a map; 0 if none is known."""
+    area = crs.area_of_use
+    if area is None and crs.sub_crs_list:  # a compound one, with heights
+        area = crs.sub_crs_list[0].area_of_use
+    if area is None:
+        return 0.0
+    north = max(area.south - latitude_deg, latitude_deg - area.north, 0.0)
+    east = 0.0
+    if area.east - area.west < 360:
+        # An area across the antimeridian has its western edge east of the eastern one.
+        width = (area.east - area.west) % 360
+        past = (longitude_deg - area.west) % 360
+        east = 0.0 if past <= width else min(past - width, 360 - past)
+    return math.hypot(north, east * math.cos(math.radians(latitude_deg))) * _DEGREE_KM
+
+
+def scale_of(crs: pyproj.CRS, latitude_deg: float, longitude_deg: float) -> float:
+    """Return the point scale of a map: the one along a meridian or parallel farther from 1."""
+    import pyproj
+
+    factors = pyproj.Proj(crs).get_factors(longitude_deg, latitude_deg)
+    return max(factors.meridional_scale, factors.parallel_scale, key=lambda scale: abs(scale - 1))
 
 
 @lru_cache(maxsize=32)

@@ -6,7 +6,7 @@ import os
 from dataclasses import replace
 from typing import Any
 
-from clsas.core import validate
+from clsas.core import map_grids, validate
 from clsas.core.georeference import Georeference
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -110,7 +110,9 @@ def export(
     Warns
     -----
     ClsasWarning
-        If 8-bit levels leave out the heights of a height map.
+        If 8-bit levels leave out the heights of a height map, or if the middle of the grid is more
+        than 150 km outside the area of use of its map projection, or where the scale of the map
+        differs from 1 by more than 1 %.
 
     See Also
     --------
@@ -170,10 +172,12 @@ def export(
     found = Source.of(opened, georeference)
     tags = _tags(found, plan, lines)
     if suffix in netcdf.SUFFIXES:
+        map_grids.warn_of_place(found.grid)
         netcdf.write(path, found, tags)
         world_files.remove_sidecars(path)
         return
     _check_map(found, given)
+    map_grids.warn_of_place(found.grid)
     options = Options(
         kind=kind or "db",
         north_up=north_up,

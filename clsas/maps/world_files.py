@@ -10,7 +10,7 @@ import numpy as np
 
 from clsas.core.atomic import replacing
 from clsas.core.image import Image
-from clsas.core.map_grids import Affine
+from clsas.core.map_grids import Affine, warn_of_place
 from clsas.plot import image_db
 from clsas.plot.canvas import PADDING_IN, PNG_DPI, length_unit, save
 
@@ -40,6 +40,7 @@ def write_picture(path: Path, image: Image, options: dict[str, Any]) -> None:
         save(figure, path)
         remove_sidecars(path)
         return
+    warn_of_place(image.grid)
     wkt = place.wkt()
     affine = _of_picture(figure, image)
     save(figure, path)
