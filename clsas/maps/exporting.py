@@ -49,7 +49,8 @@ def export(
 
     - ``.tif``, a cloud-optimized GeoTIFF, for programs of maps. Its overviews are means of power.
       A mosaic is read window by window and may be larger than memory.
-    - ``.nc``, a netCDF 4 file after the CF conventions, with level, real and imaginary parts.
+    - ``.nc``, a netCDF 4 file after the CF conventions, with level (dB re 1, NaN where nothing was
+      received), real and imaginary parts.
     - ``.png``, ``.pdf`` or ``.svg``, a picture as `clsas.plot.image_db` draws it. A PNG of an image
       with a georeference gets a world file (``.pgw``) and a file with the coordinate reference
       system (``.png.aux.xml``).
@@ -186,7 +187,8 @@ def export(
         reference=given["reference"],
         colour_map=colour_map or COLOUR_MAP,
     )
-    geotiff.write(path, found, options, tags, progress)
+    texts = {name: v if isinstance(v, str) else f"{v:.12g}" for name, v in tags.items()}
+    geotiff.write(path, found, options, texts, progress)
     world_files.remove_sidecars(path)
 
 
@@ -262,8 +264,8 @@ def _check_map(source: Source, given: dict[str, Any]) -> None:
         )
 
 
-def _tags(source: Source, plan: Plan | None, lines: RangeLines | None) -> dict[str, str]:
-    """Return what is known of an image's origin, as tags of a file."""
+def _tags(source: Source, plan: Plan | None, lines: RangeLines | None) -> dict[str, Any]:
+    """Return what is known of an image's origin, as tags of a file: texts and numbers."""
     place, inputs = source.grid.georeference, source.inputs
     errors = [r.predicted_error_db for r in source.records.values() if r.has_pixels]
     known: dict[str, Any] = {
@@ -292,11 +294,7 @@ def _tags(source: Source, plan: Plan | None, lines: RangeLines | None) -> dict[s
                 "ORIGIN_HEIGHT_M": place.height_m,
                 "X_AXIS_HEADING_DEG": place.heading_deg,
             }
-    return {
-        name: value if isinstance(value, str) else f"{value:.12g}"
-        for name, value in known.items()
-        if value is not None
-    }
+    return {name: value for name, value in known.items() if value is not None}
 
 
 def _placed(source: Image | Store, georeference: Georeference | None) -> Image:

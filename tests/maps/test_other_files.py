@@ -25,9 +25,13 @@ def test_netcdf_restores_the_image_and_its_place(place, tmp_path):
     assert data.attrs["Conventions"] == "CF-1.11"
     pixels = data.pixels_real.values + 1j * data.pixels_imag.values
     np.testing.assert_array_equal(pixels, image.pixels)
-    np.testing.assert_allclose(
-        data.amplitude_db, image.db(reference=data.attrs["reference_amplitude"]), atol=1e-4
-    )
+    assert data.attrs["reference_amplitude"] == 1.0  # as in a GeoTIFF and in stores
+    level = np.where(image.pixels == 0, np.nan, image.db(reference=1.0))
+    np.testing.assert_allclose(data.amplitude_db, level, atol=1e-4)
+    assert data.amplitude_db.dtype == np.float32
+    if place is not None and not place.is_projected:
+        assert data.attrs["origin_latitude_deg"] == place.latitude_deg  # a number
+        assert data.attrs["x_axis_heading_deg"] == place.heading_deg
     if place is None:
         assert data.amplitude_db.dims == ("y", "x")
         assert "spatial_ref" not in data.coords
