@@ -28,7 +28,26 @@ _PARALLEL = 1e-6  # sine of the least angle between rows and columns, seen from 
 def affine(place: Georeference, grid: Grid) -> Affine:
     """Return the transform from columns and rows of a grid to easting and northing."""
     validate.instance("grid", grid, Grid)
-    origin_m, row_step_m, column_step_m = grid.vectors_m
+    right, down = _steps(place, grid)
+    if _are_parallel(right, down):
+        raise ValueError(
+            "grid must not be vertical: seen from above, its rows and columns are parallel"
+        )
+    corner = place.to_map(grid.vectors_m[0])[:2] - (right + down) / 2
+    return (
+        *(float(right[0]), float(down[0]), float(corner[0])),
+        *(float(right[1]), float(down[1]), float(corner[1])),
+    )
+
+
+def is_vertical(place: Georeference, grid: Grid) -> bool:
+    """Return True if rows and columns of a grid that has them are parallel, seen from above."""
+    return _are_parallel(*_steps(place, grid))
+
+
+def _steps(place: Georeference, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return easting and northing of the steps from column to column and from row to row."""
+    _, row_step_m, column_step_m = grid.vectors_m
     right, down = (_on_map(place, step) for step in (column_step_m, row_step_m))
     rows, columns = grid.shape
     # A single row or column has no step: it is as wide as the pixels of the other axis.
@@ -36,16 +55,13 @@ def affine(place: Georeference, grid: Grid) -> Affine:
         down = np.array([-right[1], right[0]])
     if columns == 1 and not right.any():
         right = np.array([down[1], -down[0]])
+    return right, down
+
+
+def _are_parallel(right: NDArray[np.float64], down: NDArray[np.float64]) -> bool:
+    """Return True if two steps on the map are parallel, or one of them is 0."""
     lengths = math.hypot(*right) * math.hypot(*down)
-    if abs(right[0] * down[1] - right[1] * down[0]) <= _PARALLEL * lengths:
-        raise ValueError(
-            "grid must not be vertical: seen from above, its rows and columns are parallel"
-        )
-    corner = place.to_map(origin_m)[:2] - (right + down) / 2
-    return (
-        *(float(right[0]), float(down[0]), float(corner[0])),
-        *(float(right[1]), float(down[1]), float(corner[1])),
-    )
+    return bool(abs(right[0] * down[1] - right[1] * down[0]) <= _PARALLEL * lengths)
 
 
 def north_up(place: Georeference, grid: Grid, pixel_m: float | None = None) -> Grid:

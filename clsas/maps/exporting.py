@@ -53,7 +53,7 @@ def export(
       received), real and imaginary parts.
     - ``.png``, ``.pdf`` or ``.svg``, a picture as `clsas.plot.image_db` draws it. A PNG of an image
       with a georeference gets a world file (``.pgw``) and a file with the coordinate reference
-      system (``.png.aux.xml``).
+      system (``.png.aux.xml``), unless it is a vertical plane.
     - no suffix, a folder whose ``index.html`` shows the image in any browser, as `clsas view` does.
       A mosaic may be larger than memory.
 

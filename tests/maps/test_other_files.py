@@ -102,6 +102,13 @@ def test_files_beside_a_replaced_file_do_not_describe_the_new_one(tmp_path):
     assert names == ["a.png", "b.pgw", "b.tif", "c.nc"]  # b.pgw belongs to another picture
 
 
+def test_a_png_of_a_vertical_plane_has_no_place_on_a_map(tmp_path):
+    pytest.importorskip("matplotlib")
+    grid = clsas.Grid.oriented([0, 0, -9], [0, 0, 1], [1, 0.5, 0], (9, 9), georeference=local(30.0))
+    clsas.export(clsas.Image(np.ones((9, 9), complex), grid), tmp_path / "a.png")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
+
+
 def test_pictures_without_a_place_stand_alone(tmp_path):
     pytest.importorskip("matplotlib")
     image, _ = scene(UTM_NORTH)
