@@ -47,8 +47,9 @@ def export(
 
     The suffix of `path` determines the format:
 
-    - ``.tif``, a cloud-optimized GeoTIFF, for programs of maps. Its overviews are means of power.
-      A mosaic is read window by window and may be larger than memory.
+    - ``.tif``, a cloud-optimized GeoTIFF, for programs of maps. Its overviews are the mean power of
+      the pixels that received something. A mosaic is read window by window and may be larger than
+      memory.
     - ``.nc``, a netCDF 4 file after the CF conventions, with level (dB re 1, NaN where nothing was
       received), real and imaginary parts.
     - ``.png``, ``.pdf`` or ``.svg``, a picture as `clsas.plot.image_db` draws it. A PNG of an image
