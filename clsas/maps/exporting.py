@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from clsas.core import map_grids, validate
@@ -64,8 +65,8 @@ def export(
         Image, finished mosaic, or path of a file or store that contains one.
     path : path-like
         File to write, or folder. An existing one is replaced in one step, but a folder only if it
-        contains a viewer. Files beside it that describe the one it replaces, such as statistics in
-        ``.aux.xml``, are removed.
+        contains a viewer. Its name must not begin or end with a dot. Files beside it that describe
+        the one it replaces, such as statistics in ``.aux.xml``, are removed.
     kind : {"db", "complex", "8bit"}, optional
         Pixels of a GeoTIFF: the amplitude in dB (float32, NaN where nothing was received; the
         default), complex numbers (complex64), or 8-bit levels with a colour table.
@@ -139,6 +140,7 @@ def export(
     >>> clsas.export(clsas.Store.opened("mosaic.zarr"), "mosaic.tif", kind="8bit")  # doctest: +SKIP
     """
     path = validate.path("path", path)
+    check_name("path", path)
     validate.suffix("path", path, *SUFFIXES)
     suffix = path.suffix.lower()
     given: dict[str, Any] = {
@@ -191,6 +193,16 @@ def export(
     texts = {name: v if isinstance(v, str) else f"{v:.12g}" for name, v in tags.items()}
     geotiff.write(path, found, options, texts, progress)
     world_files.remove_sidecars(path)
+
+
+def check_name(name: str, path: Path) -> None:
+    """Raise ValueError for a file name like ".tif" or "image.", whose suffix was meant otherwise.
+
+    Such a name has no suffix, so that a folder would be written.
+    """
+    last = path.name
+    if last != ".." and (last.startswith(".") or last.endswith(".")):
+        raise ValueError(f"{name} must not begin or end with a dot, got {validate.shown(last)}")
 
 
 def _check(given: dict[str, Any], suffix: str) -> None:

@@ -120,6 +120,9 @@ def test_pictures_without_a_place_stand_alone(tmp_path):
         clsas.export(image, tmp_path / "b.png", kind="db")
     with pytest.raises(ValueError, match=r"reference must be left out, .* on \.nc"):
         clsas.export(image, tmp_path / "b.nc", reference=1.0)
+    for name in (".tif", "bad.", ".hidden.png"):
+        with pytest.raises(ValueError, match=r"path must not begin or end with a dot, got '"):
+            clsas.export(image, tmp_path / name)
     clsas.save(tmp_path / "grid.h5", image.grid)
     with pytest.raises(ValueError, match=r"source must contain an image, but .*grid.h5 has Grid"):
         clsas.export(tmp_path / "grid.h5", tmp_path / "b.tif")
