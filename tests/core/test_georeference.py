@@ -100,7 +100,7 @@ def test_equal_places_are_equal():
         (lambda: clsas.Georeference.projected("EPSG:99999"), "crs must be one that PROJ knows"),
         (lambda: clsas.Georeference.projected("EPSG:4326"), "got a geographic one: 'EPSG:4326'"),
         (lambda: clsas.Georeference.projected("EPSG:2263"), "must be in metres"),
-        (lambda: clsas.Georeference.projected("EPSG:2048"), "axes point west and south: 'EPSG:2048'"),
+        (lambda: clsas.Georeference.projected("EPSG:2048"), "axes point west and south: "),
         (lambda: clsas.Georeference.projected("EPSG:3031"), "north and north: .*, or UTM$"),
         (lambda: clsas.Georeference(crs="EPSG:3413").wkt(), "axes point south and south"),
         (lambda: clsas.Georeference(crs="EPSG:99999").wkt(), "crs must be one that PROJ knows"),
