@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from clsas.cli.view import Folder, size_of
 from clsas.core import reading, validate
 from clsas.files.hdf5 import read_geometry
 from clsas.maps.encoding import KINDS
-from clsas.maps.exporting import SUFFIXES
+from clsas.maps.exporting import SUFFIXES, check_name
 
 
 class _Target(File):
@@ -28,6 +30,10 @@ class _Target(File):
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Path:
         """Return the path; a usage error if nothing can be written there."""
+        try:
+            check_name("its name", Path(value))
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
         kind = Output(*SUFFIXES) if Path(value).suffix else Folder()
         return kind.convert(value, param, ctx)
 
@@ -109,11 +115,11 @@ def export(
         keep_out("OUTPUT", output, "the store", source)
     known: dict[str, Any] = {}
     if plan_path is not None:
-        known["plan"] = clsas.Plan.from_json(reading.read_bytes(plan_path).decode())
+        known["plan"] = _plan(plan_path)
     if lines_path is not None:
         known["lines"], _ = read_geometry(lines_path)
     start = time.perf_counter()
-    with progress_bar("exporting") as progress:
+    with progress_bar("exporting") as progress, _naming_options():
         clsas.export(
             source, output, kind=kind, reference=reference, georeference=place, progress=progress,
             **levels, **given, **known,
@@ -125,6 +131,33 @@ def export(
         f"{printable(output)}: {size_bytes / 1e6:.3g} MB in {seconds:.2f} s",
         file=output, bytes=size_bytes, seconds=seconds,
     )  # fmt: skip
+
+
+def _plan(path: Path) -> clsas.Plan:
+    """Return the plan in a file; raise ValueError that names the option and the file."""
+    wanted = f"--plan {printable(path)} must be a plan of `clsas plan --json --filters`"
+    try:
+        return clsas.Plan.from_json(reading.read_bytes(path).decode())
+    except UnicodeDecodeError:
+        raise ValueError(f"{wanted}, but it is not text") from None
+    except ValueError as error:
+        reason = str(error).removeprefix("text must be a plan as of Plan.to_json: ")
+        raise ValueError(f"{wanted}: {reason}") from None
+
+
+@contextmanager
+def _naming_options() -> Iterator[None]:
+    """Let errors name the options of the command, not the arguments of `clsas.export`."""
+    command = click.get_current_context().command
+    names = {each.name: each.opts[0] for each in command.params if isinstance(each, click.Option)}
+    names |= {"plan": "--plan", "lines": "--lines", "georeference": "--crs (or --origin)"}
+    try:
+        yield
+    except ValueError as error:
+        name, _, rest = str(error).partition(" ")
+        if type(error) is not ValueError or name not in names:
+            raise
+        raise ValueError(f"{names[name]} {rest}") from error
 
 
 def _georeference(

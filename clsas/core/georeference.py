@@ -146,7 +146,8 @@ class Georeference:
         Raises
         ------
         TypeError, ValueError
-            If `crs` is unknown or is not a projection in metres.
+            If `crs` is unknown, is not a projection in metres, or its axes do not point east and
+            north, such as those of polar stereographic projections.
         ImportError
             If pyproj is not installed (extra `maps`).
 

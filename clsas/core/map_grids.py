@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
+from clsas.core import projections, validate
 from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 
@@ -18,25 +18,45 @@ Affine = tuple[float, float, float, float, float, float]
 """Transform from columns and rows to easting and northing: see `Georeference.affine`."""
 
 _ROUNDING = 1e-12  # part of a step that may come from rounding: 1e-7 pixels over 100 000
+# Distance outside the area of use that is no mistake: zones of UTM are used as far beyond their
+# edges, such as zone 32 in western Norway. Places near x = 0 are farther away.
+_OUTSIDE_KM = 150.0
+_SCALE = 0.01  # difference of the scale from 1 that is probably a mistake: 0.001 within UTM zones
 _PARALLEL = 1e-6  # sine of the least angle between rows and columns, seen from above
 
 
 def affine(place: Georeference, grid: Grid) -> Affine:
     """Return the transform from columns and rows of a grid to easting and northing."""
     validate.instance("grid", grid, Grid)
-    origin_m, row_step_m, column_step_m = grid.vectors_m
-    right, down = (_on_map(place, step) for step in (column_step_m, row_step_m))
-    down, right = completed_steps((grid.shape[0], grid.shape[1]), down, right)
-    lengths = math.hypot(*right) * math.hypot(*down)
-    if abs(right[0] * down[1] - right[1] * down[0]) <= _PARALLEL * lengths:
+    right, down = _steps(place, grid)
+    if _are_parallel(right, down):
         raise ValueError(
             "grid must not be vertical: seen from above, its rows and columns are parallel"
         )
-    corner = place.to_map(origin_m)[:2] - (right + down) / 2
+    corner = place.to_map(grid.vectors_m[0])[:2] - (right + down) / 2
     return (
         *(float(right[0]), float(down[0]), float(corner[0])),
         *(float(right[1]), float(down[1]), float(corner[1])),
     )
+
+
+def is_vertical(place: Georeference, grid: Grid) -> bool:
+    """Return True if rows and columns of a grid that has them are parallel, seen from above."""
+    return _are_parallel(*_steps(place, grid))
+
+
+def _steps(place: Georeference, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return easting and northing of the steps from column to column and from row to row."""
+    _, row_step_m, column_step_m = grid.vectors_m
+    right, down = (_on_map(place, step) for step in (column_step_m, row_step_m))
+    down, right = completed_steps((grid.shape[0], grid.shape[1]), down, right)
+    return right, down
+
+
+def _are_parallel(right: NDArray[np.float64], down: NDArray[np.float64]) -> bool:
+    """Return True if two steps on the map are parallel, or one of them is 0."""
+    lengths = math.hypot(*right) * math.hypot(*down)
+    return bool(abs(right[0] * down[1] - right[1] * down[0]) <= _PARALLEL * lengths)
 
 
 def completed_steps(
@@ -72,6 +92,36 @@ def north_up(place: Georeference, grid: Grid, pixel_m: float | None = None) -> G
     steps_m = np.zeros((2, 3))  # of columns to the east, and of rows to the north
     steps_m[:, :2] = pixel_m * place.axes.T
     return Grid.oriented(first_m, steps_m[1], steps_m[0], (rows, columns), georeference=place)
+
+
+def warn_of_place(grid: Grid) -> None:
+    """Warn if the middle of a grid lies where its map projection is not meant to be used.
+
+    Warns
+    -----
+    ClsasWarning
+        If it is outside the map, far outside the area of use of the coordinate reference system, or
+        if the scale differs from 1 by more than 1 % there.
+    """
+    place = grid.georeference
+    if place is None or not place.is_projected:
+        return
+    hint = "; check the coordinate reference system, and that x and y are easting and northing"
+    crs = place.map_crs()
+    try:
+        latitude, longitude, _ = place.to_geographic(np.mean(grid.bounds_m, axis=0))
+    except ValueError:
+        validate.warn(f"the middle of the grid is outside the map of {place}{hint}")
+        return
+    outside_km = projections.outside_km(crs, latitude, longitude)
+    scale = projections.scale_of(crs, latitude, longitude)
+    is_outside = outside_km > _OUTSIDE_KM
+    if is_outside or not abs(scale - 1) <= _SCALE:
+        area = f"{outside_km:.0f} km outside the area of use of {place}, " if is_outside else ""
+        validate.warn(
+            f"the middle of the grid is at latitude {latitude:.4f}, longitude {longitude:.4f}, "
+            f"{area}where distances on the map are {scale:.4g} times true ones{hint}"
+        )
 
 
 def cover(

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     import pyproj
 
 _SEMI_MAJOR_M, _SQUARED_ECCENTRICITY = 6378137.0, 0.0066943799901413165  # WGS 84
+_DEGREE_KM = 111.3  # of latitude, to 1 %
+_VERTICAL = ("up", "down")  # directions of the third axis
 
 
 def checked(
@@ -68,7 +70,13 @@ def _worst(values: NDArray[np.float64]) -> float:
 
 @lru_cache(maxsize=32)
 def known(name: str) -> pyproj.CRS:
-    """Return a projected coordinate reference system in metres; raise ValueError for others."""
+    """Return a projected coordinate reference system that `Georeference.projected` accepts.
+
+    Raises
+    ------
+    ValueError
+        If it is unknown, not a projection in metres, or its axes do not point east and north.
+    """
     with needed("coordinate reference systems"):
         import pyproj
         from pyproj.exceptions import CRSError
@@ -92,7 +100,40 @@ def known(name: str) -> pyproj.CRS:
         raise ValueError(
             f"crs must be in metres, got {validate.shown(name)} in {', '.join(sorted(units))}"
         )
+    # The order of the axes does not matter: coordinates are always given easting first.
+    directions = [axis.direction for axis in found.axis_info if axis.direction not in _VERTICAL]
+    if sorted(directions) != ["east", "north"]:
+        raise ValueError(
+            "crs must have axes that point east and north, got one whose axes point "
+            f"{' and '.join(directions)}: {validate.shown(name)}; use a local georeference "
+            "(latitude, longitude and heading), also near the poles, or UTM"
+        )
     return found
+
+
+def outside_km(crs: pyproj.CRS, latitude_deg: float, longitude_deg: float) -> float:
+    """Return about how far a place lies outside the area of use of a map; 0 if none is known."""
+    area = crs.area_of_use
+    if area is None and crs.sub_crs_list:  # a compound one, with heights
+        area = crs.sub_crs_list[0].area_of_use
+    if area is None:
+        return 0.0
+    north = max(area.south - latitude_deg, latitude_deg - area.north, 0.0)
+    east = 0.0
+    if area.east - area.west < 360:
+        # An area across the antimeridian has its western edge east of the eastern one.
+        width = (area.east - area.west) % 360
+        past = (longitude_deg - area.west) % 360
+        east = 0.0 if past <= width else min(past - width, 360 - past)
+    return math.hypot(north, east * math.cos(math.radians(latitude_deg))) * _DEGREE_KM
+
+
+def scale_of(crs: pyproj.CRS, latitude_deg: float, longitude_deg: float) -> float:
+    """Return the point scale of a map: the one along a meridian or parallel farther from 1."""
+    import pyproj
+
+    factors = pyproj.Proj(crs).get_factors(longitude_deg, latitude_deg)
+    return max(factors.meridional_scale, factors.parallel_scale, key=lambda scale: abs(scale - 1))
 
 
 @lru_cache(maxsize=32)

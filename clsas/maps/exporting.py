@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from clsas.core import validate
+from clsas.core import map_grids, validate
 from clsas.core.georeference import Georeference
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
@@ -47,12 +48,14 @@ def export(
 
     The suffix of `path` determines the format:
 
-    - ``.tif``, a cloud-optimized GeoTIFF, for programs of maps. Its overviews are means of power.
-      A mosaic is read window by window and may be larger than memory.
-    - ``.nc``, a netCDF 4 file after the CF conventions, with level, real and imaginary parts.
+    - ``.tif``, a cloud-optimized GeoTIFF, for programs of maps. Its overviews are the mean power of
+      the pixels that received something. A mosaic is read window by window and may be larger than
+      memory.
+    - ``.nc``, a netCDF 4 file after the CF conventions, with level (dB re 1, NaN where nothing was
+      received), real and imaginary parts.
     - ``.png``, ``.pdf`` or ``.svg``, a picture as `clsas.plot.image_db` draws it. A PNG of an image
       with a georeference gets a world file (``.pgw``) and a file with the coordinate reference
-      system (``.png.aux.xml``).
+      system (``.png.aux.xml``), unless it is a vertical plane.
     - no suffix, a folder whose ``index.html`` shows the image in any browser, as `clsas view` does.
       A mosaic may be larger than memory.
 
@@ -62,7 +65,8 @@ def export(
         Image, finished mosaic, or path of a file or store that contains one.
     path : path-like
         File to write, or folder. An existing one is replaced in one step, but a folder only if it
-        contains a viewer.
+        contains a viewer. Its name must not begin or end with a dot. Files beside it that describe
+        the one it replaces, such as statistics in ``.aux.xml``, are removed.
     kind : {"db", "complex", "8bit"}, optional
         Pixels of a GeoTIFF: the amplitude in dB (float32, NaN where nothing was received; the
         default), complex numbers (complex64), or 8-bit levels with a colour table.
@@ -109,7 +113,9 @@ def export(
     Warns
     -----
     ClsasWarning
-        If 8-bit levels leave out the heights of a height map.
+        If 8-bit levels leave out the heights of a height map, or if the middle of the grid is more
+        than 150 km outside the area of use of its map projection, or where the scale of the map
+        differs from 1 by more than 1 %.
 
     See Also
     --------
@@ -134,6 +140,7 @@ def export(
     >>> clsas.export(clsas.Store.opened("mosaic.zarr"), "mosaic.tif", kind="8bit")  # doctest: +SKIP
     """
     path = validate.path("path", path)
+    check_name("path", path)
     validate.suffix("path", path, *SUFFIXES)
     suffix = path.suffix.lower()
     given: dict[str, Any] = {
@@ -170,9 +177,12 @@ def export(
     found = Source.of(opened, georeference)
     tags = _tags(found, plan, lines)
     if suffix in netcdf.SUFFIXES:
+        map_grids.warn_of_place(found.grid)
         netcdf.write(path, found, tags)
+        world_files.remove_sidecars(path)
         return
     _check_map(found, given)
+    map_grids.warn_of_place(found.grid)
     options = Options(
         kind=kind or "db",
         north_up=north_up,
@@ -181,7 +191,19 @@ def export(
         reference=given["reference"],
         colour_map=colour_map or COLOUR_MAP,
     )
-    geotiff.write(path, found, options, tags, progress)
+    texts = {name: v if isinstance(v, str) else f"{v:.12g}" for name, v in tags.items()}
+    geotiff.write(path, found, options, texts, progress)
+    world_files.remove_sidecars(path)
+
+
+def check_name(name: str, path: Path) -> None:
+    """Raise ValueError for a file name like ".tif" or "image.", whose suffix was meant otherwise.
+
+    Such a name has no suffix, so that a folder would be written.
+    """
+    last = path.name
+    if last != ".." and (last.startswith(".") or last.endswith(".")):
+        raise ValueError(f"{name} must not begin or end with a dot, got {validate.shown(last)}")
 
 
 def _check(given: dict[str, Any], suffix: str) -> None:
@@ -263,8 +285,8 @@ def _check_map(source: Source, given: dict[str, Any]) -> None:
         )
 
 
-def _tags(source: Source, plan: Plan | None, lines: RangeLines | None) -> dict[str, str]:
-    """Return what is known of an image's origin, as tags of a file."""
+def _tags(source: Source, plan: Plan | None, lines: RangeLines | None) -> dict[str, Any]:
+    """Return what is known of an image's origin, as tags of a file: texts and numbers."""
     place, inputs = source.grid.georeference, source.inputs
     errors = [r.predicted_error_db for r in source.records.values() if r.has_pixels]
     known: dict[str, Any] = {
@@ -293,11 +315,7 @@ def _tags(source: Source, plan: Plan | None, lines: RangeLines | None) -> dict[s
                 "ORIGIN_HEIGHT_M": place.height_m,
                 "X_AXIS_HEADING_DEG": place.heading_deg,
             }
-    return {
-        name: value if isinstance(value, str) else f"{value:.12g}"
-        for name, value in known.items()
-        if value is not None
-    }
+    return {name: value for name, value in known.items() if value is not None}
 
 
 def _placed(source: Image | Store, georeference: Georeference | None) -> Image:

@@ -2,7 +2,8 @@
 
 GDAL's driver for cloud-optimized files copies a file and its overviews in the required order. The
 file and each overview are first written here, since GDAL would average decibels or complex numbers
-instead of power.
+instead of power. A pixel of an overview is the mean power of the pixels that received something;
+those that did not are left out, as GDAL leaves out pixels without data.
 """
 
 from __future__ import annotations

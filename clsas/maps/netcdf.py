@@ -5,13 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from clsas.core import validate
 from clsas.core.atomic import replacing
 from clsas.core.extras import needed
 from clsas.core.image import Image
 from clsas.core.version import __version__
 from clsas.files.xarrays import GRID_MAPPING, to_xarray
+from clsas.maps.encoding import Encoding
 from clsas.maps.sources import Source
+from clsas.plot.levels import DYNAMIC_RANGE_DB
 
 if TYPE_CHECKING:
     import xarray
@@ -19,11 +23,12 @@ if TYPE_CHECKING:
 SUFFIXES = (".nc",)
 """Suffix of netCDF files."""
 
+_REFERENCE = 1.0  # amplitude of 0 dB
 _BYTES = 40  # memory of a pixel: complex number, level, coordinates, and the file in memory
 _ALONG = {"x": "Along-track", "y": "Across-track"}
 
 
-def write(path: Path, source: Source, tags: dict[str, str]) -> None:
+def write(path: Path, source: Source, tags: dict[str, Any]) -> None:
     """Write a netCDF 4 file; an existing file is replaced in one step.
 
     Raises
@@ -48,12 +53,21 @@ def write(path: Path, source: Source, tags: dict[str, str]) -> None:
         temporary.write_bytes(content)
 
 
-def _dataset(image: Image, tags: dict[str, str]) -> xarray.Dataset:
-    """Return an image with coordinates of the CF conventions."""
+def _dataset(image: Image, tags: dict[str, Any]) -> xarray.Dataset:
+    """Return an image with coordinates of the CF conventions.
+
+    Levels are those of a GeoTIFF and of stores: relative to 1, and NaN where nothing was received.
+    """
     grid = image.grid
     array = to_xarray(image)
-    reference = array.attrs["reference"]
-    array.attrs = {name: v for name, v in array.attrs.items() if name != "Conventions"}
+    level = Encoding("db", _REFERENCE, DYNAMIC_RANGE_DB).encode(np.abs(image.pixels))
+    array = array.copy(data=level)
+    of_level = {
+        "long_name": "Amplitude re 1",
+        "reference": _REFERENCE,
+        "comment": "20 log10(amplitude / reference); NaN where a pixel is 0",
+    }
+    array.attrs = {name: v for name, v in array.attrs.items() if name != "Conventions"} | of_level
     data = array.to_dataset().reset_coords(["pixels_real", "pixels_imag"])
     if grid.georeference is not None:
         for name in data.data_vars:
@@ -64,7 +78,7 @@ def _dataset(image: Image, tags: dict[str, str]) -> xarray.Dataset:
         "Conventions": "CF-1.11",
         "title": "Synthetic aperture image",
         "source": f"clsas {__version__}",
-        "reference_amplitude": reference,
+        "reference_amplitude": _REFERENCE,
         **{name.lower(): value for name, value in tags.items()},
     }
     compressed = {"zlib": True, "complevel": 1, "shuffle": True}

@@ -10,7 +10,7 @@ import numpy as np
 
 from clsas.core.atomic import replacing
 from clsas.core.image import Image
-from clsas.core.map_grids import Affine
+from clsas.core.map_grids import Affine, is_vertical, warn_of_place
 from clsas.plot import image_db
 from clsas.plot.canvas import PADDING_IN, PNG_DPI, length_unit, save
 
@@ -21,23 +21,27 @@ if TYPE_CHECKING:
 def write_picture(path: Path, image: Image, options: dict[str, Any]) -> None:
     """Write a picture of an image. A PNG of a georeferenced image gets two files beside it.
 
+    A vertical plane has no place on a map, and its PNG no such files.
+
     These are a world file (.pgw) and GDAL's auxiliary file (.png.aux.xml), which has the coordinate
-    reference system. If they cannot be written, the picture remains.
+    reference system. If they cannot be written, the picture remains. Beside a PNG without a place
+    on a map, such files of an earlier picture are removed, since they would put it at a wrong one.
 
     Raises
     ------
     ImportError
         If matplotlib is not installed, or pyproj for the coordinate reference system.
-    ValueError
-        If the image is vertical and has a georeference.
     OSError
         If a file cannot be written.
     """
     figure = image_db(image, **options)
-    place = image.georeference
-    if path.suffix.lower() != ".png" or place is None or image.grid.points_m is not None:
+    place, grid = image.georeference, image.grid
+    has_place = place is not None and grid.points_m is None and not is_vertical(place, grid)
+    if path.suffix.lower() != ".png" or place is None or not has_place:
         save(figure, path)
+        remove_sidecars(path)
         return
+    warn_of_place(grid)
     wkt = place.wkt()
     affine = _of_picture(figure, image)
     save(figure, path)
@@ -54,6 +58,25 @@ def write_picture(path: Path, image: Image, options: dict[str, Any]) -> None:
     )
     with replacing(path.with_name(f"{path.name}.aux.xml")) as temporary:
         temporary.write_text(described)
+
+
+def remove_sidecars(path: Path) -> None:
+    """Remove files beside a new file that describe the one it replaced.
+
+    GDAL and programs for maps keep statistics, a georeference and overviews in them, and believe
+    them rather than the file.
+
+    Raises
+    ------
+    OSError
+        If such a file cannot be removed.
+    """
+    path.with_name(f"{path.name}.aux.xml").unlink(missing_ok=True)
+    suffix = path.suffix.lower()
+    if suffix == ".png":
+        path.with_suffix(".pgw").unlink(missing_ok=True)
+    elif suffix in (".tif", ".tiff"):
+        path.with_name(f"{path.name}.ovr").unlink(missing_ok=True)
 
 
 def _of_picture(figure: Figure, image: Image) -> Affine:

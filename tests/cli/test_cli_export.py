@@ -1,6 +1,7 @@
 """The command `clsas export`."""
 
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -55,7 +56,7 @@ def test_a_folder_is_a_viewer(folder):
     assert '"latitude"' in (folder / "web" / "scene.js").read_text()
     assert '"names": ["nowhere.h5"]' in (folder / "web" / "scene.js").read_text()
     code, output = run("image.h5", "web", "--as", "8bit")
-    assert (code, "kind must be left out" in output) == (1, True)
+    assert (code, "--as must be left out" in output) == (1, True)
 
 
 def test_options_place_an_image(folder):
@@ -88,17 +89,23 @@ def test_options_place_an_image(folder):
             ("nowhere.h5", "a.tif", "--origin", "151.2,-33.9", "--heading-deg", 0), 1,
             "are probably swapped",
         ),
-        (("image.h5", "a.tif", "--crs", "EPSG:32632"), 1, "georeference must be left out"),
+        (("image.h5", "a.tif", "--crs", "EPSG:32632"), 1,
+         "--crs (or --origin) must be left out"),
         (("image.h5", "a.bmp"), 2, "must end in .tif or .tiff or .nc or .png"),
-        (("image.h5", "a.nc", "--as", "db"), 1, "kind must be left out"),
+        (("image.h5", "a.nc", "--as", "db"), 1, "--as must be left out"),
+        (("image.h5", "a.tif", "--plan", "image.h5"), 1, "--plan image.h5 must be a plan of"),
+        (("image.h5", "a.tif", "--plan", "bad.json"), 1, "--plan bad.json must be a plan of"),
+        (("image.h5", ".tif"), 2, "its name must not begin or end with a dot"),
+        (("image.h5", "bad."), 2, "its name must not begin or end with a dot"),
         (("image.h5", "image.h5"), 2, "must be two files"),
         (("none.h5", "a.tif"), 2, "does not exist"),
     ],
 )  # fmt: skip
 def test_mistakes_are_one_message(folder, arguments, code, message):
+    (folder / "bad.json").write_text('{"plan": ')
     found, output = run(*arguments)
     assert (found, message in output) == (code, True), output
-    assert not (folder / "a.tif").exists()
+    assert not {"a.tif", ".tif", "bad."} & set(os.listdir(folder))
 
 
 def test_images_keep_the_place_of_a_scene(folder):

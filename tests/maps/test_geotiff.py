@@ -119,7 +119,9 @@ def test_overviews_are_means_of_power(tmp_path):
     random = np.random.default_rng(4)
     pixels = random.normal(size=shape) + 1j * random.normal(size=shape)
     pixels[:400, :301] = 0
-    grid = clsas.Grid.plane((0, 110, 1101), (0, 130, 1301), georeference=UTM_NORTH)
+    grid = clsas.Grid.plane(
+        (500_000, 500_110, 1101), (6_700_000, 6_700_130, 1301), georeference=UTM_NORTH
+    )
     image = clsas.Image(pixels, grid)
     for kind in ("complex", "db"):
         clsas.export(image, tmp_path / "a.tif", kind=kind)
@@ -356,3 +358,32 @@ def test_an_image_of_zeros_is_a_map_of_nothing(tmp_path):
         clsas.export(clsas.Image(0 * image.pixels, image.grid), tmp_path / "a.tif", kind="8bit")
     with rasterio.open(tmp_path / "a.tif") as file:
         assert not file.read().any()
+
+
+@pytest.mark.parametrize(
+    ("crs", "shift_m", "message"),
+    [
+        ("EPSG:32632", (0, 0), r"latitude 0\.0\d+, longitude 4\.51\d+, 16\d km outside the area"),
+        ("EPSG:32632", (1_500_000, 6_700_000), r"longitude 26\.\d+, .* km outside .* 1\.01"),
+        ("EPSG:3857", (590_000, 8_420_000), r"latitude 60\.\d+, .*, where .* are 2\.\d+ times"),
+        ("EPSG:32632", (9e8, 0), "outside the map of EPSG:32632"),
+        ("EPSG:32632", (295_000, 6_700_000), None),  # zone 32 is wider in Norway: 5.3 degrees east
+        ("EPSG:2193", (1_750_000, 5_427_000), None),  # area of use near the antimeridian
+    ],
+)  # fmt: skip
+def test_an_unlikely_place_is_a_warning(crs, shift_m, message, tmp_path):
+    pytest.importorskip("matplotlib")
+    image, _ = scene(local(90.0), shape=(20, 30))
+    place = clsas.Georeference.projected(crs)
+    origin_m = np.array([*shift_m, 0.0])
+    grid = clsas.Grid.oriented(
+        origin_m, [0, STEPS_M[1], 0], [STEPS_M[0], 0, 0], (20, 30), georeference=place
+    )
+    image = clsas.Image(image.pixels, grid)
+    for name in ("a.tif", "a.nc", "a.png"):
+        if message is None:
+            clsas.export(image, tmp_path / name)
+        else:
+            with pytest.warns(ClsasWarning, match=message):
+                clsas.export(image, tmp_path / name)
+        assert (tmp_path / name).exists()

@@ -25,9 +25,13 @@ def test_netcdf_restores_the_image_and_its_place(place, tmp_path):
     assert data.attrs["Conventions"] == "CF-1.11"
     pixels = data.pixels_real.values + 1j * data.pixels_imag.values
     np.testing.assert_array_equal(pixels, image.pixels)
-    np.testing.assert_allclose(
-        data.amplitude_db, image.db(reference=data.attrs["reference_amplitude"]), atol=1e-4
-    )
+    assert data.attrs["reference_amplitude"] == 1.0  # as in a GeoTIFF and in stores
+    level = np.where(image.pixels == 0, np.nan, image.db(reference=1.0))
+    np.testing.assert_allclose(data.amplitude_db, level, atol=1e-4)
+    assert data.amplitude_db.dtype == np.float32
+    if place is not None and not place.is_projected:
+        assert data.attrs["origin_latitude_deg"] == place.latitude_deg  # a number
+        assert data.attrs["x_axis_heading_deg"] == place.heading_deg
     if place is None:
         assert data.amplitude_db.dims == ("y", "x")
         assert "spatial_ref" not in data.coords
@@ -84,6 +88,27 @@ def test_a_png_has_its_place_on_the_map(place, tmp_path):
     np.testing.assert_allclose((c, f), at(placed, 0.5, 0.5))
 
 
+def test_files_beside_a_replaced_file_do_not_describe_the_new_one(tmp_path):
+    pytest.importorskip("matplotlib")
+    image, _ = scene(local(217.0))
+    nowhere = clsas.Image(image.pixels, replace(image.grid, georeference=None))
+    clsas.export(image, tmp_path / "a.png")
+    for name in ("b.tif.aux.xml", "b.tif.ovr", "c.nc.aux.xml", "b.pgw"):
+        (tmp_path / name).touch()
+    clsas.export(nowhere, tmp_path / "a.png")
+    clsas.export(image, tmp_path / "b.tif")
+    clsas.export(nowhere, tmp_path / "c.nc")
+    names = sorted(p.name for p in tmp_path.iterdir())
+    assert names == ["a.png", "b.pgw", "b.tif", "c.nc"]  # b.pgw belongs to another picture
+
+
+def test_a_png_of_a_vertical_plane_has_no_place_on_a_map(tmp_path):
+    pytest.importorskip("matplotlib")
+    grid = clsas.Grid.oriented([0, 0, -9], [0, 0, 1], [1, 0.5, 0], (9, 9), georeference=local(30.0))
+    clsas.export(clsas.Image(np.ones((9, 9), complex), grid), tmp_path / "a.png")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
+
+
 def test_pictures_without_a_place_stand_alone(tmp_path):
     pytest.importorskip("matplotlib")
     image, _ = scene(UTM_NORTH)
@@ -95,6 +120,9 @@ def test_pictures_without_a_place_stand_alone(tmp_path):
         clsas.export(image, tmp_path / "b.png", kind="db")
     with pytest.raises(ValueError, match=r"reference must be left out, .* on \.nc"):
         clsas.export(image, tmp_path / "b.nc", reference=1.0)
+    for name in (".tif", "bad.", ".hidden.png"):
+        with pytest.raises(ValueError, match=r"path must not begin or end with a dot, got '"):
+            clsas.export(image, tmp_path / name)
     clsas.save(tmp_path / "grid.h5", image.grid)
     with pytest.raises(ValueError, match=r"source must contain an image, but .*grid.h5 has Grid"):
         clsas.export(tmp_path / "grid.h5", tmp_path / "b.tif")
