@@ -40,10 +40,7 @@ _GROUPS = {
         "mosaic": ("mosaics", "Form an image of any size, patch by patch."),
         "view": ("view", "Show an image or a mosaic in a browser."),
         "show": ("show", "Draw an image, range lines, a plan, a recording or a mosaic."),
-        "export": (
-            "export",
-            "Write an image or a mosaic as GeoTIFF, netCDF, a picture or a web page.",
-        ),
+        "export": ("export", "Write an image or a mosaic as a map, a picture or a web page."),
     },
     "Measures": {
         "quality": ("measures", "Measure the contrast, a point or the error of an image."),

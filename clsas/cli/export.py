@@ -99,7 +99,7 @@ def export(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Write an image or a mosaic as GeoTIFF, netCDF, a picture or a web page.
+    """Write an image or a mosaic as a map, a picture or a web page.
 
     INPUT is an image in HDF5 or the Zarr store of a finished mosaic, which may be larger than
     memory. The suffix of OUTPUT decides: .tif is a cloud-optimized GeoTIFF, .nc is netCDF 4, and

@@ -318,6 +318,7 @@ def test_the_snippets_of_the_documentation_run_where_patches_are_unseen(tmp_path
     part = snippets[4].replace("slice(2000, 3000)", "slice(20, 30)")
     for snippet in (small, *snippets[1:4], part):
         exec(snippet, names)
+    pytest.importorskip("matplotlib.pyplot").close()  # of what xarray plotted
     records = Store.opened("image.zarr").records().values()
     assert {record.has_pixels for record in records} == {True, False}
     assert names["worst"] <= -40
