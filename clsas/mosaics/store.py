@@ -388,9 +388,7 @@ class Store:
         if not self._mosaic_arrays or self._is_complete():
             return False
         digest = self._digest()
-        with needed("stores of mosaics"):
-            from clsas.mosaics import completing
-        completing.complete(self.path, read_document(self.path), digest, self.read, progress)
+        _completing().complete(self.path, read_document(self.path), digest, self.read, progress)
         return True
 
     def add_levels(self, progress: Callable[[int, int], object] | None = None) -> bool:
@@ -600,23 +598,17 @@ class Store:
 
     def _digest(self) -> str:
         """Return a digest of the pixels of the finished patches."""
-        with needed("stores of mosaics"):
-            from clsas.mosaics import completing
-        return completing.digest_of_patches(self._files.recorded())
+        return _completing().digest_of_patches(self._files.recorded())
 
     def _is_complete(self) -> bool:
         """Return whether the levels that mix patches are those of the present patches."""
-        with needed("stores of mosaics"):
-            from clsas.mosaics import completing
-        return completing.is_current(self.path, read_document(self.path), self._digest())
+        return _completing().is_current(self.path, read_document(self.path), self._digest())
 
     def _level_damage(self) -> dict[str, str]:
         """Read the levels that mix patches, if they are complete; return those that are damaged."""
         if not (self.path / LEVELS / "zarr.json").exists() or not self._is_complete():
             return {}
-        with needed("stores of mosaics"):
-            from clsas.mosaics import completing
-        return completing.damage(self.path, read_document(self.path))
+        return _completing().damage(self.path, read_document(self.path))
 
 
 def _arrays() -> ModuleType:
@@ -624,3 +616,10 @@ def _arrays() -> ModuleType:
     with needed("stores of mosaics"):
         from clsas.mosaics import arrays
     return arrays
+
+
+def _completing() -> ModuleType:
+    """Return the module that computes levels, which needs Zarr."""
+    with needed("stores of mosaics"):
+        from clsas.mosaics import completing
+    return completing
