@@ -174,7 +174,7 @@ def export(
         picture = {name: value for name, value in given.items() if value is not None}
         world_files.write_picture(path, _placed(opened, georeference), picture)
         return
-    found = Source.of(opened, georeference)
+    found = _finished(opened, georeference)
     tags = _tags(found, plan, lines)
     if suffix in netcdf.SUFFIXES:
         map_grids.warn_of_place(found.grid)
@@ -318,9 +318,16 @@ def _tags(source: Source, plan: Plan | None, lines: RangeLines | None) -> dict[s
     return {name: value for name, value in known.items() if value is not None}
 
 
+def _finished(source: Image | Store, georeference: Georeference | None) -> Source:
+    """Return the source of an image or a store; raise ValueError if a store is not finished."""
+    found = Source.of(source, georeference)
+    found.check_finished()
+    return found
+
+
 def _placed(source: Image | Store, georeference: Georeference | None) -> Image:
     """Return the image that a picture shows, with the georeference of the export."""
-    found = Source.of(source, georeference)
+    found = _finished(source, georeference)
     shown = source.overview() if isinstance(source, Store) else source
     if shown.georeference == found.grid.georeference:
         return shown

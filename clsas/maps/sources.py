@@ -42,30 +42,46 @@ class Source:
 
     @classmethod
     def of(cls, source: Image | Store, georeference: Georeference | None) -> Source:
-        """Return the source of an image or a store.
+        """Return the source of an image or a store, with a georeference if one is given.
 
         Raises
         ------
         ValueError
-            If the georeference differs from that of the source, or a store is damaged or not
-            finished.
+            If the source has another georeference, or a store is damaged.
         """
-        grid, records = source.grid, {}
-        if isinstance(source, Store):
-            records = source.records()
-            rows, columns = (
-                math.ceil(n / m) for n, m in zip(grid.shape, _patch_shape(source), strict=True)
-            )
-            if len(records) < rows * columns:
+        grid = source.grid
+        if georeference is not None:
+            if grid.georeference not in (None, georeference):
                 raise ValueError(
-                    f"source must be finished, but {len(records)} of the {rows * columns} patches "
-                    f"of {source.path} are, without damage: run clsas mosaic again with the same "
-                    "inputs, which forms the others"
+                    f"georeference must be left out, since the source has one: {grid.georeference}"
                 )
-        grid = placed(grid, georeference)
+            grid = replace(grid, georeference=georeference)
         if isinstance(source, Store):
-            return cls(grid, None, source, records)
-        return cls(grid, source, None, records)
+            return cls(grid, None, source, source.records())
+        return cls(grid, source, None, {})
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        rows, columns = self.grid.shape
+        return rows, columns
+
+    @property
+    def window_shape(self) -> tuple[int, int]:
+        """Rows and columns that are read at once: those of a patch for a store."""
+        if self.store is None:
+            return _WINDOW, _WINDOW
+        shape = self.store.patch_shape
+        assert shape is not None  # the store exists
+        return shape
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Number of windows along rows and columns."""
+        rows, columns = (
+            math.ceil(n / side) for n, side in zip(self.shape, self.window_shape, strict=True)
+        )
+        return rows, columns
 
     @property
     def inputs(self) -> dict[str, Any]:
@@ -74,9 +90,7 @@ class Source:
 
     def windows(self) -> Iterator[tuple[slice, slice]]:
         """Yield windows that cover the image. Those of a store are whole patches."""
-        rows, columns = self.grid.shape
-        height, width = (_WINDOW, _WINDOW) if self.store is None else _patch_shape(self.store)
-        yield from windows_of((rows, columns), (height, width))
+        yield from windows_of(self.shape, self.window_shape)
 
     def read(self, rows: slice, columns: slice) -> NDArray[np.complex64]:
         """Return the pixels of a window, complex64 [rows, columns]."""
@@ -85,36 +99,23 @@ class Source:
         assert self.store is not None
         return self.store.read(rows, columns)
 
-    def check_unchanged(self) -> None:
-        """Raise ValueError if patches of the store were formed again since the export began."""
-        if self.store is not None and self.store.records() != self.records:
+    def check_finished(self) -> None:
+        """Raise ValueError if patches of the store are missing or damaged."""
+        patches = math.prod(self.counts)
+        if self.store is not None and len(self.records) < patches:
             raise ValueError(
-                f"source must not change, but patches of {self.store.path} were formed again "
-                "during the export: repeat it when the mosaic is finished"
+                f"source must be finished, but {len(self.records)} of the {patches} patches of "
+                f"{self.store.path} are, without damage: run clsas mosaic again with the same "
+                "inputs, which forms the others"
             )
 
-
-def placed(grid: Grid, georeference: Georeference | None) -> Grid:
-    """Return a grid with a georeference, if one is given.
-
-    Raises
-    ------
-    ValueError
-        If the grid has another one.
-    """
-    if georeference is None:
-        return grid
-    if grid.georeference not in (None, georeference):
-        raise ValueError(
-            f"georeference must be left out, since the source has one: {grid.georeference}"
-        )
-    return replace(grid, georeference=georeference)
-
-
-def _patch_shape(store: Store) -> tuple[int, int]:
-    shape = store.patch_shape
-    assert shape is not None  # the store exists
-    return shape
+    def check_unchanged(self, name: str = "source") -> None:
+        """Raise ValueError if patches of the store `name` were formed since the export began."""
+        if self.store is not None and self.store.records() != self.records:
+            raise ValueError(
+                f"{name} must not change while it is exported, but patches of {self.store.path} "
+                "were formed meanwhile: repeat the export when the mosaic is finished"
+            )
 
 
 def windows_of(

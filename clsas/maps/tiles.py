@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import math
 import zlib
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -31,44 +30,7 @@ NOTHING = 0
 BRIGHTEST = 255
 """Level of the reference; every level below is one step of dB lower."""
 
-Reader = Callable[[slice, slice], NDArray[np.complex64]]
-"""Returns the pixels of a window, complex64 [rows, columns]."""
-
 _FAINTEST = np.float32(1e-30)  # power that stays above 0 in float32, but below every level
-_WINDOW = 2048  # rows and columns that are read at once: 32 MiB of pixels; a plain choice
-
-
-@dataclass(frozen=True, eq=False)
-class Source:
-    """Pixels of an image that are read window by window.
-
-    Attributes
-    ----------
-    shape : (rows, columns)
-    window_shape : (rows, columns)
-        Pixels that are read at once. Every pixel is read once for the tiles.
-    read : callable
-    """
-
-    shape: tuple[int, int]
-    read: Reader
-    window_shape: tuple[int, int] = (_WINDOW, _WINDOW)
-
-    def windows(self) -> Iterator[tuple[slice, slice]]:
-        """Yield windows that cover the image, row by row."""
-        height, width = self.window_shape
-        for top in range(0, self.shape[0], height):
-            for left in range(0, self.shape[1], width):
-                yield (
-                    slice(top, min(top + height, self.shape[0])),
-                    slice(left, min(left + width, self.shape[1])),
-                )
-
-    def __len__(self) -> int:
-        """Return the number of windows."""
-        return math.prod(
-            math.ceil(n / side) for n, side in zip(self.shape, self.window_shape, strict=True)
-        )
 
 
 @dataclass(frozen=True)

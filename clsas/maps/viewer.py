@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from importlib import resources
 from itertools import product
-from math import ceil
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,8 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.version import __version__
 from clsas.maps.frames import Frame, fitted_degrees, geographic_of, steps_of
-from clsas.maps.sources import placed
-from clsas.maps.tiles import BRIGHTEST, SIDE, STEP_DB, Levels, Pyramid, Source, scales_of
+from clsas.maps.sources import Source
+from clsas.maps.tiles import BRIGHTEST, SIDE, STEP_DB, Levels, Pyramid, scales_of
 from clsas.mosaics.store import Store
 from clsas.plot.colours import COLOUR_MAP
 from clsas.plot.colours import colour_map as colours_of
@@ -112,19 +112,18 @@ def write(
     tables = {name: _table(name) for name in dict.fromkeys((colour_map, *_COLOURS))}
     validate.instance("georeference", georeference, Georeference, type(None))
     validate.progress(progress)
-    grids = [placed(each.grid, georeference) for each in sources]
+    readers = [Source.of(each, georeference) for each in sources]
+    grids = [reader.grid for reader in readers]
     _check_grids(grids)
     check_folder(folder)
-    records = [each.records() if isinstance(each, Store) else None for each in sources]
 
-    readers = [_reader(each) for each in sources]
-    report = _Progress(2 * sum(map(len, readers)), progress)
+    report = _Progress(2 * sum(prod(reader.counts) for reader in readers), progress)
     reference = max(_largest(reader, report) for reader in readers) or 1.0
     levels = Levels(reference, max(STEP_DB, range_db / (BRIGHTEST - 1)))
     scene = {"names": names, "range_db": range_db, "colours": tables}
     known = next((grid for grid in grids if grid.georeference is not None), grids[0])
     scene |= _described(readers[0].shape, known, levels)
-    scene |= {"patches": _patches(source) if isinstance(source, Store) else []}
+    scene |= {"patches": _patches(readers[0])}
     with replacing_folder(folder) as made:
         for name in _FILES:
             (made / name).write_text(_text_of(name), encoding="utf-8")
@@ -134,9 +133,8 @@ def write(
             pyramid = Pyramid(reader.shape, levels, made / "tiles" / str(index), str(index))
             for rows, columns in report.through(reader):
                 pyramid.add(rows, columns, reader.read(rows, columns))
-        for each, before in zip(sources, records, strict=True):
-            if isinstance(each, Store):
-                _check_unchanged(each, before)
+        for name, reader in zip(("source", "against"), readers, strict=False):
+            reader.check_unchanged(name)
 
 
 def check_folder(folder: Path) -> None:
@@ -217,17 +215,6 @@ class _Progress:
                 self._progress(self._done, self._total)
 
 
-def _reader(source: Image | Store) -> Source:
-    if isinstance(source, Store):
-        rows, columns = source.grid.shape
-        shape = source.patch_shape
-        assert shape is not None  # the store exists
-        return Source((rows, columns), source.read, shape)
-    rows, columns = source.pixels.shape
-    pixels = source.pixels
-    return Source((rows, columns), lambda rows, columns: pixels[rows, columns])
-
-
 def _largest(reader: Source, report: _Progress) -> float:
     """Return the largest amplitude of an image."""
     most = 0.0
@@ -261,15 +248,6 @@ def _check_grids(grids: Sequence[Grid]) -> None:
         )
 
 
-def _check_unchanged(store: Store, records: object) -> None:
-    """Raise ValueError if patches of a store were formed since its records were read."""
-    if store.records() != records:
-        raise ValueError(
-            f"{store.path} must not change while it is exported, but patches were formed "
-            "meanwhile: repeat the export when the mosaic is finished"
-        )
-
-
 def _described(shape: tuple[int, int], grid: Grid, levels: Levels) -> dict[str, Any]:
     """Return what the page needs to know of a grid and of the tiles."""
     scales, to_geographic = scales_of(shape), geographic_of(grid)
@@ -285,23 +263,23 @@ def _described(shape: tuple[int, int], grid: Grid, levels: Levels) -> dict[str, 
     }
 
 
-def _patches(store: Store) -> list[list[Any]]:
-    """Return [first row, first column, rows, columns, predicted error (dB), words] of patches."""
-    shape = store.patch_shape
-    assert shape is not None  # the store exists
-    records, pixels = store.records(), store.grid.shape
-    counts = [range(ceil(n / side)) for n, side in zip(pixels, shape, strict=True)]
+def _patches(source: Source) -> list[list[Any]]:
+    """Return [first row, first column, rows, columns, predicted error (dB), words] of patches.
+
+    An image has none.
+    """
+    if source.store is None:
+        return []
     found: list[list[Any]] = []
-    for index in product(*counts):
-        first = [i * side for i, side in zip(index, shape, strict=True)]
-        sides = [min(side, n - i) for side, n, i in zip(shape, pixels, first, strict=True)]
-        record = records.get((index[0], index[1]))
+    for index, window in zip(product(*map(range, source.counts)), source.windows(), strict=True):
+        place = [part.start for part in window] + [part.stop - part.start for part in window]
+        record = source.records.get((index[0], index[1]))
         if record is None:
-            found.append([*first, *sides, None, "not formed yet"])
+            found.append([*place, None, "not formed yet"])
             continue
         error_db = record.predicted_error_db
         rounded = None if error_db is None else round(error_db, 1)
-        found.append([*first, *sides, rounded, "; ".join(record.flags)])
+        found.append([*place, rounded, "; ".join(record.flags)])
     return found
 
 
