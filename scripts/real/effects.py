@@ -5,15 +5,16 @@ recording is also assessed with two known effects that do not matter: the motion
 during the flight of a pulse, and a height for every pixel, which is the same for all. The thesis's
 case is also assessed over a sloping seabed.
 
-    python scripts/real/effects.py [CASE ...] [--device NAME] [--repeats 5]
+    python scripts/real/effects.py [CASE ...] [--device NAME] [--repeats 5] [--docs]
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,11 @@ import clsas
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
 from clsas.files import scene_files as config
-from clsas.measures.assessment_result import Assessment
-from clsas.opencl.device import open_device
+from clsas.measures.assessment_result import NONE_DB, Assessment, Effect
+from clsas.opencl.device import Device, open_device
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import stored_tables
 
 AIRCRAFT_M_S = 100.0
 """Approximate speed of the aircraft, whose positions are known, but not their times."""
@@ -93,47 +97,94 @@ CASES: dict[str, Callable[[], dict[str, Any]]] = {
 }
 
 
-def show(name: str, found: Assessment) -> None:
-    """Print an assessment as a Markdown table."""
-    print(
-        f"\n**{name}**: {found.channels} channels, {' x '.join(map(str, found.pixels))} pixels, "
-        f"tolerance {found.tolerance_db:g} dB; {1e3 * found.seconds:.0f} ms with all effects "
-        f"modelled, {1e3 * found.simple_seconds:.0f} ms as imagers form it\n"
-    )
-    columns = ("effect", "modelled", "error", "wavelengths, at most", "needed", "time", "left out")
-    print("| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
-    for e in found.effects:
-        error = (
-            "-" if e.error_db is None else f"{e.error_db:.1f} dB" if e.error_db > -250 else "none"
-        )
-        most = f"{e.most_wavelengths:.2g}" if e.most_wavelengths else "-"
-        needed = {True: "yes", False: "no", None: "-"}[e.needed]
-        seconds = "-" if e.seconds is None else f"{1e3 * e.seconds:+.0f} ms"
-        cells = (e.name, "yes" if e.modelled else "no", error, most, needed, seconds)
-        print("| " + " | ".join((*cells, "yes" if e.left_out else "")) + " |", flush=True)
+FULL, SIMPLE = "full model", "simplified"
+SCATTER = 0.2  # share of an image's time that is not counted as the cost of an effect
 
 
-def show_exact(given: dict[str, Any], device: str | None, repeats: int) -> None:
-    """Print the times of the exact image with all effects and as imagers form it, in turns."""
-    seconds: dict[bool, list[float]] = {True: [], False: []}
-    opened = open_device(device)
+@dataclass(frozen=True)
+class Found:
+    """What was found out about a case.
+
+    Attributes
+    ----------
+    title : str
+        Name and tolerance.
+    assessment : Assessment
+    exact_seconds : dict of str to float
+        Shortest time of the exact image with all effects and as imagers form it, by `FULL` and
+        `SIMPLE`.
+    """
+
+    title: str
+    assessment: Assessment
+    exact_seconds: dict[str, float]
+
+
+def time_exact(given: dict[str, Any], device: Device, repeats: int) -> dict[str, float]:
+    """Return the shortest times of exact images, which are formed in turns."""
+    seconds: dict[str, list[float]] = {FULL: [], SIMPLE: []}
     for turn in range(repeats + 1):
-        for full_model, times in seconds.items():
+        for model, times in seconds.items():
             start = time.perf_counter()
             preparation = prepare(
                 given["lines"],
                 given["grid"],
                 beam=given.get("beam"),
-                device=opened,
+                device=device,
                 accuracy_db=given.get("tolerance_db", -50.0),
-                full_model=full_model,
+                full_model=model == FULL,
             )
             execute(preparation)
-            if turn:
+            if turn:  # the first turn builds kernels
                 times.append(time.perf_counter() - start)
-    full, simple = (min(times) for times in seconds.values())
-    left_out = ", ".join(preparation.left_out) or "nothing"
-    print(f"\nExact: {full:.2f} s with all effects, {simple:.2f} s as formed (without {left_out})")
+    return {model: min(times) for model, times in seconds.items() if times}
+
+
+def without(effect: Effect, image_seconds: float) -> str:
+    """Return what an image without an effect would be."""
+    if effect.error_db is None:
+        return "unknown"
+    if effect.error_db < NONE_DB:
+        return "none"
+    parts = [f"{effect.error_db:+.1f} dB"]
+    if effect.most_wavelengths:
+        parts.append(f"{effect.most_wavelengths:.2g} wavelengths")
+    if effect.needed:
+        parts.append("**needed**")
+    if effect.left_out:
+        parts.append("left out")
+    if effect.seconds is not None and abs(effect.seconds) > SCATTER * image_seconds:
+        parts.append(f"{effect.seconds:+.2g} s")
+    return ", ".join(parts)
+
+
+def effects_table(cases: list[Found]) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows of the table of effects."""
+    names = [effect.name for effect in cases[0].assessment.effects]
+    rows = [
+        [name, *(without(case.assessment[name], case.assessment.seconds) for case in cases)]
+        for name in names
+    ]
+    return ["without", *(case.title for case in cases)], rows
+
+
+def times_table(cases: list[Found]) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows of the table of times."""
+    header = ["image", "neglected", f"{FULL} (s)", f"{SIMPLE} (s)"]
+    rows = []
+    for case in cases:
+        left_out = [effect.name for effect in case.assessment.effects if effect.left_out]
+        fast = {FULL: case.assessment.seconds, SIMPLE: case.assessment.simple_seconds}
+        for method, seconds in {"planned": fast, "exact": case.exact_seconds}.items():
+            rows.append(
+                [
+                    f"{case.title}, {method}",
+                    ", ".join(left_out),
+                    f"{seconds[FULL]:.3g}",
+                    f"{seconds[SIMPLE]:.3g}" if left_out else "",
+                ]
+            )
+    return header, rows
 
 
 def main() -> None:
@@ -144,16 +195,35 @@ def main() -> None:
         "--repeats", type=int, default=5, help="number of images of each kind (default: 5)"
     )
     parser.add_argument("--tolerance-db", type=float, help="tolerance instead of that of each case")
+    parser.add_argument(
+        "--docs", action="store_true", help="write the tables of the documentation, too"
+    )
     arguments = parser.parse_args()
+    unknown = set(arguments.case) - set(CASES)
+    if unknown:
+        parser.error(f"there is no case {unknown.pop()!r}; cases are {', '.join(CASES)}")
+    device = open_device(arguments.device)
+    cases = []
     for name in arguments.case or CASES:
-        if name not in CASES:
-            parser.error(f"there is no case {name!r}; cases are {', '.join(CASES)}")
         given = CASES[name]()
         if arguments.tolerance_db is not None:
             given["tolerance_db"] = arguments.tolerance_db
-        show(name, clsas.assess(**given, device=arguments.device, repeats=arguments.repeats))
-        if arguments.repeats:
-            show_exact(given, arguments.device, arguments.repeats)
+        assessment = clsas.assess(**given, device=device.info.index, repeats=arguments.repeats)
+        title = f"{name}, {assessment.tolerance_db:g} dB"
+        cases.append(Found(title, assessment, time_exact(given, device, max(arguments.repeats, 1))))
+    origin = stored_tables.here(
+        f"{device.info.name}, {device.info.compute_units} compute units",
+        f"{device.info.platform} {device.info.driver}",
+        "scripts/real/effects.py",
+    )
+    for stem, (header, rows) in {
+        "effects": effects_table(cases),
+        "times": times_table(cases),
+    }.items():
+        print(stored_tables.markdown(stored_tables.StoredTable(origin, header, rows), stem))
+        if arguments.docs:
+            path = stored_tables.TABLES / "assess" / f"{stem}.csv"
+            stored_tables.write(path, origin, header, rows)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import statistics
 import sys
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -351,16 +351,30 @@ def arguments(description: str, repeats: int | None = None) -> tuple[argparse.Na
     return given, scene
 
 
-def report(out: Output, stem: str, rows: Sequence[dict[str, object]]) -> None:
-    """Print rows as a Markdown table and write them as CSV, with their origin."""
+def report(
+    out: Output,
+    stem: str,
+    rows: Sequence[Mapping[str, object]],
+    origin: dict[str, str] | None = None,
+) -> dict[str, str]:
+    """Print rows as a Markdown table, write them as CSV, and return their origin.
+
+    By default the origin is this run; pass another one for rows that follow from an earlier table.
+    """
     header = list(rows[0])
-    info, options = out.device.info, [each for each in sys.argv[1:] if each != "--docs"]
-    command = " ".join([f"scripts/thesis/{Path(sys.argv[0]).name}", *options])
-    device = f"{info.name}, {info.compute_units} compute units"
-    origin = stored_tables.here(device, f"{info.platform} {info.driver}", command)
+    origin = origin or _this_run(out)
     cells = [[str(row[column]) for column in header] for row in rows]
     print(stored_tables.markdown(stored_tables.StoredTable(origin, header, cells), stem))
     stored_tables.write(out.table(stem), origin, header, cells)
+    return origin
+
+
+def _this_run(out: Output) -> dict[str, str]:
+    """Return the origin of numbers that this run measured."""
+    info, options = out.device.info, [each for each in sys.argv[1:] if each != "--docs"]
+    command = " ".join([f"scripts/thesis/{Path(sys.argv[0]).name}", *options])
+    device = f"{info.name}, {info.compute_units} compute units"
+    return stored_tables.here(device, f"{info.platform} {info.driver}", command)
 
 
 def figure(width: float = 6.0, height: float = 4.0):

@@ -4,7 +4,7 @@
 Six systems are each varied in one way at a time: beam width, range over aperture, size of the
 scene, size of the pixels, receivers per ping and carrier frequency. Exact and factorized images at
 -40 dB are timed in turns. The pictures show the time that factorization saves against the number
-of channels whose beam touches a pixel.
+of channels N whose beam touches a pixel. The rule states the number by which N has to be divided.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from functools import cached_property
 
 import chapter5
 import numpy as np
+import stored_tables
 
 import clsas
 from clsas.opencl.device import Device, open_device
@@ -28,7 +29,7 @@ TOLERANCE_DB = -40.0
 POINTS = 50
 WORK = 6e9  # most pairs of pixels and channels of a case: an exact image of 4 to 8 s
 LINES = 3e8  # most samples of all lines of a case
-PER_SPEED_UP = 35.0  # channels per pixel for each time by which factorized images are faster
+FEWEST = 30  # channels per pixel from which the rule counts a case
 EXACT_IS_SLOW = Costs(pixel_ns=1e4, point_ns=1e4)  # so that every image is factorized
 
 
@@ -226,7 +227,7 @@ SWEEPS: dict[str, Callable[[System], Iterator[tuple[str, System]]]] = {
 }
 
 
-def measured(system: System, device: Device, repeats: int) -> dict[str, object]:
+def measured(system: System, device: Device, repeats: int) -> dict[str, str]:
     """Return the cells of a table for one case."""
     lines, grid, beam = system.lines, system.grid, system.beam
     request = {"tolerance_db": TOLERANCE_DB, "beam": beam, "device": device}
@@ -242,7 +243,7 @@ def measured(system: System, device: Device, repeats: int) -> dict[str, object]:
         )
     error_db = clsas.relative_error_db(images[1], images[0])
     return {
-        "channels": lines.channels,
+        "channels": f"{lines.channels}",
         "per pixel": f"{system.per_pixel:.0f}",
         "pixels": f"{grid.shape[0]} x {grid.shape[1]}",
         "subimages": " ".join(f"{each.rows}x{each.columns}" for each in forced.stages[:-1]),
@@ -255,6 +256,68 @@ def measured(system: System, device: Device, repeats: int) -> dict[str, object]:
     }
 
 
+Rows = Sequence[dict[str, str]]
+
+
+def rule(rows: Rows) -> list[dict[str, str]]:
+    """Return by what N has to be divided, for the usual case and for others."""
+    usual = [each for each in rows if _is_usual(each)]
+    # The ultrasound array, whose scene begins a third of an aperture in front of it, has no rule.
+    far = [each for each in rows if each["system"] != "ultrasound array"]
+    cases = {
+        "as above, beam of up to 20°": usual,
+        "pixels as large as the resolution": _varied(far, "pixel over resolution", 1),
+        "pixels twice as large as the resolution": _varied(far, "pixel over resolution", 2),
+        "512 pixels along each side": _varied(far, "pixels per side", 512),
+        "256 pixels along each side": _varied(far, "pixels per side", 256),
+        "beam of 40°": _varied(far, "beam width", 40),
+        "beam of 80°": _varied(far, "beam width", 80),
+        "range of the whole aperture": _varied(far, "range over aperture", 1),
+        "range of half the aperture": _varied(far, "range over aperture", 0.5),
+    }
+    found = []
+    for case, some in cases.items():
+        enough = [each for each in some if float(each["per pixel"]) >= FEWEST]
+        if not enough:
+            continue
+        divisors = [float(each["per pixel"]) / float(each["speed-up"]) for each in enough]
+        least, quarter, median, most_of, most = np.percentile(divisors, (0, 25, 50, 75, 100))
+        found.append(
+            {
+                "case": case,
+                "images": str(len(divisors)),
+                "divide N by": f"{median:.0f}",
+                "half of the images": f"{quarter:.0f} to {most_of:.0f}",
+                "all": f"{least:.0f} to {most:.0f}",
+            }
+        )
+    return found
+
+
+def _value(row: dict[str, str]) -> float:
+    """Return the number that was varied, without its unit."""
+    return float(row["value"].split()[0])
+
+
+def _varied(rows: Rows, sweep: str, value: float) -> Rows:
+    """Return the rows of a sweep at one value."""
+    return [each for each in rows if each["varied"] == sweep and _value(each) == value]
+
+
+def _is_usual(row: dict[str, str]) -> bool:
+    """Return True for fine pixels, narrow beams, long ranges and the system's own carrier."""
+    sweep, value = row["varied"], _value(row)
+    return (
+        row["system"] != "ultrasound array"
+        and row["pixels"] == "1024 x 1024"
+        and (row["system"] != "SENSOTEK" or sweep == "beam width")
+        and not (sweep == "beam width" and value > 20)
+        and not (sweep == "range over aperture" and value < 2)
+        and not (sweep == "pixel over resolution" and value > 0.5)
+        and sweep != "carrier"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     chapter5.add_output(parser)
@@ -263,9 +326,17 @@ def main() -> None:
     names = [system.name for system in SYSTEMS]
     parser.add_argument("--system", action="append", choices=names, help="only this system")
     parser.add_argument("--repeats", type=int, default=3, help="timed runs [default: %(default)s]")
+    parser.add_argument(
+        "--again", action="store_true", help="evaluate the stored table; nothing is measured"
+    )
     given = parser.parse_args()
     device = open_device(given.device)
     out = chapter5.Output.of(given, device)
+    if given.again:
+        stored = stored_tables.read(out.table("section_7_1"))
+        rows = [dict(zip(stored.header, row, strict=True)) for row in stored.rows]
+        evaluate(rows, out, stored.origin)
+        return
     rows = []
     for sweep in given.sweep or SWEEPS:
         for system in SYSTEMS:
@@ -281,12 +352,20 @@ def main() -> None:
                     cells = measured(case, device, given.repeats)
                 rows.append({"varied": sweep, "system": system.name, "value": value} | cells)
                 print(*rows[-1].values(), sep=" | ", flush=True)
-    chapter5.report(out, "section_7_1", rows)
-    draw(rows, given.sweep or list(SWEEPS), out)
+    evaluate(rows, out, chapter5.report(out, "section_7_1", rows))
 
 
-def draw(rows: Sequence[dict[str, object]], sweeps: Sequence[str], out: chapter5.Output) -> None:
+def evaluate(rows: Rows, out: chapter5.Output, origin: dict[str, str]) -> None:
+    """Write the rule that follows from rows, and the picture."""
+    divisors = rule(rows)
+    if divisors:
+        chapter5.report(out, "section_7_1_rule", divisors, origin)
+    draw(rows, float(divisors[0]["divide N by"]) if divisors else None, out)
+
+
+def draw(rows: Rows, divisor: float | None, out: chapter5.Output) -> None:
     """Draw the speed-up over the channels per pixel, or over what is varied at equal ones."""
+    sweeps = list(dict.fromkeys(each["varied"] for each in rows))
     figure = chapter5.figure(11, 6.5)
     panels = np.ravel(figure.subplots(2, 3, sharey=True))
     for sweep, axes in zip(sweeps, panels, strict=False):
@@ -294,16 +373,16 @@ def draw(rows: Sequence[dict[str, object]], sweeps: Sequence[str], out: chapter5
         ticks = set()
         for system in SYSTEMS:
             some = [r for r in rows if (r["varied"], r["system"]) == (sweep, system.name)]
-            x = [float(r["per pixel"] if per_pixel else str(r["value"]).split()[0]) for r in some]
+            x = [float(r["per pixel"]) if per_pixel else _value(r) for r in some]
             if sweep == "carrier":
-                x = [each / system.carrier_hz for each in x]
+                x = [float(f"{each / system.carrier_hz:.2g}") for each in x]
             ticks |= set(x)
             speed_up = [float(r["speed-up"]) for r in some]
             axes.loglog(x, speed_up, "o-", label=system.name, markersize=4)
-        if per_pixel:
-            channels = np.array([PER_SPEED_UP, 100 * PER_SPEED_UP])
-            axes.loglog(channels, channels / PER_SPEED_UP, "k--", label=f"N/{PER_SPEED_UP:g}")
-        else:
+        if per_pixel and divisor:
+            channels = np.array([divisor, 100 * divisor])
+            axes.loglog(channels, channels / divisor, "k--", label=f"N/{divisor:g}")
+        if not per_pixel:
             axes.set_xticks(sorted(ticks), [f"{each:g}" for each in sorted(ticks)])
             axes.minorticks_off()
         axes.axhline(1.0, color="grey", linestyle=":")
