@@ -148,7 +148,7 @@ def without(effect: Effect, image_seconds: float) -> str:
         return "none"
     parts = [f"{effect.error_db:+.1f} dB"]
     if effect.most_wavelengths:
-        parts.append(f"{effect.most_wavelengths:.2g} wavelengths")
+        parts.append(f"{effect.most_wavelengths:.2g} λ")
     if effect.needed:
         parts.append("**needed**")
     if effect.left_out:
