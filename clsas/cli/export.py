@@ -20,7 +20,8 @@ from clsas.cli.view import Folder, size_of
 from clsas.core import reading, validate
 from clsas.files.hdf5 import read_geometry
 from clsas.maps.encoding import KINDS
-from clsas.maps.exporting import SUFFIXES, check_name
+from clsas.maps.export_options import SUFFIXES
+from clsas.maps.exporting import check_name
 
 
 class _Target(File):

@@ -13,8 +13,8 @@ from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.core.version import __version__
 from clsas.maps import geotiff, netcdf, viewer, world_files
-from clsas.maps.encoding import KINDS
-from clsas.maps.geotiff import Options, Progress
+from clsas.maps.export_options import SUFFIXES, ExportOptions
+from clsas.maps.geotiff import Progress
 from clsas.maps.orientation import Orientation
 from clsas.maps.sources import Source
 from clsas.mosaics.store import Store
@@ -22,9 +22,6 @@ from clsas.plans.plan import Plan
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.plot.colours import COLOUR_MAP
 from clsas.plot.levels import DYNAMIC_RANGE_DB
-
-SUFFIXES = (*geotiff.SUFFIXES, *netcdf.SUFFIXES, *PICTURES)
-"""Suffixes of the files that `export` writes."""
 
 
 def export(
@@ -143,19 +140,19 @@ def export(
     check_name("path", path)
     validate.suffix("path", path, *SUFFIXES)
     suffix = path.suffix.lower()
-    given: dict[str, Any] = {
-        "kind": kind,
-        "dynamic_range_db": dynamic_range_db,
-        "reference": reference,
-        "colour_map": colour_map,
-        "north_up": validate.flag("north_up", north_up) or None,
-        "pixel_m": pixel_m,
-        "plan": plan,
-        "lines": lines,
-        "north_arrow": validate.flag("north_arrow", north_arrow) or None,
-        "scale_bar": validate.flag("scale_bar", scale_bar) or None,
-    }
-    _check(given, suffix)
+    options = ExportOptions(
+        kind=kind,
+        dynamic_range_db=dynamic_range_db,
+        reference=reference,
+        colour_map=colour_map,
+        north_up=north_up,
+        pixel_m=pixel_m,
+        plan=plan,
+        lines=lines,
+        north_arrow=north_arrow,
+        scale_bar=scale_bar,
+    )
+    options.check_used(suffix)
     validate.instance("georeference", georeference, Georeference, type(None))
     validate.progress(progress)
     opened = _opened(source)
@@ -164,35 +161,23 @@ def export(
             opened,
             path,
             names=[_name_of(source)],
-            dynamic_range_db=given["dynamic_range_db"],
-            colour_map=colour_map,
+            dynamic_range_db=options.dynamic_range_db,
+            colour_map=options.colour_map,
             georeference=georeference,
             progress=progress,
         )
         return
     if suffix in PICTURES:
-        picture = {name: value for name, value in given.items() if value is not None}
-        world_files.write_picture(path, _placed(opened, georeference), picture)
+        world_files.write_picture(path, _placed(opened, georeference), options.given)
         return
     found = _finished(opened, georeference)
-    tags = _tags(found, plan, lines)
     if suffix in netcdf.SUFFIXES:
         map_grids.warn_of_place(found.grid)
-        netcdf.write(path, found, tags)
-        world_files.remove_sidecars(path)
-        return
-    _check_map(found, given)
-    map_grids.warn_of_place(found.grid)
-    options = Options(
-        kind=kind or "db",
-        north_up=north_up,
-        pixel_m=given["pixel_m"],
-        dynamic_range_db=given["dynamic_range_db"] or DYNAMIC_RANGE_DB,
-        reference=given["reference"],
-        colour_map=colour_map or COLOUR_MAP,
-    )
-    texts = {name: v if isinstance(v, str) else f"{v:.12g}" for name, v in tags.items()}
-    geotiff.write(path, found, options, texts, progress)
+        netcdf.write(path, found, _tags(found, options))
+    else:
+        _check_map(found, options)
+        map_grids.warn_of_place(found.grid)
+        _write_geotiff(path, found, options, progress)
     world_files.remove_sidecars(path)
 
 
@@ -204,39 +189,6 @@ def check_name(name: str, path: Path) -> None:
     last = path.name
     if last != ".." and (last.startswith(".") or last.endswith(".")):
         raise ValueError(f"{name} must not begin or end with a dot, got {validate.shown(last)}")
-
-
-def _check(given: dict[str, Any], suffix: str) -> None:
-    """Raise TypeError or ValueError for options that are wrong, or have no effect on a format."""
-    kind = given["kind"]
-    if kind is not None:
-        validate.one_of("kind", kind, KINDS)
-    for name in ("reference", "pixel_m"):
-        if given[name] is not None:
-            given[name] = validate.positive(name, given[name], "m" if name == "pixel_m" else "")
-    if given["dynamic_range_db"] is not None:
-        given["dynamic_range_db"] = validate.dynamic_range_db(given["dynamic_range_db"])
-    if given["colour_map"] is not None:
-        validate.text("colour_map", given["colour_map"])
-    validate.instance("plan", given["plan"], Plan, type(None))
-    validate.instance("lines", given["lines"], RangeLines, type(None))
-    drawn = {"dynamic_range_db", "reference", "colour_map"}
-    if suffix in geotiff.SUFFIXES:
-        known = {"kind", "north_up", "plan", "lines"}
-        known |= {"pixel_m"} if given["north_up"] else set()
-        known |= {"8bit": drawn, "complex": set()}.get(kind or "db", {"reference"})
-        what = f"{suffix} of kind {kind or 'db'!r}"
-        if not given["north_up"]:
-            what += " without north_up"
-    elif suffix in netcdf.SUFFIXES:
-        known, what = {"plan", "lines"}, suffix
-    elif not suffix:
-        known, what = {"dynamic_range_db", "colour_map"}, "a folder"
-    else:
-        known, what = drawn | {"north_arrow", "scale_bar"}, suffix
-    unused = [name for name, value in given.items() if value is not None and name not in known]
-    if unused:
-        raise ValueError(f"{unused[0]} must be left out, since it has no effect on {what}")
 
 
 def _opened(source: Image | Store | str | os.PathLike) -> Image | Store:
@@ -261,7 +213,26 @@ def _name_of(source: Image | Store | str | os.PathLike) -> str:
     return validate.printable(validate.path("source", source).resolve().name)
 
 
-def _check_map(source: Source, given: dict[str, Any]) -> None:
+def _write_geotiff(
+    path: Path, source: Source, options: ExportOptions, progress: Progress | None
+) -> None:
+    """Write a GeoTIFF by the options of an export, or by their defaults."""
+    tags = {
+        name: value if isinstance(value, str) else f"{value:.12g}"
+        for name, value in _tags(source, options).items()
+    }
+    completed = geotiff.Options(
+        kind=options.kind or "db",
+        north_up=options.north_up,
+        pixel_m=options.pixel_m,
+        dynamic_range_db=options.dynamic_range_db or DYNAMIC_RANGE_DB,
+        reference=options.reference,
+        colour_map=options.colour_map or COLOUR_MAP,
+    )
+    geotiff.write(path, source, completed, tags, progress)
+
+
+def _check_map(source: Source, options: ExportOptions) -> None:
     """Raise ValueError for images that a GeoTIFF cannot show."""
     grid = source.grid
     if grid.points_m is not None:
@@ -273,20 +244,21 @@ def _check_map(source: Source, given: dict[str, Any]) -> None:
             "the image by a scene with a table [georeference]"
         )
     turned = Orientation.of((grid.shape[0], grid.shape[1]), grid.georeference.affine(grid))
-    resamples = given["north_up"] and (given["pixel_m"] is not None or not turned.is_north_up)
-    if given["kind"] == "complex" and resamples:
+    resamples = options.north_up and (options.pixel_m is not None or not turned.is_north_up)
+    if options.kind == "complex" and resamples:
         raise ValueError(
             "north_up must be off for complex pixels, whose phase cannot be interpolated: form the "
             "image on the grid of Georeference.north_up, or export it rotated"
         )
-    if grid.height_m is not None and given["kind"] == "8bit":
+    if grid.height_m is not None and options.kind == "8bit":
         validate.warn(
             "8-bit levels leave out the heights of the grid; the kind 'db' has them as second band"
         )
 
 
-def _tags(source: Source, plan: Plan | None, lines: RangeLines | None) -> dict[str, Any]:
+def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
     """Return what is known of an image's origin, as tags of a file: texts and numbers."""
+    lines, plan = options.lines, options.plan
     place, inputs = source.grid.georeference, source.inputs
     errors = [r.predicted_error_db for r in source.records.values() if r.has_pixels]
     known: dict[str, Any] = {
