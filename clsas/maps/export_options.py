@@ -7,12 +7,13 @@ from typing import Any
 
 from clsas.core import validate
 from clsas.core.lines import RangeLines
-from clsas.maps import geotiff, netcdf
+from clsas.maps import geotiff, netcdf, sicd
 from clsas.maps.encoding import KINDS
 from clsas.plans.plan import Plan
 from clsas.plot.canvas import SUFFIXES as PICTURES
+from clsas.sonar.beam import BeamWindow
 
-SUFFIXES = (*geotiff.SUFFIXES, *netcdf.SUFFIXES, *PICTURES)
+SUFFIXES = (*geotiff.SUFFIXES, *netcdf.SUFFIXES, *sicd.SUFFIXES, *PICTURES)
 """Suffixes of the files that `clsas.export` writes."""
 
 _COLOURS = {"dynamic_range_db", "reference", "colour_map"}
@@ -37,6 +38,7 @@ class ExportOptions:
     pixel_m: float | None = None
     plan: Plan | None = None
     lines: RangeLines | None = None
+    beam: BeamWindow | None = None
     north_arrow: bool = False
     scale_bar: bool = False
 
@@ -60,6 +62,7 @@ class ExportOptions:
             validate.text("colour_map", self.colour_map)
         validate.instance("plan", self.plan, Plan, type(None))
         validate.instance("lines", self.lines, RangeLines, type(None))
+        validate.instance("beam", self.beam, BeamWindow, type(None))
 
     @property
     def given(self) -> dict[str, Any]:
@@ -82,6 +85,8 @@ class ExportOptions:
             return _COLOURS | {"north_arrow", "scale_bar"}, suffix
         if suffix in netcdf.SUFFIXES:
             return _ORIGIN, suffix
+        if suffix in sicd.SUFFIXES:
+            return _ORIGIN | {"beam"}, suffix
         kind = self.kind or "db"
         used = _ORIGIN | {"kind", "north_up"}
         used |= {"8bit": _COLOURS, "complex": set()}.get(kind, {"reference"})

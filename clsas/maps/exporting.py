@@ -12,7 +12,7 @@ from clsas.core.georeference import Georeference
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.core.version import __version__
-from clsas.maps import geotiff, netcdf, viewer, world_files
+from clsas.maps import geotiff, netcdf, sicd, viewer, world_files
 from clsas.maps.export_options import SUFFIXES, ExportOptions
 from clsas.maps.geotiff import Progress
 from clsas.maps.orientation import Orientation
@@ -22,6 +22,7 @@ from clsas.plans.plan import Plan
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.plot.colours import COLOUR_MAP
 from clsas.plot.levels import DYNAMIC_RANGE_DB
+from clsas.sonar.beam import BeamWindow
 
 
 def export(
@@ -37,6 +38,7 @@ def export(
     georeference: Georeference | None = None,
     plan: Plan | None = None,
     lines: RangeLines | None = None,
+    beam: BeamWindow | None = None,
     north_arrow: bool = False,
     scale_bar: bool = False,
     progress: Progress | None = None,
@@ -50,6 +52,8 @@ def export(
       memory.
     - ``.nc``, a netCDF 4 file after the CF conventions, with level (dB re 1, NaN where nothing was
       received), real and imaginary parts.
+    - ``.nitf`` or ``.ntf``, a SICD file (1.4.0) of a radar image on a plane, for programs of
+      synthetic aperture radar. It has complex pixels and the geometry of the lines.
     - ``.png``, ``.pdf`` or ``.svg``, a picture as `clsas.plot.image_db` draws it. A PNG of an image
       with a georeference gets a world file (``.pgw``) and a file with the coordinate reference
       system (``.png.aux.xml``), unless it is a vertical plane.
@@ -87,7 +91,11 @@ def export(
         Plan of the image. Its tolerance, predicted error and stages become tags of the file. A
         mosaic knows its own.
     lines : RangeLines, optional
-        Range lines of the image. Their carrier and sound speed become tags of the file.
+        Range lines of the image. Their carrier and sound speed become tags of the file. SICD
+        requires them, for track, band and resolution.
+    beam : BeamWindow, optional
+        Beam with which the image was formed, for SICD. Without it, every line that reaches a pixel
+        contributes to it.
     north_arrow, scale_bar : bool
         True to draw an arrow to the north and a scale bar into a picture.
     progress : callable, optional
@@ -149,6 +157,7 @@ def export(
         pixel_m=pixel_m,
         plan=plan,
         lines=lines,
+        beam=beam,
         north_arrow=north_arrow,
         scale_bar=scale_bar,
     )
@@ -156,7 +165,11 @@ def export(
     validate.instance("georeference", georeference, Georeference, type(None))
     validate.progress(progress)
     opened = _opened(source)
-    if not suffix:
+    if suffix and suffix not in PICTURES:
+        _write_data(path, _finished(opened, georeference), options, progress)
+    elif suffix:
+        world_files.write_picture(path, _placed(opened, georeference), options.given)
+    else:
         viewer.write(
             opened,
             path,
@@ -166,19 +179,6 @@ def export(
             georeference=georeference,
             progress=progress,
         )
-        return
-    if suffix in PICTURES:
-        world_files.write_picture(path, _placed(opened, georeference), options.given)
-        return
-    found = _finished(opened, georeference)
-    if suffix in netcdf.SUFFIXES:
-        map_grids.warn_of_place(found.grid)
-        netcdf.write(path, found, _tags(found, options))
-    else:
-        _check_map(found, options)
-        map_grids.warn_of_place(found.grid)
-        _write_geotiff(path, found, options, progress)
-    world_files.remove_sidecars(path)
 
 
 def check_name(name: str, path: Path) -> None:
@@ -211,6 +211,23 @@ def _name_of(source: Image | Store | str | os.PathLike) -> str:
     if isinstance(source, Image | Store):
         return "image"
     return validate.printable(validate.path("source", source).resolve().name)
+
+
+def _write_data(
+    path: Path, source: Source, options: ExportOptions, progress: Progress | None
+) -> None:
+    """Write a file of pixels by its suffix, and remove files that describe the one it replaces."""
+    suffix = path.suffix.lower()
+    if suffix in geotiff.SUFFIXES:
+        _check_map(source, options)
+    map_grids.warn_of_place(source.grid)
+    if suffix in geotiff.SUFFIXES:
+        _write_geotiff(path, source, options, progress)
+    elif suffix in netcdf.SUFFIXES:
+        netcdf.write(path, source, _tags(source, options))
+    else:
+        sicd.write(path, source, options.lines, options.beam, _tags(source, options), progress)
+    world_files.remove_sidecars(path)
 
 
 def _write_geotiff(
