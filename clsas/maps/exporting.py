@@ -11,6 +11,7 @@ from clsas.core import map_grids, validate
 from clsas.core.georeference import Georeference
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
+from clsas.core.sidecars import remove_sidecars
 from clsas.core.version import __version__
 from clsas.maps import geotiff, netcdf, sicd, viewer, world_files
 from clsas.maps.export_options import SUFFIXES, ExportOptions
@@ -227,7 +228,7 @@ def _write_data(
         netcdf.write(path, source, _tags(source, options))
     else:
         sicd.write(path, source, options.lines, options.beam, _tags(source, options), progress)
-    world_files.remove_sidecars(path)
+    remove_sidecars(path)
 
 
 def _write_geotiff(
