@@ -26,8 +26,8 @@ PROGRAMS = sorted([*(DOCS / "tutorials").glob("*.md"), *FIGURES])
 @pytest.mark.slow
 @pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.stem)
 def test_tutorials_and_figures_run(program):
-    if program.stem == "mosaic":
-        pytest.importorskip("zarr")
+    for package in {"mosaic": ["zarr"], "map": ["zarr", "rasterio"]}.get(program.stem, []):
+        pytest.importorskip(package)
     done = subprocess.run(
         [sys.executable, ROOT / "scripts" / "pages", program], capture_output=True, text=True
     )
@@ -63,8 +63,22 @@ def test_a_page_that_shows_a_picture_must_make_it(tmp_path):
     assert "missing.png, which its code does not write" in done.stderr
 
 
-def run_page(page):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+@pytest.mark.parametrize("installed", [True, False])
+def test_pictures_by_a_browser_may_be_missing_where_there_is_none(installed, tmp_path):
+    page, programs = tmp_path / "page.md", tmp_path / "programs"
+    code = "from pathlib import Path\n\nPath('drawn.png').touch()"
+    page.write_text(f"```python chromium\n{code}\n```\n\n![drawn](../images/drawn.png)\n")
+    programs.mkdir()
+    if installed:
+        (programs / "chromium").write_text("#!/bin/sh\n")
+        (programs / "chromium").chmod(0o755)
+    done = run_page(page, PATH=str(programs))
+    assert done.returncode == 0, done.stderr
+    assert ("drawn.png" in done.stdout) == installed
+
+
+def run_page(page, **variables):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
     return subprocess.run(
         [sys.executable, ROOT / "scripts" / "pages", page],
         capture_output=True, text=True, env=environment,

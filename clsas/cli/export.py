@@ -13,14 +13,16 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import read_levels
+from clsas.cli.inputs import load, read_levels, read_scene
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, ORIGIN, File, Output, keep_out
 from clsas.cli.view import Folder, size_of
 from clsas.core import reading, validate
 from clsas.files.hdf5 import read_geometry
+from clsas.maps import sicd
 from clsas.maps.encoding import KINDS
-from clsas.maps.exporting import SUFFIXES, check_name
+from clsas.maps.export_options import SUFFIXES
+from clsas.maps.exporting import check_name
 
 
 class _Target(File):
@@ -80,7 +82,12 @@ class _Target(File):
 )  # fmt: skip
 @click.option(
     "--lines", "lines_path", type=INPUT,
-    help="Range lines of the image, for tags with their carrier and sound speed.",
+    help="Range lines of the image, for tags with their carrier and sound speed. A .nitf requires "
+    "them.",
+)  # fmt: skip
+@click.option(
+    "--scene", "scene_path", type=INPUT,
+    help="Scene file with the beam that formed the image, for a .nitf.",
 )  # fmt: skip
 @options.map_marks
 @options.as_json
@@ -96,14 +103,16 @@ def export(
     crs: str | None,
     plan_path: Path | None,
     lines_path: Path | None,
+    scene_path: Path | None,
     as_json: bool,
     **given: Any,
 ) -> None:
     """Write an image or a mosaic as a map, a picture or a web page.
 
     INPUT is an image in HDF5 or the Zarr store of a finished mosaic, which may be larger than
-    memory. The suffix of OUTPUT decides: .tif is a cloud-optimized GeoTIFF, .nc is netCDF 4, and
-    .png, .pdf and .svg are pictures. A PNG of an image with a georeference gets a world file.
+    memory. The suffix of OUTPUT decides: .tif is a cloud-optimized GeoTIFF, .nc is netCDF 4, .nitf
+    is SICD (radar images only), and .png, .pdf and .svg are pictures. A PNG of an image with a
+    georeference gets a world file.
     Without a suffix, OUTPUT is a folder that any browser shows, as clsas view writes it.
 
     \b
@@ -117,7 +126,13 @@ def export(
     if plan_path is not None:
         known["plan"] = _plan(plan_path)
     if lines_path is not None:
-        known["lines"], _ = read_geometry(lines_path)
+        known["lines"] = (
+            load(lines_path, clsas.RangeLines)
+            if output.suffix.lower() in sicd.SUFFIXES  # which states their band
+            else read_geometry(lines_path)[0]
+        )
+    if scene_path is not None:
+        known["beam"] = _beam(scene_path)
     start = time.perf_counter()
     with progress_bar("exporting") as progress, _naming_options():
         clsas.export(
@@ -145,12 +160,25 @@ def _plan(path: Path) -> clsas.Plan:
         raise ValueError(f"{wanted}: {reason}") from None
 
 
+def _beam(path: Path) -> clsas.BeamWindow:
+    """Return the beam of a scene; raise UsageError if it has none."""
+    beam = read_scene(path).image.get("beam")
+    if beam is None:
+        raise click.UsageError(f"--scene {printable(path)} must have a beam, in [image]")
+    return beam
+
+
 @contextmanager
 def _naming_options() -> Iterator[None]:
     """Let errors name the options of the command, not the arguments of `clsas.export`."""
     command = click.get_current_context().command
     names = {each.name: each.opts[0] for each in command.params if isinstance(each, click.Option)}
-    names |= {"plan": "--plan", "lines": "--lines", "georeference": "--crs (or --origin)"}
+    names |= {
+        "plan": "--plan",
+        "lines": "--lines",
+        "beam": "--scene",
+        "georeference": "--crs (or --origin)",
+    }
     try:
         yield
     except ValueError as error:

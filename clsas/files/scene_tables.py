@@ -241,9 +241,12 @@ class SceneTables(Table):
             "process.lines": self.process.lines,
         }
         place = self.georeference.build() if self.georeference else None
+        track = self.track.build(folder, place) if self.track else None
+        if track is not None:
+            place = track.georeference  # its own, if it consists of latitudes and longitudes
         return dict(
             sonar=self.sonar.build() if self.sonar else None,
-            track=replace(self.track.build(folder), georeference=place) if self.track else None,
+            track=track,
             targets=tuple(parts) if len(parts) > 1 else parts[0] if parts else None,
             grid=replace(self.grid.build(folder), georeference=place) if self.grid else None,
             georeference=place,

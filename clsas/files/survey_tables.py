@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsas.core import validate
+from clsas.core.georeference import Georeference
 from clsas.files.tables import Table, Vector, located
 from clsas.files.track_files import read_track
 from clsas.sonar.system import Pulse, Sonar, line_array
@@ -144,8 +146,14 @@ class TrackTable(Table):
     pitch: RotationTable | None = None
     roll: RotationTable | None = None
 
-    def build(self, folder: Path) -> Track:
+    def build(self, folder: Path, georeference: Georeference | None = None) -> Track:
         """Return the track; a relative path of a `file` starts from `folder`.
+
+        Parameters
+        ----------
+        folder : Path
+        georeference : Georeference, optional
+            Frame of the track.
 
         Raises
         ------
@@ -158,7 +166,7 @@ class TrackTable(Table):
                 raise ValueError(f"[track] file must be the only key, got also {', '.join(others)}")
             with located("[track] file"):
                 try:
-                    return read_track(folder / self.file)
+                    return read_track(folder / self.file, georeference)
                 except OSError as error:
                     raise ValueError(
                         f"must be readable: {error.strerror}: {folder / self.file}"
@@ -176,4 +184,5 @@ class TrackTable(Table):
                 with located(f"[track.{table}]"):
                     motions[argument] = motion.build()
         with located("[track]"):
-            return Track.straight(*(getattr(self, name) for name in course), **motions)
+            track = Track.straight(*(getattr(self, name) for name in course), **motions)
+        return replace(track, georeference=georeference)

@@ -11,10 +11,11 @@ from clsas.core import map_grids, validate
 from clsas.core.georeference import Georeference
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
+from clsas.core.sidecars import remove_sidecars
 from clsas.core.version import __version__
-from clsas.maps import geotiff, netcdf, viewer, world_files
-from clsas.maps.encoding import KINDS
-from clsas.maps.geotiff import Options, Progress
+from clsas.maps import geotiff, netcdf, sicd, viewer, world_files
+from clsas.maps.export_options import SUFFIXES, ExportOptions
+from clsas.maps.geotiff import Progress
 from clsas.maps.orientation import Orientation
 from clsas.maps.sources import Source
 from clsas.mosaics.store import Store
@@ -22,9 +23,7 @@ from clsas.plans.plan import Plan
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.plot.colours import COLOUR_MAP
 from clsas.plot.levels import DYNAMIC_RANGE_DB
-
-SUFFIXES = (*geotiff.SUFFIXES, *netcdf.SUFFIXES, *PICTURES)
-"""Suffixes of the files that `export` writes."""
+from clsas.sonar.beam import BeamWindow
 
 
 def export(
@@ -40,6 +39,7 @@ def export(
     georeference: Georeference | None = None,
     plan: Plan | None = None,
     lines: RangeLines | None = None,
+    beam: BeamWindow | None = None,
     north_arrow: bool = False,
     scale_bar: bool = False,
     progress: Progress | None = None,
@@ -53,6 +53,8 @@ def export(
       memory.
     - ``.nc``, a netCDF 4 file after the CF conventions, with level (dB re 1, NaN where nothing was
       received), real and imaginary parts.
+    - ``.nitf`` or ``.ntf``, a SICD file (1.4.0) of a radar image on a plane, for programs of
+      synthetic aperture radar. It has complex pixels and the geometry of the lines.
     - ``.png``, ``.pdf`` or ``.svg``, a picture as `clsas.plot.image_db` draws it. A PNG of an image
       with a georeference gets a world file (``.pgw``) and a file with the coordinate reference
       system (``.png.aux.xml``), unless it is a vertical plane.
@@ -90,7 +92,11 @@ def export(
         Plan of the image. Its tolerance, predicted error and stages become tags of the file. A
         mosaic knows its own.
     lines : RangeLines, optional
-        Range lines of the image. Their carrier and sound speed become tags of the file.
+        Range lines of the image. Their carrier and sound speed become tags of the file. SICD
+        requires them, for track, band and resolution.
+    beam : BeamWindow, optional
+        Beam with which the image was formed, for SICD. Without it, every line that reaches a pixel
+        contributes to it.
     north_arrow, scale_bar : bool
         True to draw an arrow to the north and a scale bar into a picture.
     progress : callable, optional
@@ -143,57 +149,37 @@ def export(
     check_name("path", path)
     validate.suffix("path", path, *SUFFIXES)
     suffix = path.suffix.lower()
-    given: dict[str, Any] = {
-        "kind": kind,
-        "dynamic_range_db": dynamic_range_db,
-        "reference": reference,
-        "colour_map": colour_map,
-        "north_up": validate.flag("north_up", north_up) or None,
-        "pixel_m": pixel_m,
-        "plan": plan,
-        "lines": lines,
-        "north_arrow": validate.flag("north_arrow", north_arrow) or None,
-        "scale_bar": validate.flag("scale_bar", scale_bar) or None,
-    }
-    _check(given, suffix)
+    options = ExportOptions(
+        kind=kind,
+        dynamic_range_db=dynamic_range_db,
+        reference=reference,
+        colour_map=colour_map,
+        north_up=north_up,
+        pixel_m=pixel_m,
+        plan=plan,
+        lines=lines,
+        beam=beam,
+        north_arrow=north_arrow,
+        scale_bar=scale_bar,
+    )
+    options.check_used(suffix)
     validate.instance("georeference", georeference, Georeference, type(None))
     validate.progress(progress)
     opened = _opened(source)
-    if not suffix:
+    if suffix and suffix not in PICTURES:
+        _write_data(path, _finished(opened, georeference), options, progress)
+    elif suffix:
+        world_files.write_picture(path, _placed(opened, georeference), options.given)
+    else:
         viewer.write(
             opened,
             path,
             names=[_name_of(source)],
-            dynamic_range_db=given["dynamic_range_db"],
-            colour_map=colour_map,
+            dynamic_range_db=options.dynamic_range_db,
+            colour_map=options.colour_map,
             georeference=georeference,
             progress=progress,
         )
-        return
-    if suffix in PICTURES:
-        picture = {name: value for name, value in given.items() if value is not None}
-        world_files.write_picture(path, _placed(opened, georeference), picture)
-        return
-    found = _finished(opened, georeference)
-    tags = _tags(found, plan, lines)
-    if suffix in netcdf.SUFFIXES:
-        map_grids.warn_of_place(found.grid)
-        netcdf.write(path, found, tags)
-        world_files.remove_sidecars(path)
-        return
-    _check_map(found, given)
-    map_grids.warn_of_place(found.grid)
-    options = Options(
-        kind=kind or "db",
-        north_up=north_up,
-        pixel_m=given["pixel_m"],
-        dynamic_range_db=given["dynamic_range_db"] or DYNAMIC_RANGE_DB,
-        reference=given["reference"],
-        colour_map=colour_map or COLOUR_MAP,
-    )
-    texts = {name: v if isinstance(v, str) else f"{v:.12g}" for name, v in tags.items()}
-    geotiff.write(path, found, options, texts, progress)
-    world_files.remove_sidecars(path)
 
 
 def check_name(name: str, path: Path) -> None:
@@ -204,39 +190,6 @@ def check_name(name: str, path: Path) -> None:
     last = path.name
     if last != ".." and (last.startswith(".") or last.endswith(".")):
         raise ValueError(f"{name} must not begin or end with a dot, got {validate.shown(last)}")
-
-
-def _check(given: dict[str, Any], suffix: str) -> None:
-    """Raise TypeError or ValueError for options that are wrong, or have no effect on a format."""
-    kind = given["kind"]
-    if kind is not None:
-        validate.one_of("kind", kind, KINDS)
-    for name in ("reference", "pixel_m"):
-        if given[name] is not None:
-            given[name] = validate.positive(name, given[name], "m" if name == "pixel_m" else "")
-    if given["dynamic_range_db"] is not None:
-        given["dynamic_range_db"] = validate.dynamic_range_db(given["dynamic_range_db"])
-    if given["colour_map"] is not None:
-        validate.text("colour_map", given["colour_map"])
-    validate.instance("plan", given["plan"], Plan, type(None))
-    validate.instance("lines", given["lines"], RangeLines, type(None))
-    drawn = {"dynamic_range_db", "reference", "colour_map"}
-    if suffix in geotiff.SUFFIXES:
-        known = {"kind", "north_up", "plan", "lines"}
-        known |= {"pixel_m"} if given["north_up"] else set()
-        known |= {"8bit": drawn, "complex": set()}.get(kind or "db", {"reference"})
-        what = f"{suffix} of kind {kind or 'db'!r}"
-        if not given["north_up"]:
-            what += " without north_up"
-    elif suffix in netcdf.SUFFIXES:
-        known, what = {"plan", "lines"}, suffix
-    elif not suffix:
-        known, what = {"dynamic_range_db", "colour_map"}, "a folder"
-    else:
-        known, what = drawn | {"north_arrow", "scale_bar"}, suffix
-    unused = [name for name, value in given.items() if value is not None and name not in known]
-    if unused:
-        raise ValueError(f"{unused[0]} must be left out, since it has no effect on {what}")
 
 
 def _opened(source: Image | Store | str | os.PathLike) -> Image | Store:
@@ -261,7 +214,43 @@ def _name_of(source: Image | Store | str | os.PathLike) -> str:
     return validate.printable(validate.path("source", source).resolve().name)
 
 
-def _check_map(source: Source, given: dict[str, Any]) -> None:
+def _write_data(
+    path: Path, source: Source, options: ExportOptions, progress: Progress | None
+) -> None:
+    """Write a file of pixels by its suffix, and remove files that describe the one it replaces."""
+    suffix = path.suffix.lower()
+    if suffix in geotiff.SUFFIXES:
+        _check_map(source, options)
+    map_grids.warn_of_place(source.grid)
+    if suffix in geotiff.SUFFIXES:
+        _write_geotiff(path, source, options, progress)
+    elif suffix in netcdf.SUFFIXES:
+        netcdf.write(path, source, _tags(source, options))
+    else:
+        sicd.write(path, source, options.lines, options.beam, _tags(source, options), progress)
+    remove_sidecars(path)
+
+
+def _write_geotiff(
+    path: Path, source: Source, options: ExportOptions, progress: Progress | None
+) -> None:
+    """Write a GeoTIFF by the options of an export, or by their defaults."""
+    tags = {
+        name: value if isinstance(value, str) else f"{value:.12g}"
+        for name, value in _tags(source, options).items()
+    }
+    completed = geotiff.Options(
+        kind=options.kind or "db",
+        north_up=options.north_up,
+        pixel_m=options.pixel_m,
+        dynamic_range_db=options.dynamic_range_db or DYNAMIC_RANGE_DB,
+        reference=options.reference,
+        colour_map=options.colour_map or COLOUR_MAP,
+    )
+    geotiff.write(path, source, completed, tags, progress)
+
+
+def _check_map(source: Source, options: ExportOptions) -> None:
     """Raise ValueError for images that a GeoTIFF cannot show."""
     grid = source.grid
     if grid.points_m is not None:
@@ -273,20 +262,21 @@ def _check_map(source: Source, given: dict[str, Any]) -> None:
             "the image by a scene with a table [georeference]"
         )
     turned = Orientation.of((grid.shape[0], grid.shape[1]), grid.georeference.affine(grid))
-    resamples = given["north_up"] and (given["pixel_m"] is not None or not turned.is_north_up)
-    if given["kind"] == "complex" and resamples:
+    resamples = options.north_up and (options.pixel_m is not None or not turned.is_north_up)
+    if options.kind == "complex" and resamples:
         raise ValueError(
             "north_up must be off for complex pixels, whose phase cannot be interpolated: form the "
             "image on the grid of Georeference.north_up, or export it rotated"
         )
-    if grid.height_m is not None and given["kind"] == "8bit":
+    if grid.height_m is not None and options.kind == "8bit":
         validate.warn(
             "8-bit levels leave out the heights of the grid; the kind 'db' has them as second band"
         )
 
 
-def _tags(source: Source, plan: Plan | None, lines: RangeLines | None) -> dict[str, Any]:
+def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
     """Return what is known of an image's origin, as tags of a file: texts and numbers."""
+    lines, plan = options.lines, options.plan
     place, inputs = source.grid.georeference, source.inputs
     errors = [r.predicted_error_db for r in source.records.values() if r.has_pixels]
     known: dict[str, Any] = {

@@ -24,8 +24,8 @@ def write_picture(path: Path, image: Image, options: dict[str, Any]) -> None:
     A vertical plane has no place on a map, and its PNG no such files.
 
     These are a world file (.pgw) and GDAL's auxiliary file (.png.aux.xml), which has the coordinate
-    reference system. If they cannot be written, the picture remains. Beside a PNG without a place
-    on a map, such files of an earlier picture are removed, since they would put it at a wrong one.
+    reference system. If they cannot be written, the picture remains. Such files of an earlier
+    picture are removed before.
 
     Raises
     ------
@@ -39,7 +39,6 @@ def write_picture(path: Path, image: Image, options: dict[str, Any]) -> None:
     has_place = place is not None and grid.points_m is None and not is_vertical(place, grid)
     if path.suffix.lower() != ".png" or place is None or not has_place:
         save(figure, path)
-        remove_sidecars(path)
         return
     warn_of_place(grid)
     wkt = place.wkt()
@@ -58,25 +57,6 @@ def write_picture(path: Path, image: Image, options: dict[str, Any]) -> None:
     )
     with replacing(path.with_name(f"{path.name}.aux.xml")) as temporary:
         temporary.write_text(described)
-
-
-def remove_sidecars(path: Path) -> None:
-    """Remove files beside a new file that describe the one it replaced.
-
-    GDAL and programs for maps keep statistics, a georeference and overviews in them, and believe
-    them rather than the file.
-
-    Raises
-    ------
-    OSError
-        If such a file cannot be removed.
-    """
-    path.with_name(f"{path.name}.aux.xml").unlink(missing_ok=True)
-    suffix = path.suffix.lower()
-    if suffix == ".png":
-        path.with_suffix(".pgw").unlink(missing_ok=True)
-    elif suffix in (".tif", ".tiff"):
-        path.with_name(f"{path.name}.ovr").unlink(missing_ok=True)
 
 
 def _of_picture(figure: Figure, image: Image) -> Affine:

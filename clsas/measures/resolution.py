@@ -132,7 +132,7 @@ def azimuth_width_m(seen: View, wavelength_m: float) -> float:
     of infinity means that all channels have one frequency, so that there is no aperture.
     """
     sine = _sines(seen.point_m, seen.tx_m, seen.along) + _sines(seen.point_m, seen.rx_m, seen.along)
-    return _width(sine / wavelength_m, seen.weights)
+    return half_power_width(sine / wavelength_m, seen.weights)
 
 
 def range_width_m(sonar: Sonar, window: Window = "none") -> float:
@@ -142,7 +142,7 @@ def range_width_m(sonar: Sonar, window: Window = "none") -> float:
     the pulse compression, at the spatial frequency 2 f/c.
     """
     frequency, power = _band(sonar, window)
-    return _width(2 * frequency / sonar.sound_speed_m_s, power)
+    return half_power_width(2 * frequency / sonar.sound_speed_m_s, power)
 
 
 def grating_lobe_db(
@@ -276,7 +276,7 @@ def _sines(
     return np.divide(forward_m, distance_m, out=np.zeros_like(distance_m), where=distance_m > 0)
 
 
-def _width(cycles_per_m: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
+def half_power_width(cycles_per_m: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
     """Return the full width at half power of |sum weight exp(j 2 pi cycles_per_m u)| at u = 0."""
     used = weight != 0
     cycles_per_m, weight = cycles_per_m[used], weight[used]

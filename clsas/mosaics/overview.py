@@ -13,7 +13,7 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 
 _FINEST = 5  # pixels of a level along each side of an overview pixel, before a larger step is tried
-_LARGER = 1.25  # largest step over the smallest, so that a coarser level can be read
+_LARGER = 4 / 3  # largest step over the smallest, so that a coarser level can be read
 
 
 class Reading(NamedTuple):

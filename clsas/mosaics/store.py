@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -231,9 +231,7 @@ class Store:
             validate.warn(
                 f"{self.path} was damaged and has been repaired: {describe_arrays(repaired)}"
             )
-        if damaged := self._level_damage():
-            # Without their record they are computed again when all patches are finished.
-            (self.path / LEVELS / "zarr.json").unlink()
+        if damaged := self._forget_damaged_levels():
             validate.warn(
                 f"{self.path} was damaged; these levels are computed again: "
                 f"{describe_arrays(damaged)}"
@@ -290,15 +288,7 @@ class Store:
         """
         validate.progress(progress)
         _ = self.pixels  # raises if their metadata are damaged
-        found, indices = {}, self._files.indices()
-        for done, index in enumerate(indices, 1):
-            try:
-                self._files.verify(index, self._opened)
-            except DamageError as error:
-                found[index] = str(error)
-            if progress is not None:
-                progress(done, len(indices))
-        return found
+        return self._patch_damage(self._files.arrays, progress)
 
     def write(
         self,
@@ -405,12 +395,13 @@ class Store:
         Returns
         -------
         bool
-            True if levels were computed, False if the store has its levels already.
+            True if levels were computed, False if the store has its levels already, which are then
+            read and compared with their checksums.
 
         Raises
         ------
         ValueError
-            If a patch is damaged; the message names it.
+            If a patch or its part of the levels is damaged; the message names it.
         OSError
             If the store cannot be read or written.
         """
@@ -419,7 +410,11 @@ class Store:
             _arrays().add_levels(self.path)
             for name in ("_files", "_mosaic_arrays"):
                 self.__dict__.pop(name, None)
-        return self.complete_levels(progress)
+        self._forget_damaged_levels()
+        added = self.complete_levels(progress)
+        if found := self._patch_damage(self._files.arrays[1:]):  # without the pixels
+            raise ValueError(f"{self.path} is damaged: {describe_damage(found)}{_REPAIR}")
+        return added
 
     def read(
         self, rows: slice = slice(None), columns: slice = slice(None)
@@ -493,18 +488,19 @@ class Store:
             _arrays().check_metadata(self.path, read_document(self.path))
             for index in patches:
                 self._files.record(index, [array])
-            return np.asarray(stored[rows, columns])
+            values = np.asarray(stored[rows, columns])
         except ValueError as error:
-            found = {}
-            for index in patches:
-                try:
-                    self._files.verify(index, self._opened, [array])
-                except DamageError as damage:
-                    found[index] = str(damage)
+            found = self._patch_damage([array], indices=patches)
             reason = describe_damage(found) if found else f"{array.name}: {error}"
             if not found and array.name == "pixels":
                 reason = str(error)
             raise ValueError(f"{self.path} is damaged: {reason}{_REPAIR}") from error
+        if not np.isfinite(values).all():
+            raise ValueError(
+                f"{self.path} must have finite numbers, but its {array.name} contain NaN or "
+                "infinity, which clsas does not write"
+            )
+        return values
 
     def _opened(self, array: PixelArray) -> zarr.Array:
         if array.name == "pixels":
@@ -603,6 +599,33 @@ class Store:
     def _is_complete(self) -> bool:
         """Return whether the levels that mix patches are those of the present patches."""
         return _completing().is_current(self.path, read_document(self.path), self._digest())
+
+    def _patch_damage(
+        self,
+        arrays: Sequence[PixelArray],
+        progress: Callable[[int, int], object] | None = None,
+        indices: Sequence[PatchIndex] | None = None,
+    ) -> dict[PatchIndex, str]:
+        """Read parts of arrays that belong to patches, by default all; return what is damaged."""
+        indices = self._files.indices() if indices is None else indices
+        found = {}
+        for done, index in enumerate(indices, 1):
+            try:
+                self._files.verify(index, self._opened, arrays)
+            except DamageError as error:
+                found[index] = str(error)
+            if progress is not None:
+                progress(done, len(indices))
+        return found
+
+    def _forget_damaged_levels(self) -> dict[str, str]:
+        """Return the damaged levels that mix patches, and remove the record of all of them.
+
+        Without it they are computed again when all patches are finished.
+        """
+        if damaged := self._level_damage():
+            (self.path / LEVELS / "zarr.json").unlink()
+        return damaged
 
     def _level_damage(self) -> dict[str, str]:
         """Read the levels that mix patches, if they are complete; return those that are damaged."""

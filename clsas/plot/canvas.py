@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from clsas.core import validate
 from clsas.core.atomic import replacing
 from clsas.core.extras import needed
+from clsas.core.sidecars import remove_sidecars
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,6 +37,8 @@ _DATES = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -> None:
     """Write a figure as PNG, PDF or SVG. An existing file is replaced in one step.
+
+    Files beside it that put the old picture on a map (.pgw, .aux.xml) are removed.
 
     Parameters
     ----------
@@ -71,6 +74,7 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -
         figure.savefig(
             temporary, format=kind, dpi=dpi, bbox_inches="tight", pad_inches=PADDING_IN, **options
         )
+    remove_sidecars(path)
 
 
 def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -> None:

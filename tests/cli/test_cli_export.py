@@ -91,7 +91,7 @@ def test_options_place_an_image(folder):
         ),
         (("image.h5", "a.tif", "--crs", "EPSG:32632"), 1,
          "--crs (or --origin) must be left out"),
-        (("image.h5", "a.bmp"), 2, "must end in .tif or .tiff or .nc or .png"),
+        (("image.h5", "a.bmp"), 2, "must end in .tif or .tiff or .nc or .nitf or .ntf or .png"),
         (("image.h5", "a.nc", "--as", "db"), 1, "--as must be left out"),
         (("image.h5", "a.tif", "--plan", "image.h5"), 1, "--plan image.h5 must be a plan of"),
         (("image.h5", "a.tif", "--plan", "bad.json"), 1, "--plan bad.json must be a plan of"),
@@ -134,3 +134,32 @@ def test_show_draws_the_marks_of_a_map(folder, figures):
     done = CliRunner().invoke(main, ["show", "lines.h5", "--scale-bar"])
     assert done.exit_code == 2
     assert "--scale-bar cannot be used with range lines" in done.output
+
+
+def test_a_radar_image_becomes_sicd_by_its_lines_and_its_beam(folder):
+    pytest.importorskip("sarkit", reason="sarkit (extra radar) is not installed")
+    import sarkit.sicd
+
+    place, light_m_s = local(217.0), 299_792_458.0
+    grid = clsas.Grid.plane((-1, 1, 11), (997, 1003, 7), georeference=place)
+    clsas.save("radar.h5", clsas.Image(np.ones(grid.shape, complex), grid))
+    track_m = np.stack([np.linspace(-20, 20, 41), np.zeros(41), np.full(41, 500.0)], axis=1)
+    samples = np.tile(np.sinc(np.arange(-200, 200) / 2), (41, 1)).astype(complex)
+    lines = clsas.RangeLines(samples, 1000.0, 1.0, track_m, track_m, 9.6e9, light_m_s)
+    clsas.save("radar-lines.h5", lines)
+    (folder / "scene.toml").write_text("[image]\nbeam = {width_deg = 1.0}\n")
+    assert run("radar.h5", "a.nitf", "--lines", "radar-lines.h5")[0] == 0
+    assert run("radar.h5", "b.nitf", "--lines", "radar-lines.h5", "--scene", "scene.toml")[0] == 0
+    bandwidths = []
+    for name in ("a.nitf", "b.nitf"):
+        with (folder / name).open("rb") as file, sarkit.sicd.NitfReader(file) as reader:
+            root = sarkit.sicd.ElementWrapper(reader.metadata.xmltree.getroot())
+            bandwidths.append(root["Grid"]["Col"]["ImpRespBW"])
+    assert bandwidths[1] < 0.6 * bandwidths[0]
+    code, output = run("radar.h5", "c.nitf")
+    assert (code, "--lines must be given for SICD" in output) == (1, True)
+    code, output = run("radar.h5", "c.tif", "--scene", "scene.toml")
+    assert (code, "--scene must be left out, since it has no effect on .tif" in output) == (1, True)
+    (folder / "scene.toml").write_text("")
+    code, output = run("radar.h5", "c.nitf", "--lines", "radar-lines.h5", "--scene", "scene.toml")
+    assert (code, "--scene scene.toml must have a beam" in output) == (2, True)

@@ -256,6 +256,49 @@ def test_track_file(tmp_path):
     assert parse("[track]\nfile = 'track.csv'", tmp_path).track.velocity_m_s.tolist() == [[1, 2, 3]]
 
 
+GEOGRAPHIC = (
+    "time_s,latitude_deg,longitude_deg,height_m,heading_deg,pitch_deg\n"
+    "0,60.39,5.32,-20,0,2\n5,60.3901,5.32,-20,0,2\n"
+)
+
+
+def test_a_track_file_may_have_latitudes_and_longitudes(tmp_path):
+    pytest.importorskip("pyproj")
+    (tmp_path / "track.csv").write_text(GEOGRAPHIC)
+    table = "[track]\nfile = 'track.csv'\n"
+    expected = clsas.Track.from_geographic(
+        [60.39, 60.3901], [5.32, 5.32], -20.0, 0.0, [0.0, 5.0], pitch_deg=2.0
+    )
+    scene = parse(table + GRID, tmp_path)
+    np.testing.assert_array_equal(scene.track.positions_m, expected.positions_m)
+    np.testing.assert_allclose(scene.track.pitch_rad, -np.radians(2))
+    assert scene.track.georeference == expected.georeference
+    assert scene.georeference == scene.grid.georeference == expected.georeference
+    place = "[georeference]\nlatitude_deg = 60.39\nlongitude_deg = 5.32\nheading_deg = 90.0\n"
+    scene = parse(table + place, tmp_path)
+    assert scene.track.georeference == clsas.Georeference.local(60.39, 5.32, heading_deg=90.0)
+    np.testing.assert_allclose(scene.track.positions_m[0], [0, 0, -20], atol=1e-6)
+    np.testing.assert_allclose(scene.track.positions_m[1], [0, 11.14, -20], atol=0.01)
+    np.testing.assert_allclose(scene.track.yaw_rad, np.pi / 2)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("height_m", "z_m", "column 'z_m' excludes latitude_deg and longitude_deg"),
+        ("pitch_deg", "yaw_deg", "column 'yaw_deg' excludes latitude_deg"),
+        (",heading_deg", ",pitch_deg", "column 'heading_deg' must be present once"),
+        ("60.39,", "91,", "latitude_deg must be"),
+        ("latitude_deg", "lattitude_deg", "did you mean 'latitude_deg'"),
+    ],
+)
+def test_wrong_latitudes_and_longitudes_are_one_message(before, after, message, tmp_path):
+    pytest.importorskip("pyproj")
+    (tmp_path / "track.csv").write_text(GEOGRAPHIC.replace(before, after, 1))
+    with pytest.raises(ValueError, match=rf"track\.csv: .*{message}"):
+        parse("[track]\nfile = 'track.csv'", tmp_path)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

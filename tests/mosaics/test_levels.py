@@ -244,6 +244,9 @@ def test_the_overview_reads_the_level_that_makes_up_its_pixels(tmp_path, monkeyp
             np.testing.assert_allclose(np.abs(ours.pixels), np.abs(image.pixels), rtol=1e-6)
             np.testing.assert_allclose(ours.grid.positions_m(), image.grid.positions_m())
     read.clear()
+    assert store.overview(28).shape == (17, 21)  # 4 pixels a side instead of 3, which no level has
+    assert set(read) == {"4x/amplitude"}
+    read.clear()
     assert store.overview(12, *windows[0]).shape == (7, 10)
     assert set(read) == {"8x/amplitude"}
     read.clear()
@@ -287,6 +290,43 @@ def test_damaged_levels_that_mix_patches_are_computed_again(tmp_path):
     assert store.levels == (2, 4)
     assert store.complete_levels()
     assert files_of(store.path) == whole
+
+
+def test_adding_levels_finds_damaged_ones(tmp_path):
+    store = finished(tmp_path / "a.zarr", MIXED)
+    whole = files_of(store.path)
+    assert not store.add_levels()
+    for name, of_patches in (("8x/amplitude", False), ("4x/amplitude", True)):
+        chunk = store.path / name / "c/0/0"
+        chunk.write_bytes(b"\1" + chunk.read_bytes()[1:])
+        if of_patches:
+            with pytest.raises(ValueError, match=r"patch 0,0: its values of 4x/amplitude do not"):
+                store.add_levels()
+        else:
+            assert store.add_levels()
+            assert files_of(store.path) == whole
+
+
+def test_numbers_of_other_programs_that_are_not_finite_are_refused(tmp_path, monkeypatch):
+    """Zarr gives them checksums as good as any."""
+    store = finished(tmp_path / "a.zarr", OF_PATCHES)
+    pixels = PIXELS.copy()
+    pixels[3, 5] = np.nan
+    checked = clsas.core.validate.array
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "clsas.core.validate.array",
+            lambda name, value, *rest, **options: (
+                value if name == "pixels" else checked(name, value, *rest, **options)
+            ),
+        )
+        write(store, patches_of(OF_PATCHES)[0], pixels)
+    assert not store.damage()
+    with pytest.raises(ValueError, match=r"a\.zarr must have finite numbers, .* pixels"):
+        store.read(slice(0, 8))
+    with pytest.raises(ValueError, match=r"a\.zarr must have finite numbers, .* 2x/amplitude"):
+        store.read_level(2)
+    np.testing.assert_array_equal(store.read(slice(40, 70)), PIXELS[40:])
 
 
 @pytest.mark.parametrize("name", ["4x", "8x/amplitude", "8x/x", "overview_y", "amplitude_db"])

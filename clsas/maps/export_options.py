@@ -1,0 +1,95 @@
+"""Options of an export, and which of them have an effect on which format."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from clsas.core import validate
+from clsas.core.lines import RangeLines
+from clsas.maps import geotiff, netcdf, sicd
+from clsas.maps.encoding import KINDS
+from clsas.plans.plan import Plan
+from clsas.plot.canvas import SUFFIXES as PICTURES
+from clsas.sonar.beam import BeamWindow
+
+SUFFIXES = (*geotiff.SUFFIXES, *netcdf.SUFFIXES, *sicd.SUFFIXES, *PICTURES)
+"""Suffixes of the files that `clsas.export` writes."""
+
+_COLOURS = {"dynamic_range_db", "reference", "colour_map"}
+_ORIGIN = {"plan", "lines"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Options of `clsas.export`, which describes them. None or False is an option not given.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value has the wrong type or is outside its limits.
+    """
+
+    kind: str | None = None
+    dynamic_range_db: float | None = None
+    reference: float | None = None
+    colour_map: str | None = None
+    north_up: bool = False
+    pixel_m: float | None = None
+    plan: Plan | None = None
+    lines: RangeLines | None = None
+    beam: BeamWindow | None = None
+    north_arrow: bool = False
+    scale_bar: bool = False
+
+    def __post_init__(self) -> None:
+        """Check every field and convert it."""
+
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        for name in ("north_up", "north_arrow", "scale_bar"):
+            put(name, validate.flag(name, getattr(self, name)))
+        if self.kind is not None:
+            validate.one_of("kind", self.kind, KINDS)
+        if self.reference is not None:
+            put("reference", validate.positive("reference", self.reference))
+        if self.pixel_m is not None:
+            put("pixel_m", validate.positive("pixel_m", self.pixel_m, "m"))
+        if self.dynamic_range_db is not None:
+            put("dynamic_range_db", validate.dynamic_range_db(self.dynamic_range_db))
+        if self.colour_map is not None:
+            validate.text("colour_map", self.colour_map)
+        validate.instance("plan", self.plan, Plan, type(None))
+        validate.instance("lines", self.lines, RangeLines, type(None))
+        validate.instance("beam", self.beam, BeamWindow, type(None))
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """Options that are given, by name."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: v for name, v in values.items() if v is not None and v is not False}
+
+    def check_used(self, suffix: str) -> None:
+        """Raise ValueError if an option has no effect on the format of a suffix; "" is a folder."""
+        used, what = self._used(suffix)
+        unused = [name for name in self.given if name not in used]
+        if unused:
+            raise ValueError(f"{unused[0]} must be left out, since it has no effect on {what}")
+
+    def _used(self, suffix: str) -> tuple[set[str], str]:
+        """Return the options that have an effect on a format, and what the format is called."""
+        if not suffix:
+            return {"dynamic_range_db", "colour_map"}, "a folder"
+        if suffix in PICTURES:
+            return _COLOURS | {"north_arrow", "scale_bar"}, suffix
+        if suffix in netcdf.SUFFIXES:
+            return _ORIGIN, suffix
+        if suffix in sicd.SUFFIXES:
+            return _ORIGIN | {"beam"}, suffix
+        kind = self.kind or "db"
+        used = _ORIGIN | {"kind", "north_up"}
+        used |= {"8bit": _COLOURS, "complex": set()}.get(kind, {"reference"})
+        if self.north_up:
+            return used | {"pixel_m"}, f"{suffix} of kind {kind!r}"
+        return used, f"{suffix} of kind {kind!r} without north_up"
