@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
+from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.measures.limits_geometry import Survey
+from clsas.measures.limits_heights import heights
 from clsas.measures.limits_imaging import approximations, resolution
 from clsas.measures.limits_result import Limit, Limits
 from clsas.measures.limits_sampling import along_track, grating_lobes, ping_interval
@@ -44,7 +47,8 @@ def limits(
     Parameters
     ----------
     sonar : Sonar
-        The sonar, with the speed of sound.
+        The sonar, with the speed of sound. Of several receiver banks, all results but those on
+        heights are for the first one, since each bank forms an image of its own.
     track : Track, optional
         Its track.
     grid : Grid, optional
@@ -104,6 +108,10 @@ def limits(
     u is half the length of the array. For a synthetic aperture, the way out curves like the way
     back, so the distance is twice as large.
 
+    Two banks whose lines of sight to a point have the unit vectors u and v measure its height by
+    the phase between their images, which changes by 2 pi/lambda (v_z - u_z) per metre. The height
+    of ambiguity, lambda/(v_z - u_z), shifts it by a cycle.
+
     References
     ----------
     Ødegaard, "Fast time domain beamforming for synthetic aperture sonar", thesis, University of
@@ -125,12 +133,22 @@ def limits(
     >>> print(f"{advance.value:.3f} m, at {advance.side} {advance.limit:.3f} m {advance.equation}")
     0.528 m, at most 0.528 m [31]
     """
+    validate.instance("sonar", sonar, Sonar)
     survey = Survey(
-        sonar, track, grid, beam, range_m, window, pointing, element_pattern, motion_in_flight
+        sonar.bank(0),
+        track,
+        grid,
+        beam,
+        range_m,
+        window,
+        pointing,
+        element_pattern,
+        motion_in_flight,
     )
     results: list[Limit] = []
     missing: dict[str, str] = {}
-    for subject, yields in _SUBJECTS.items():
+    subjects = {**_SUBJECTS, "Heights": partial(heights, sonar=sonar)}
+    for subject, yields in subjects.items():
         for each in yields(survey):
             if isinstance(each, Limit):
                 results.append(replace(each, subject=subject))
