@@ -337,7 +337,20 @@ class Sonar:
         return replace(self, rx_m=self.rx_m[index], bank_numbers=None)
 
     def channel_banks(self, pings: int) -> NDArray[np.int64] | None:
-        """Return the bank of every channel of a track with so many pings; None for one bank."""
+        """Return the bank of every channel, [pings * receivers]; None for one bank.
+
+        Parameters
+        ----------
+        pings : int
+            Number of pings. Channels are in ping-major order, as those of `clsas.channels`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If `pings` is not a positive whole number, or the channels do not fit into memory.
+        """
+        pings = validate.count("pings", pings)
+        validate.memory("pings", 8 * pings * self.receivers)
         return None if self.bank_numbers is None else np.tile(self.bank_numbers, pings)
 
     @property
