@@ -173,6 +173,7 @@ def convert(
         steps.append(partial(high_passed, cutoff_hz=high_pass_hz, name="--high-pass-hz"))
     if taper_m is not None:
         steps.append(partial(tapered_ends, length_m=taper_m, name="--taper-m"))
+    obj: Any
     if steps or bank is not None or output.suffix.lower() in CPHD:
         obj = load_lines(recording, bank)
     else:

@@ -57,18 +57,49 @@ def _ambiguities(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return ranges of grid points, metres, and their heights of ambiguity, [points] each.
 
-    The phase between two images is 2 pi/wavelength times the difference of the paths to their
-    receivers. Its change with the height of a point is the difference of the vertical components of
-    the unit vectors from the receivers. The ping that passes closest sees each point.
+    The ping that passes closest sees each point.
     """
     points_m = grid.spread(_POINTS)
-    slopes = []
-    for receiver_m in (low_m, high_m):
-        rx_m = channels(Sonar(sonar.pulse, receiver_m[None]), track).rx_m
-        away_m = points_m[:, None] - rx_m
-        distance_m = np.linalg.norm(away_m, axis=-1)
-        closest = distance_m.argmin(axis=1)[:, None]
-        nearest_m = np.take_along_axis(distance_m, closest, axis=1)[:, 0]
-        slopes.append(np.take_along_axis(away_m[..., 2], closest, axis=1)[:, 0] / nearest_m)
+    rx_m = np.stack([low_m, high_m])
+    tx_m, rx_m, _ = channels(Sonar(sonar.pulse, rx_m, tx_m=sonar.tx_m), track)
+    tx_m, rx_m = tx_m[::2], rx_m.reshape(-1, 2, 3)
+    range_m = np.linalg.norm(points_m[:, None] - tx_m, axis=-1)
+    closest = range_m.argmin(axis=1)
+    turns = phase_per_height(
+        points_m, tx_m[closest], rx_m[closest, 0], rx_m[closest, 1], sonar.wavelength_m
+    )
     with np.errstate(divide="ignore"):
-        return nearest_m, sonar.wavelength_m / np.abs(slopes[1] - slopes[0])
+        return range_m.min(axis=1), 2 * np.pi / np.abs(turns)
+
+
+def phase_per_height(
+    points_m: NDArray[np.float64],
+    tx_m: NDArray[np.float64],
+    low_m: NDArray[np.float64],
+    high_m: NDArray[np.float64],
+    wavelength_m: float,
+) -> NDArray[np.float64]:
+    """Return how fast the phase between two receivers changes with height, rad/m, [points].
+
+    An echo tells its range, not its height. The height therefore changes along a curve of constant
+    range, that is, a point that rises also moves away. With unit vectors u and v from the receivers
+    and w from the transmitter to the point, the phase changes by 2 pi/lambda (v - u) . t along the
+    vector t that rises by 1, lies in the vertical plane through the point, and is perpendicular to
+    2 w + u + v.
+
+    Parameters
+    ----------
+    points_m, tx_m, low_m, high_m : float64 [points, 3]
+        Points, and the transmitter and the receivers that see each of them.
+    wavelength_m : float
+    """
+    ways_m = [points_m - each_m for each_m in (tx_m, low_m, high_m)]
+    w, u, v = (way_m / np.linalg.norm(way_m, axis=1, keepdims=True) for way_m in ways_m)
+    outward = ways_m[0] * [1.0, 1.0, 0.0]
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), np.finfo(float).tiny)
+    gradient = 2 * w + u + v
+    across = np.einsum("pi,pi->p", gradient, outward)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moves = -gradient[:, 2] / across  # outward per metre of height
+        turned = (v - u)[:, 2] + moves * np.einsum("pi,pi->p", v - u, outward)
+    return 2 * np.pi / wavelength_m * np.nan_to_num(turned, nan=0.0, posinf=0.0, neginf=0.0)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
 from clsas.core import validate
 from clsas.core.grid import Grid
+from clsas.measures.limits_common import Result
 from clsas.measures.limits_geometry import Survey
 from clsas.measures.limits_heights import heights
 from clsas.measures.limits_imaging import approximations, resolution
@@ -108,9 +109,8 @@ def limits(
     u is half the length of the array. For a synthetic aperture, the way out curves like the way
     back, so the distance is twice as large.
 
-    Two banks whose lines of sight to a point have the unit vectors u and v measure its height by
-    the phase between their images, which changes by 2 pi/lambda (v_z - u_z) per metre. The height
-    of ambiguity, lambda/(v_z - u_z), shifts it by a cycle.
+    The phase between the images of two banks shows heights. The height of ambiguity shifts it by a
+    cycle, at constant range. It is lambda R/B for a vertical baseline B at the range R.
 
     References
     ----------
@@ -147,7 +147,10 @@ def limits(
     )
     results: list[Limit] = []
     missing: dict[str, str] = {}
-    subjects = {**_SUBJECTS, "Heights": partial(heights, sonar=sonar)}
+    subjects: dict[str, Callable[[Survey], Iterator[Result]]] = {
+        **_SUBJECTS,
+        "Heights": partial(heights, sonar=sonar),
+    }
     for subject, yields in subjects.items():
         for each in yields(survey):
             if isinstance(each, Limit):

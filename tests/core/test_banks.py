@@ -143,9 +143,7 @@ def test_two_banks_cancel_in_one_image_off_the_grid():
     """What the warning says: half a cycle of height away from the grid, the echoes cancel."""
     sonar = clsas.Sonar(PULSE, [[0, 0, -0.1], [0, 0, 0.1]], bank_numbers=[0, 1])
     track = clsas.Track.straight([-1, 0, 10], [2, 0, 0], pings=100, ping_interval_s=0.01)
-    away_m = np.array([0.0, 40.0, 10.0])
-    slopes = [(away_m[2] - z) / np.hypot(away_m[1], away_m[2] - z) for z in (0.1, -0.1)]
-    height_m = sonar.wavelength_m / abs(slopes[0] - slopes[1]) / 2
+    height_m = sonar.wavelength_m * np.hypot(40, 10) / 0.2 / 2  # half the height of ambiguity
     levels = []
     for z in (0.0, height_m):
         # The point that has the range of a point on the plane, higher up and farther away.

@@ -339,14 +339,16 @@ def test_heights_of_two_banks():
     grid = clsas.Grid.plane((-2, 2, 5), (30, 80, 3))
     found = clsas.limits(sonar, track, grid)
     assert found["baseline_m"].value == pytest.approx(0.3)
-    # The path to either receiver, computed at two heights of the nearest and farthest pixel.
-    for name, y in (("near", 30.0), ("far", 80.0)):
+    # The path to either receiver, at two heights and the range of the nearest or farthest pixel.
+    for name, range_m in (("near", np.hypot(30.0, 15)), ("far", np.hypot(80.0, 15))):
         phases = [
-            [2 * np.pi / sonar.wavelength_m * np.hypot(y, 15 + z_m - height_m)
+            [2 * np.pi / sonar.wavelength_m
+             * np.hypot(np.sqrt(range_m**2 - (15 - height_m) ** 2), 15 + z_m - height_m)
              for z_m in (-0.15, 0.15)]
             for height_m in (-0.05, 0.05)
         ]  # fmt: skip
         turn = np.ptp(np.diff(phases, axis=1)) / 0.1
+        assert 2 * np.pi / turn == pytest.approx(sonar.wavelength_m * range_m / 0.3, rel=1e-3)
         # The lattice of pixels includes those at x = 0, abeam of a ping.
         assert found[f"ambiguity_{name}_m"].value == pytest.approx(2 * np.pi / turn, rel=1e-4)
     one = clsas.limits(sonar.bank(0), track, grid)

@@ -113,6 +113,12 @@ def data(folder: Path) -> dict[str, Call]:
             {"frequency_hz": np.array([0.0, 1e3, -2e3])},
             accepts={"frequency_hz": EMPTY},
         ),
+        "multilook": Call(
+            clsas.multilook,
+            {"images": [image, image], "window_m": 0.5},
+            accepts={"images": ("an Image",), "window_m": ("None",)},
+        ),
+        "sub_bands": Call(clsas.sub_bands, {"lines": lines, "count": 3}),
         "contrast": Call(clsas.contrast, {"image": image}, accepts={"image": ("list of it",)}),
         "entropy": Call(clsas.entropy, {"image": image}, accepts={"image": ("list of it",)}),
         "relative_error_db": Call(

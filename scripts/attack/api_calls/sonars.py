@@ -113,6 +113,7 @@ def sonars(folder: Path) -> dict[str, Call]:
         "BeamWindow.of_element": Call(
             clsas.BeamWindow.of_element, {"length_m": 0.1, "wavelength_m": 0.015, "shape": "hann"}
         ),
+        "BeamWindow.divided": Call(beam.divided, {"count": 3}),
         "BeamWindow.directions": Call(beam.directions, {"lines": s.lines}),
         "BeamWindow.weights": Call(
             beam.weights,
