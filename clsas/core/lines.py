@@ -271,7 +271,7 @@ class RangeLines:
         >>> lines.channels, lines.banks
         (12, 2)
         >>> upper = lines.bank(1)
-        >>> upper.channels, upper.rx_m[:, 2].min()
+        >>> upper.channels, float(upper.rx_m[:, 2].min())
         (6, 10.3)
         """
         index = banks.members(self.bank_numbers, number)

@@ -28,9 +28,9 @@ def multilook(images: Image | Sequence[Image], *, window_m: float | None = None)
     images : Image or sequence of Image
         One image, or several looks at one grid.
     window_m : float, optional
-        Side of a square window over rows and columns, metres; it contains an odd number of pixels
-        along either axis, at least one. Near the edges of the image, the window contains fewer
-        pixels. None averages only over the looks.
+        Side of a square window, metres, which contains the pixels up to half a side before and
+        after its middle along rows and columns. Near the edges of the image these are fewer. None
+        averages only over the looks.
 
     Returns
     -------
@@ -60,9 +60,9 @@ def multilook(images: Image | Sequence[Image], *, window_m: float | None = None)
     >>> grid = clsas.Grid.plane((0, 5, 200), (40, 45, 200))
     >>> random = np.random.default_rng(0)
     >>> speckle = clsas.Image(random.standard_normal((200, 200, 2)) @ [1, 1j], grid)
-    >>> smooth = clsas.multilook(speckle, window_m=0.1)
+    >>> smooth = clsas.multilook(speckle, window_m=0.12)
     >>> f"{clsas.contrast(speckle):.2f}, of 25 looks {clsas.contrast(smooth):.2f}"
-    '0.99, of 25 looks 0.20'
+    '1.01, of 25 looks 0.20'
     """
     looks = _checked(images)
     grid = looks[0].grid
