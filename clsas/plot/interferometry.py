@@ -33,7 +33,7 @@ _HIGHEST = 0.98  # share of the deviations within the colours
 
 
 class Interferogram(Protocol):
-    """What `interferogram` draws, with an entry per pixel of the grid."""
+    """Phase and coherence of two images, as `interferogram` draws them."""
 
     @property
     def grid(self) -> Grid:
@@ -49,7 +49,7 @@ class Interferogram(Protocol):
 
 
 class Heights(Protocol):
-    """What `heights` draws, with an entry per pixel of the image."""
+    """Heights on the grid of an image, as `heights` draws them."""
 
     @property
     def image(self) -> Image:
