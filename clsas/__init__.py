@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from clsas.measures.assessment import assess, survey_lines
     from clsas.measures.assessment_result import Assessment, Effect
     from clsas.measures.limits_result import Limit, Limits
+    from clsas.measures.looks import multilook
     from clsas.measures.quality import measure_point
     from clsas.measures.survey_limits import limits
     from clsas.measures.tradeoff import tradeoff
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from clsas.planning.planner import plan
     from clsas.plans.plan import Plan
     from clsas.processing.chain import Processed, process
+    from clsas.signal.band_parts import sub_bands
     from clsas.signal.compression import compress
     from clsas.signal.echoes import Echoes
     from clsas.signal.full_matrix import from_full_matrix
@@ -113,6 +115,7 @@ __all__ = [
     "measure_point",
     "micronavigate",
     "mosaic",
+    "multilook",
     "plan",
     "plot",
     "process",
@@ -124,6 +127,7 @@ __all__ = [
     "save",
     "simulate",
     "simulate_lines",
+    "sub_bands",
     "survey_lines",
     "to_xarray",
     "tradeoff",
@@ -156,6 +160,7 @@ _MODULES = {
     "measures.assessment": "assess survey_lines",
     "measures.assessment_result": "Assessment Effect",
     "measures.limits_result": "Limit Limits",
+    "measures.looks": "multilook",
     "measures.quality": "measure_point",
     "measures.survey_limits": "limits",
     "measures.tradeoff": "tradeoff",
@@ -170,6 +175,7 @@ _MODULES = {
     "planning.imager": "Imager",
     "planning.planner": "plan",
     "processing.chain": "Processed process",
+    "signal.band_parts": "sub_bands",
     "signal.compression": "compress",
     "signal.echoes": "Echoes",
     "signal.full_matrix": "from_full_matrix",

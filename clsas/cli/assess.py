@@ -9,7 +9,7 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, read_beam, read_grid, read_request
+from clsas.cli.inputs import load_lines, read_beam, read_grid, read_request
 from clsas.cli.outputs import json_able, report
 from clsas.cli.parameters import INPUT
 from clsas.files.cphd import START as CPHD
@@ -26,6 +26,7 @@ _HDF5 = b"\x89HDF"
 
 @click.command()
 @click.argument("file", metavar="SCENE.TOML|LINES.H5", type=INPUT)
+@options.bank
 @options.grid
 @options.method
 @options.beam
@@ -37,6 +38,7 @@ _HDF5 = b"\x89HDF"
 @options.as_json
 def assess(
     file: Path,
+    bank: int | None,
     scene: Path | None,
     device: str | None,
     repeats: int,
@@ -48,7 +50,8 @@ def assess(
     The table states the error of the image without each effect. Assess a scene before you simulate
     it, or range lines with a grid from --scene or from --x, --y and --z. If the scene describes
     sonar and track, element patterns are assessed too, and so is the motion of the receivers, even
-    if the lines have no velocities. Specify grid, beam and tolerance as for `clsas image`.
+    if the lines have no velocities. Of a scene with several banks, the first one is assessed unless
+    --bank names another. Specify grid, beam and tolerance as for `clsas image`.
 
     \b
     Example:  clsas assess scene.toml --tolerance-db -40
@@ -67,13 +70,16 @@ def assess(
     simulate = described.simulate
     known: dict[str, Any] = {}
     if is_lines:
-        lines = load(file, clsas.RangeLines)
+        lines = load_lines(file, bank)
         sonar, track = described.sonar, described.track
+        if sonar is not None and sonar.banks > 1 and lines.banks == 1:
+            sonar = sonar.bank(bank or 0)
         # A scene that describes another survey than the lines provides only grid and beam.
         if sonar and track and sonar.receivers * track.pings == lines.channels:
             known = {"sonar": sonar, "track": track}
     else:
         sonar, track = described.need("sonar", "track")
+        sonar = sonar.bank(bank or 0)
         survey = {
             name: simulate[name]
             for name in ("motion_in_flight", "phase_centres")

@@ -16,7 +16,7 @@ import clsas
 from clsas.cli import options
 from clsas.cli.inputs import (
     DEFAULT_REQUEST,
-    load,
+    load_lines,
     read_beam,
     read_grid,
     read_levels,
@@ -35,7 +35,7 @@ from clsas.opencl.device import Device, KernelTimes, open_device
 from clsas.planning.request import WORST_TOLERANCE_DB
 from clsas.plans.factorization import UNREACHED, ExactImage
 from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
-from clsas.sonar.looking import warn_behind
+from clsas.sonar.looking import warn_before_imaging
 
 _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is reported
 
@@ -43,6 +43,7 @@ _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is 
 @click.command()
 @click.argument("lines_file", metavar="LINES.H5", type=HDF5)
 @options.output("Image")
+@options.bank
 @options.grid
 @options.method
 @click.option(
@@ -77,6 +78,7 @@ _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is 
 def image(
     lines_file: Path,
     output: Path,
+    bank: int | None,
     scene: Path | None,
     exact: bool,
     device: str | None,
@@ -105,7 +107,7 @@ def image(
     # `clsas simulate` has already warned about the scene's own grid.
     if described.targets is None or grid is not described.grid:
         warn_of_sampling(described, grid)
-    lines = load(lines_file, clsas.RangeLines)
+    lines = load_lines(lines_file, bank)
     opened = open_device(device)
     chosen, planned_s = None, None
     if request.keys() & set(PLAN_KEYS):
@@ -228,7 +230,7 @@ def _exactly(
         warned = chosen.method.reason == UNREACHED
     preparation = prepare(lines, grid, device=device, beam=beam, **request)
     if chosen is None:  # otherwise the plan has warned
-        warn_behind(lines, grid)
+        warn_before_imaging(lines, grid)
         preparation.warn_of_ambiguity()
     interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
     return _Formed(
@@ -264,6 +266,7 @@ def _table(kernels: dict[str, KernelTimes]) -> str:
 
 @click.command()
 @click.argument("lines_file", metavar="LINES.H5", type=HDF5)
+@options.bank
 @options.grid
 @options.method
 @options.beam
@@ -275,6 +278,7 @@ def _table(kernels: dict[str, KernelTimes]) -> str:
 )  # fmt: skip
 def plan(
     lines_file: Path,
+    bank: int | None,
     scene: Path | None,
     device: str | None,
     as_json: bool,
@@ -295,7 +299,7 @@ def plan(
     described, grid = read_grid(scene, given)
     request = read_request(described, given)
     beam = read_beam(described, given)
-    lines = load(lines_file, clsas.RangeLines)
+    lines = load_lines(lines_file, bank)
     if not request.keys() & set(PLAN_KEYS):
         request = DEFAULT_REQUEST
     chosen = clsas.plan(lines, grid, **request, beam=beam, device=device)

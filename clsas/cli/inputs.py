@@ -35,6 +35,17 @@ def load(path: Path, *kinds: type) -> Any:
     raise ValueError(f"{path} must hold {wanted}, got {type(obj).__name__}")
 
 
+def load_lines(path: Path, bank: int | None) -> clsas.RangeLines:
+    """Return the range lines of a file, or those of one of their receiver banks."""
+    lines: clsas.RangeLines = load(path, clsas.RangeLines)
+    if bank is None:
+        return lines
+    try:
+        return lines.bank(bank)
+    except ValueError as error:
+        raise ValueError(f"{path}: {str(error).replace('number', '--bank', 1)}") from None
+
+
 def read_scene(path: Path) -> SceneFile:
     """Return a scene; raise UsageError if the command would replace a file that it refers to."""
     described = config.read_scene(path)

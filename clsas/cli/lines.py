@@ -12,7 +12,7 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, read_levels, read_scene, warn_of_sampling
+from clsas.cli.inputs import load, load_lines, read_levels, read_scene, warn_of_sampling
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import HDF5, INPUT, Output
 from clsas.core import validate
@@ -118,6 +118,7 @@ def compress(
 @click.command()
 @click.argument("recording", metavar="FILE", type=INPUT)
 @click.argument("output", metavar="OUTPUT", type=Output(*SUFFIXES))
+@options.bank
 @click.option(
     "--without-still-pings",
     is_flag=True,
@@ -145,6 +146,7 @@ def compress(
 def convert(
     recording: Path,
     output: Path,
+    bank: int | None,
     without_still_pings: bool,
     without_background: str | None,
     high_pass_hz: float | None,
@@ -155,8 +157,8 @@ def convert(
 
     FILE is an HDF5 file of clsas or AirSAS, a CPHD file, or a MATLAB file with a radar's phase
     history or a full matrix capture. The suffix of OUTPUT decides what is written: HDF5 (.h5) or
-    CPHD (.cphd). The options remove faults that `clsas inspect` finds. They are applied in the
-    order of this list.
+    CPHD (.cphd). The options keep one receiver bank, or remove faults that `clsas inspect` finds.
+    They are applied in the order of this list.
 
     \b
     Example:  clsas convert lines.h5 lines.cphd
@@ -171,8 +173,9 @@ def convert(
         steps.append(partial(high_passed, cutoff_hz=high_pass_hz, name="--high-pass-hz"))
     if taper_m is not None:
         steps.append(partial(tapered_ends, length_m=taper_m, name="--taper-m"))
-    if steps or output.suffix.lower() in CPHD:
-        obj = load(recording, clsas.RangeLines)
+    obj: Any
+    if steps or bank is not None or output.suffix.lower() in CPHD:
+        obj = load_lines(recording, bank)
     else:
         obj = clsas.load(recording)
     for step in steps:

@@ -11,7 +11,7 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, read_beam, read_grid
+from clsas.cli.inputs import load, load_lines, read_beam, read_grid
 from clsas.cli.outputs import json_able, print_json, printable, progress_bar, report, say
 from clsas.cli.parameters import HDF5, INPUT, POSITION, STAGES, Output
 from clsas.core import validate
@@ -92,6 +92,7 @@ def quality(
 @click.option(
     "--case", help="Use lines and grid of a case of `clsas bench`: ffbp-thesis, ffbp-2k, ..."
 )
+@options.bank
 @options.grid
 @click.option(
     "--tolerance-db",
@@ -124,6 +125,7 @@ def quality(
 def tradeoff(
     lines_file: Path | None,
     case: str | None,
+    bank: int | None,
     scene: Path | None,
     tolerance_db: tuple[float, ...],
     stages: tuple[tuple[tuple[int, int], ...], ...],
@@ -150,11 +152,13 @@ def tradeoff(
         title = lines_file.name
         described, grid = read_grid(scene, given)
         beam = read_beam(described, given)
-        lines = load(lines_file, clsas.RangeLines)
+        lines = load_lines(lines_file, bank)
     elif case is None:
         raise click.UsageError("give either LINES.H5 or --case")
     else:
         title = case
+        if bank is not None:
+            raise click.UsageError("--case has lines of one bank: leave out --bank")
         if scene is not None or any(given[name] is not None for name in ("x", "y", "z")):
             raise click.UsageError("--case has its own grid: leave out --scene, --x, --y and --z")
         built_in = _case(case)

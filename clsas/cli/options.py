@@ -109,6 +109,10 @@ device = click.option(
     help="Device to use: its index, kind (cpu, gpu), platform (pocl, intel, nvidia) or part of its "
     "name, as `clsas devices` lists them.",
 )
+bank = click.option(
+    "--bank", type=click.IntRange(min=0),
+    help="Use only the lines of this receiver bank, counted from 0. [default: all lines]",
+)  # fmt: skip
 axes = _together(
     click.option(
         "--x", type=AXIS, help="First and last pixel centre along x (m), and number of pixels."

@@ -15,7 +15,8 @@ def lines_digest(lines: RangeLines) -> str:
     """Return a digest of everything in range lines from which images of any samples follow."""
     numbers = np.array([lines.range_step_m, lines.carrier_hz, lines.sound_speed_m_s])
     others = lines.per_channel
-    others.pop("look_direction", None)  # does not change images
+    for name in ("look_direction", "bank_numbers"):  # do not change images
+        others.pop(name, None)
     # Changing this order would invalidate the digests in stores and plans.
     arrays = [others.pop(name) for name in ("tx_m", "rx_m", "first_range_m")]
     return _digest(np.array(lines.samples.shape), *arrays, numbers, *others.values())

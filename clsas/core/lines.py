@@ -8,10 +8,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import conditioning, pings, reprs, validate
+from clsas.core import banks, conditioning, pings, reprs, validate
 from clsas.core.georeference import Georeference
 
-_PER_CHANNEL = ("first_range_m", "tx_m", "rx_m", "rx_velocity_m_s", "look_direction")
+_PER_CHANNEL = (
+    "first_range_m",
+    "tx_m",
+    "rx_m",
+    "rx_velocity_m_s",
+    "look_direction",
+    "bank_numbers",
+)
 GOLDEN = (np.sqrt(5) - 1) / 2
 """Golden ratio minus 1. Modulo 1, its multiples fill [0, 1) evenly, but never in regular steps."""
 
@@ -59,6 +66,9 @@ class RangeLines:
         warn if pixels lie behind the elements.
     georeference : Georeference, optional
         Where the coordinates lie on Earth. Images of these lines have it too.
+    bank_numbers : array_like of int, shape [channels], optional
+        Receiver bank of each channel, counted from 0, for sonars with several rows of receivers at
+        different heights. None means that all receivers are one bank.
 
     Raises
     ------
@@ -107,6 +117,7 @@ class RangeLines:
     rx_velocity_m_s: NDArray[np.float64] | None = None
     look_direction: NDArray[np.float64] | None = None
     georeference: Georeference | None = None
+    bank_numbers: NDArray[np.int64] | None = None
 
     if TYPE_CHECKING:  # the constructor converts array_like arguments
 
@@ -122,6 +133,7 @@ class RangeLines:
             rx_velocity_m_s: ArrayLike | None = None,
             look_direction: ArrayLike | None = None,
             georeference: Georeference | None = None,
+            bank_numbers: ArrayLike | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -141,6 +153,7 @@ class RangeLines:
         return reprs.summary(
             self,
             f"{self.channels} channels of {self.length} samples",
+            f"{self.banks} banks" if self.banks > 1 else None,
             f"range {reprs.span(*range_m, 'm')} in steps of "
             f"{reprs.quantity(self.range_step_m, 'm')}",
             f"carrier {reprs.quantity(self.carrier_hz, 'Hz')}",
@@ -148,7 +161,7 @@ class RangeLines:
 
     @property
     def per_channel(self) -> dict[str, Any]:
-        """Float64 fields with an entry per channel, by name, without those that are None.
+        """Fields with an entry per channel, by name, without those that are None.
 
         Code that selects, joins or compares lines takes the fields from here.
         """
@@ -164,6 +177,11 @@ class RangeLines:
     def length(self) -> int:
         """Samples per channel."""
         return self.samples.shape[1]
+
+    @property
+    def banks(self) -> int:
+        """Number of receiver banks that the channels belong to."""
+        return len(banks.present(self.bank_numbers))
 
     @property
     def phase_centres_m(self) -> NDArray[np.float64]:
@@ -223,8 +241,46 @@ class RangeLines:
         index = self._index(channels)
         if len(range(self.channels)[index] if isinstance(index, slice) else index) == 0:
             raise ValueError("channels must select at least one line, got none")
+        return self._selected(index)
+
+    def bank(self, number: int) -> RangeLines:
+        """Return the lines of one receiver bank, whose `bank_numbers` are None.
+
+        Parameters
+        ----------
+        number : int
+            Number of the bank, one of `bank_numbers`, or 0 if these are None.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If there is no such bank.
+
+        Examples
+        --------
+        Three pings of a sonar with two banks, 0.3 m apart, of two receivers each:
+
+        >>> import clsas
+        >>> import numpy as np
+        >>> pulse = clsas.Pulse(carrier_hz=100e3, bandwidth_hz=20e3, duration_s=1e-3)
+        >>> rx_m = [[0, 0, 0], [0.1, 0, 0], [0, 0, 0.3], [0.1, 0, 0.3]]
+        >>> sonar = clsas.Sonar(pulse, rx_m, bank_numbers=[0, 0, 1, 1])
+        >>> track = clsas.Track.straight([0, 0, 10], [2, 0, 0], pings=3, ping_interval_s=0.05)
+        >>> point = clsas.PointTargets([[0.1, 40, 0]])
+        >>> lines = clsas.compress(clsas.simulate(sonar, track, point))
+        >>> lines.channels, lines.banks
+        (12, 2)
+        >>> upper = lines.bank(1)
+        >>> upper.channels, float(upper.rx_m[:, 2].min())
+        (6, 10.3)
+        """
+        index = banks.members(self.bank_numbers, number)
+        return self if self.bank_numbers is None else self._selected(index, bank_numbers=None)
+
+    def _selected(self, index: slice | NDArray[np.int64], **changes: Any) -> RangeLines:
+        """Return some channels, with fields replaced."""
         of_channels = {name: values[index] for name, values in self.per_channel.items()}
-        return replace(self, samples=self.samples[index], **of_channels)
+        return replace(self, samples=self.samples[index], **(of_channels | changes))
 
     def _index(self, channels: slice | ArrayLike) -> slice | NDArray[np.int64]:
         """Return the channels, checked, as a slice or as indices [n]."""
@@ -390,6 +446,8 @@ def checked_channels(received: Any, start: str) -> dict[str, Any]:
     if "rx_velocity_m_s" in checked:
         fastest_m_s = float(np.linalg.norm(checked["rx_velocity_m_s"], axis=1).max())
         validate.number("the speed of rx_velocity_m_s", fastest_m_s, "m/s", below=speed_m_s)
+    if received.bank_numbers is not None:
+        checked["bank_numbers"] = banks.checked_numbers(received.bank_numbers, channels, "channels")
     if "look_direction" in checked:
         checked["look_direction"] = _unit_vectors("look_direction", checked["look_direction"])
     return checked

@@ -19,7 +19,7 @@ from clsas.signal.ambiguity import BEST_DB, ambiguity
 from clsas.signal.spectrum import OUTSIDE, line_energy, measure_spectrum, occupied_band
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches
-from clsas.sonar.looking import warn_behind
+from clsas.sonar.looking import warn_before_imaging
 from clsas.sonar.simplify import simplify
 
 BEST_ACCURACY_DB = BEST_DB
@@ -146,7 +146,7 @@ def backproject(
     )
     if accumulate is not None:
         check_accumulate(accumulate, placed(lines, grid), beam)
-    warn_behind(lines, grid)
+    warn_before_imaging(lines, grid)
     preparation.warn_of_ambiguity()
     image = execute(preparation, progress=progress)
     if accumulate is None:

@@ -60,7 +60,8 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
     TypeError
         If `lines` are not range lines.
     ValueError
-        If the lines have receiver velocities, or the file's name has another suffix.
+        If the lines have receiver velocities or several banks, or the file's name has another
+        suffix.
     ImportError
         If sarkit is not installed (extra `radar`).
     OSError
@@ -95,6 +96,11 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
     if lines.rx_velocity_m_s is not None:
         raise ValueError(
             "lines must not have rx_velocity_m_s: CPHD cannot describe motion during flight"
+        )
+    if lines.banks > 1:
+        raise ValueError(
+            f"lines must be of one bank, got {lines.banks}: write lines.bank(0) and the others to "
+            "files of their own"
         )
     origin_m = np.rint(lines.phase_centres_m.mean(axis=0))
     origin_m *= np.abs(origin_m).max() > _NEAR_M

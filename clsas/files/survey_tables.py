@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from clsas.core import validate
 from clsas.core.georeference import Georeference
 from clsas.files.tables import Table, Vector, located
 from clsas.files.track_files import read_track
-from clsas.sonar.system import Pulse, Sonar, line_array
+from clsas.sonar.system import Pulse, Sonar, line_array, stacked
 from clsas.sonar.track import Motion, Track
 
-PRESETS = ("thesis_wide_beam", "edgetech", "sensotek")
+PRESETS = ("thesis_wide_beam", "edgetech", "sensotek", "hisas_1030")
 
 
 class PulseTable(Table):
@@ -47,6 +48,7 @@ class SonarTable(Table):
     pulse: PulseTable | None = None
     receivers: int | None = None
     spacing_m: float | None = None
+    bank_heights_m: Annotated[list[float], Field(min_length=1)] | None = None
     rx_m: list[Vector] | None = None
     tx_m: Vector = Field(default=[0.0, 0.0, 0.0])
     sample_rate_hz: float | None = None
@@ -55,6 +57,7 @@ class SonarTable(Table):
     rx_length_m: float | None = None
     tx_height_m: float | None = None
     rx_height_m: float | None = None
+    bank_numbers: list[int] | None = None
 
     def build(self) -> Sonar:
         """Return the sonar; raise ValueError if a value is outside its limits."""
@@ -67,20 +70,35 @@ class SonarTable(Table):
                 return getattr(Sonar, self.preset)()
             if self.pulse is None:
                 raise ValueError("missing table [sonar.pulse], or key 'preset'")
-            match self.rx_m, self.receivers, self.spacing_m:
-                case list(), None, None:
-                    rx = np.array(self.rx_m)
-                case None, int(count), float(spacing):
-                    rx = line_array(count, spacing)
-                case _:
-                    raise ValueError(
-                        "give the receivers by either receivers and spacing_m, or rx_m"
-                    )
+            rx_m, banks = self._receivers()
         with located("[sonar.pulse]"):
             pulse = self.pulse.build()
         skipped = {"preset", "pulse", "receivers", "spacing_m", "rx_m"}
+        skipped |= {"bank_heights_m", "bank_numbers"}
         with located("[sonar]"):
-            return Sonar(pulse, rx, **self.model_dump(exclude=skipped))
+            return Sonar(pulse, rx_m, **self.model_dump(exclude=skipped), bank_numbers=banks)
+
+    def _receivers(self) -> tuple[NDArray[np.float64], ArrayLike | None]:
+        """Return the positions of the receivers, [receivers, 3], and their banks."""
+        match self.rx_m, self.receivers, self.spacing_m:
+            case list(), None, None:
+                if self.bank_heights_m is not None:
+                    raise ValueError(
+                        "bank_heights_m must be left out with rx_m, which has the heights: give "
+                        "the banks by bank_numbers"
+                    )
+                return np.array(self.rx_m), self.bank_numbers
+            case None, int(count), float(spacing):
+                if self.bank_numbers is not None:
+                    raise ValueError(
+                        "bank_numbers must be left out without rx_m: give the heights of the banks "
+                        "by bank_heights_m"
+                    )
+                row_m = line_array(count, spacing)
+                if self.bank_heights_m is None:
+                    return row_m, None
+                return stacked(row_m, self.bank_heights_m)
+        raise ValueError("give the receivers by either receivers and spacing_m, or rx_m")
 
 
 class MotionTable(Table):

@@ -39,6 +39,7 @@ _NAMES = {
     "rx_m": "Receiver position",
     "rx_velocity_m_s": "Receiver velocity",
     "look_direction": "Look direction",
+    "bank_numbers": "Receiver bank",
     "first_range_m": "Range of the first sample",
     "start_time_s": "Time of the first sample after transmission",
 }

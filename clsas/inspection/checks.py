@@ -136,9 +136,11 @@ def check_advance(recording: Recording) -> Iterator[Finding]:
     """Yield an advance that only a slip of units can explain."""
     pings, lines, wavelength_m = recording.pings, recording.lines, recording.wavelength_m
     usual_m, last_range_m = pings.usual_step_m, float(lines.last_range_m.max())
-    receivers = float(np.median(pings.receivers))
+    receivers = float(np.median(pings.receivers)) / lines.banks
     # A long array may advance by little: its own length counts as well.
     first_ping = lines.rx_m[: pings.starts[1]]
+    if lines.bank_numbers is not None:  # banks lie above each other
+        first_ping = first_ping[lines.bank_numbers[: pings.starts[1]] == lines.bank_numbers[0]]
     array_m = float(np.linalg.norm(np.ptp(first_ping, axis=0))) / 2
     least_m = wavelength_m / _LEAST_PER_WAVELENGTH
     most_m = _MOST_WAVELENGTHS * wavelength_m * receivers

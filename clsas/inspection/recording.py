@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal.windows import hann
 
-from clsas.core import decibels
+from clsas.core import banks, decibels
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.pings import Transmissions
@@ -91,6 +91,16 @@ class Recording:
         return None if np.ptp(counts) else int(counts[0])
 
     @cached_property
+    def moving_bank(self) -> RangeLines:
+        """Moving lines of the first receiver bank; those of several may cancel in an image."""
+        return self.moving.bank(banks.present(self.moving.bank_numbers)[0])
+
+    @property
+    def receivers_per_bank(self) -> int | None:
+        """Channels per ping and bank if all pings have the same number, else None."""
+        return None if self.receivers is None else self.receivers // self.lines.banks
+
+    @cached_property
     def spectrum(self) -> Spectrum:
         """Mean power spectrum of the moving lines."""
         return measure_spectrum(self.moving)
@@ -145,10 +155,10 @@ class Recording:
     @cached_property
     def sign(self) -> tuple[PhaseSign | None, str]:
         """Comparison of both signs of the phase; see `phase_sign`."""
-        lines = self.moving
+        lines = self.moving_bank
         if self.background > decibels.power(CONSTANT_DB):
             # It is equally bright in every ping, and would be taken for the brightest echoes.
-            lines = lines.without_background("median", receivers=self.receivers)
+            lines = lines.without_background("median", receivers=self.receivers_per_bank)
         cell_m = lines.range_step_m * max(self.spectrum.oversampling, 1.0)
         return phase_sign(lines, self.grid, self.wavelength_m, cell_m, self.device)
 

@@ -174,7 +174,8 @@ class Inspection:
     def _rows(self) -> list[tuple[str, str]]:
         fewest, most = self.receivers
         several = f"{fewest}" if fewest == most else f"{fewest} to {most}"
-        array = f", {several} receivers per ping" if most > 1 else ""
+        banks = f" in {self.lines.banks} banks" if self.lines.banks > 1 else ""
+        array = f", {several} receivers per ping{banks}" if most > 1 else ""
         low_hz, high_hz = self.band_hz
         speed = "unknown: the lines have neither times nor velocities"
         if self.speed_m_s is not None:

@@ -103,8 +103,8 @@ def assess(
     Raises
     ------
     TypeError, ValueError
-        If an argument has the wrong type or is out of bounds, or sonar and track have other
-        channels than the lines.
+        If an argument has the wrong type or is out of bounds, the lines have several banks, or
+        sonar and track have other channels than the lines.
     DeviceError
         If the device does not exist.
 
@@ -268,7 +268,7 @@ def survey_lines(
     validate.memory("oversampling", 8 * len(first_m) * extent)
     length = math.ceil(extent) + _MARGIN
     middle = np.ravel_multi_index([n // 2 for n in grid.shape], grid.shape)
-    return simulate_lines(
+    lines = simulate_lines(
         geometry.tx_m,
         geometry.rx_m,
         PointTargets(grid.at(np.array([middle])), [1.0]),
@@ -281,6 +281,7 @@ def survey_lines(
         length=length,
         rx_velocity_m_s=geometry.rx_velocity_m_s,
     )
+    return replace(lines, bank_numbers=sonar.channel_banks(track.pings))
 
 
 @dataclass(frozen=True, eq=False)

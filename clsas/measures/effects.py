@@ -89,6 +89,11 @@ class Survey:
         validate.instance("pointing", self.pointing, Pointing, type(None))
         validate.flag("element_pattern", self.element_pattern)
         validate.flag("ends", self.ends)
+        if self.lines.banks > 1:
+            raise ValueError(
+                f"lines must be of one bank, got {self.lines.banks}: assess lines.bank(0), with "
+                "sonar.bank(0)"
+            )
         if self.sonar is None or self.track is None:
             return
         if self.sonar.receivers * self.track.pings != self.lines.channels:

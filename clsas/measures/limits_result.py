@@ -40,8 +40,11 @@ LABELS = {
     "aperture_far_field_m": "far field of the aperture",
     "phase_centre_shift_m": "phase-centre path",
     "phase_centre_error_m": "phase-centre error",
+    "baseline_m": "baseline of the banks",
+    "ambiguity_near_m": "height of ambiguity, near",
+    "ambiguity_far_m": "height of ambiguity, far",
 }
-"""Words for the name of every result, in their order."""
+"""Words for the name of every result, in their order. The last three require several banks."""
 
 
 @dataclass(frozen=True)

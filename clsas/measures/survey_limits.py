@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
+from clsas.core import validate
 from clsas.core.grid import Grid
+from clsas.measures.limits_common import Result
 from clsas.measures.limits_geometry import Survey
+from clsas.measures.limits_heights import heights
 from clsas.measures.limits_imaging import approximations, resolution
 from clsas.measures.limits_result import Limit, Limits
 from clsas.measures.limits_sampling import along_track, grating_lobes, ping_interval
@@ -44,7 +48,8 @@ def limits(
     Parameters
     ----------
     sonar : Sonar
-        The sonar, with the speed of sound.
+        The sonar, with the speed of sound. Of several receiver banks, all results but those on
+        heights are for the first one, since each bank forms an image of its own.
     track : Track, optional
         Its track.
     grid : Grid, optional
@@ -104,6 +109,9 @@ def limits(
     u is half the length of the array. For a synthetic aperture, the way out curves like the way
     back, so the distance is twice as large.
 
+    The phase between the images of two banks shows heights. The height of ambiguity shifts it by a
+    cycle, at constant range. It is lambda R/B for a vertical baseline B at the range R.
+
     References
     ----------
     Ødegaard, "Fast time domain beamforming for synthetic aperture sonar", thesis, University of
@@ -125,12 +133,25 @@ def limits(
     >>> print(f"{advance.value:.3f} m, at {advance.side} {advance.limit:.3f} m {advance.equation}")
     0.528 m, at most 0.528 m [31]
     """
+    validate.instance("sonar", sonar, Sonar)
     survey = Survey(
-        sonar, track, grid, beam, range_m, window, pointing, element_pattern, motion_in_flight
+        sonar.bank(0),
+        track,
+        grid,
+        beam,
+        range_m,
+        window,
+        pointing,
+        element_pattern,
+        motion_in_flight,
     )
     results: list[Limit] = []
     missing: dict[str, str] = {}
-    for subject, yields in _SUBJECTS.items():
+    subjects: dict[str, Callable[[Survey], Iterator[Result]]] = {
+        **_SUBJECTS,
+        "Heights": partial(heights, sonar=sonar),
+    }
+    for subject, yields in subjects.items():
         for each in yields(survey):
             if isinstance(each, Limit):
                 results.append(replace(each, subject=subject))

@@ -35,7 +35,7 @@ from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import Device
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import warn_unreached
-from clsas.sonar.looking import warn_behind
+from clsas.sonar.looking import warn_before_imaging
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -361,7 +361,7 @@ def mosaic(
     grid = placed(survey.geometry, grid)
     visibility = SurveyVisibility.of(survey, beam)
     if growth is None:
-        warn_behind(survey.geometry, grid, survey.last_range_m)
+        warn_before_imaging(survey.geometry, grid, survey.last_range_m)
     if growth is None and not visibility.channels(grid).any():
         warn_unreached(survey.geometry, grid, beam, visibility.along, survey.span_m)
     opened = None if store is None else Store.at(validate.path("store", store))

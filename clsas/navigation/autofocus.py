@@ -28,6 +28,7 @@ from clsas.navigation.autofocus_result import Autofocus
 from clsas.navigation.checks import (
     check_navigation,
     checked_unknowns,
+    first_bank,
     mean_wavelength_m,
     range_cell_m,
 )
@@ -94,7 +95,8 @@ def autofocus(
     Parameters
     ----------
     lines : RangeLines
-        At least ten pings, monostatic, bistatic, or of an array.
+        At least ten pings, monostatic, bistatic, or of an array. Of several receiver banks, the
+        first one is focused, and all of them are corrected.
     grid : Grid
         Pixels among which responses are searched. Part of the scene is enough if it has a few dozen
         bright responses.
@@ -188,12 +190,24 @@ def autofocus(
     validate.progress(progress)
     names = checked_unknowns(unknowns, UNKNOWNS)
     check_navigation(lines, 10, "autofocus", may_stand=True)
-    readout = Readout.of(_of_unit_level(lines), READ_DB)
-    passage = Passage.of(lines, names, mean_wavelength_m(readout))
+    focused = first_bank(lines)
+    readout = Readout.of(_of_unit_level(focused), READ_DB)
+    passage = Passage.of(focused, names, mean_wavelength_m(readout))
     focus = _Focus(readout, grid, passage, beam, open_device(device), progress)
     focus.check_geometry(names)
-    found = focus.result()
-    return replace(found, lines=replace(found.lines, samples=lines.samples))
+    return _of_all_banks(focus.result(), focused, lines)
+
+
+def _of_all_banks(found: Autofocus, focused: RangeLines, lines: RangeLines) -> Autofocus:
+    """Return a result for the lines `focused`, applied to all channels of the same pings."""
+    one_of_ping = focused.ping_starts[lines.ping_numbers]
+    moved_m = found.correction_m[one_of_ping]
+    return replace(
+        found,
+        lines=replace(lines, tx_m=lines.tx_m + moved_m, rx_m=lines.rx_m + moved_m),
+        correction_m=moved_m,
+        correction_sd_m=found.correction_sd_m[one_of_ping],
+    )
 
 
 def _of_unit_level(lines: RangeLines) -> RangeLines:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from clsas.core import validate
+from clsas.core import banks, validate
 from clsas.core.lines import RangeLines
 from clsas.core.pings import Transmissions
 from clsas.core.wavelengths import band_wavelength_m, is_about_zero
@@ -45,6 +45,28 @@ def checked_unknowns(unknowns: Sequence[str], allowed: Sequence[str]) -> tuple[s
     if not names or len(set(names)) < len(names):
         raise ValueError(f"unknowns must be one or several of {tuple(allowed)}, got {names}")
     return names
+
+
+def first_bank(lines: RangeLines) -> RangeLines:
+    """Return the lines of the first receiver bank, from which the track of all is estimated.
+
+    Channels of different banks share no phase centres, and their echoes differ in phase by the
+    height of the seabed. All banks are on one platform, so its displacements apply to them all.
+
+    Raises
+    ------
+    ValueError
+        If a ping has no channels of this bank.
+    """
+    number = banks.present(lines.bank_numbers)[0]
+    bank = lines.bank(number)
+    pings, of_bank = len(lines.ping_starts), len(bank.ping_starts)
+    if of_bank != pings:
+        raise ValueError(
+            f"lines must have channels of every bank in every ping, but only {of_bank} of {pings} "
+            f"pings have some of bank {number}. Correct one bank alone: lines.bank({number})"
+        )
+    return bank
 
 
 def check_navigation(lines: RangeLines, least_pings: int, purpose: str, *, may_stand: bool) -> None:

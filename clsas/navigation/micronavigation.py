@@ -14,7 +14,7 @@ from clsas.core import reprs, validate
 from clsas.core.conditioning import DEAD_DB
 from clsas.core.lines import RangeLines
 from clsas.navigation.accuracy import Accuracy, check_plausible
-from clsas.navigation.checks import check_navigation, mean_wavelength_m
+from clsas.navigation.checks import check_navigation, first_bank, mean_wavelength_m
 from clsas.navigation.correlation import Correlator
 from clsas.navigation.overlap import Array, moved
 from clsas.navigation.passes import LEAST_ECHOES, Displacements, measured
@@ -137,7 +137,8 @@ def micronavigate(
     ----------
     lines : RangeLines or Echoes
         Data of an array whose phase centres overlap from ping to ping, by at least three. Echoes
-        are compressed first. The positions are those of the navigation.
+        are compressed first. The positions are those of the navigation. Of several receiver banks,
+        the first one is used, and all of them are corrected.
     range_m : (near, far), optional
         Ranges to use, metres. By default nearly all ranges that every channel has.
     window_m : float, optional
@@ -248,18 +249,20 @@ def micronavigate(
     if "sway" not in names:
         raise ValueError(f"unknowns must include 'sway', got {names}")
     check_navigation(lines, 2, "micronavigation", may_stand=False)
-    array = Array.of(lines)
-    swath = checked_swath(lines, range_m, window_m, side, seabed_z_m, element_length_m)
+    array_lines = first_bank(lines)
+    array = Array.of(array_lines)
+    swath = checked_swath(array_lines, range_m, window_m, side, seabed_z_m, element_length_m)
     accuracy = Accuracy.of(array.pings, sway_sd_m, yaw_sd_rad, surge_sd_m, correlation_pings)
     longest_m = float(np.diff(swath.edges_m).max())
     most_step_m = validate.number("most_step_m", most_step_m, "m", above=0.0, most=longest_m)
-    correlator = Correlator(lines, swath)
-    check_sizes(lines, array, swath, mean_wavelength_m(correlator.readout))
+    correlator = Correlator(array_lines, swath)
+    check_sizes(array_lines, array, swath, mean_wavelength_m(correlator.readout))
     dead = int((~correlator.live).sum())
     if dead:
+        of_bank = " of the first bank" * (lines.banks > 1)
         validate.warn(
-            f"{dead} of {lines.channels} channels have no signal, or at least {-DEAD_DB:.0f} dB "
-            "less than the other channels of their ping (the first is channel "
+            f"{dead} of {array_lines.channels} channels{of_bank} have no signal, or at least "
+            f"{-DEAD_DB:.0f} dB less than the other channels of their ping (the first is channel "
             f"{int(np.argmin(correlator.live))}). They are left out"
         )
     found = measured(array, correlator, names, accuracy.deviations[:, :2], most_step_m, progress)
@@ -273,7 +276,7 @@ def _result(
     found: Displacements,
     accuracy: Accuracy,
 ) -> Micronavigation:
-    """Return the displacements combined with the navigation."""
+    """Return the displacements combined with the navigation; `lines` have all banks."""
     _check_coherence(found)
     count = len(found.moved)
     misfit = max(float(found.misfit[found.coherent].mean()), _contradiction(found), 1.0)
@@ -290,7 +293,7 @@ def _result(
     surges, spreads = smooth(along, accuracy.deviations[:, 2:], accuracy.correlation_pings)
     check_plausible(np.concatenate([states, surges], axis=1), accuracy)
     corrected = moved(lines, array, states[:, 0], states[:, 1], surges[:, 0])
-    at = Array.of(corrected)
+    at = Array.of(first_bank(corrected))
     heading = np.arctan2(at.forward[:, 1], at.forward[:, 0])
     deviations = np.sqrt(misfit * np.stack([np.diag(each) for each in found.covariance]))
     deviations[~found.coherent] = np.inf

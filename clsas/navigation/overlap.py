@@ -158,10 +158,11 @@ def moved(
 ) -> RangeLines:
     """Return lines whose array is displaced to port and forward, and turned, ping by ping.
 
-    The array turns about a vertical axis through its mean phase centre. Positive yaw turns it from
+    The lines may have more channels than the array in each ping, such as those of other banks. All
+    turn about a vertical axis through the array's mean phase centre. Positive yaw turns them from
     forward to port.
     """
-    ping = np.repeat(np.arange(array.pings), np.diff(array.starts))
+    ping = lines.ping_numbers
     turn = Rotation.from_rotvec(np.outer(yaw_rad, [0.0, 0.0, 1.0]))
     shift_m = (sway_m[:, None] * array.port + surge_m[:, None] * array.forward)[ping]
     reference_m = array.reference_m[ping]

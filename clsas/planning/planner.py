@@ -31,7 +31,7 @@ from clsas.plans.plan import Plan
 from clsas.signal.spectrum import OUTSIDE
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches, warn_unreached
-from clsas.sonar.looking import warn_behind
+from clsas.sonar.looking import warn_before_imaging
 from clsas.sonar.simplify import Model, simplify
 
 # `scripts/bench sensitivity` halves and doubles these; without a remark nothing changes.
@@ -184,7 +184,7 @@ def plan(
         depth=depth,
         full_model=full_model,
     )
-    warn_behind(lines, grid)
+    warn_before_imaging(lines, grid)
     return planned(request).plan
 
 

@@ -1,4 +1,4 @@
-"""Pictures of images, mosaics, volumes, points, geometry, recordings, tracks, plans, trade-offs.
+"""Pictures of images, mosaics, volumes, heights, points, recordings, tracks, plans, trade-offs.
 
 Most functions return a `matplotlib.figure.Figure` that belongs to no window and changes no global
 state; `save` writes it as PNG, PDF or SVG. `image` draws into axes of your own, or into a new
@@ -9,6 +9,8 @@ from clsas.plot.canvas import save as save
 from clsas.plot.canvas import save_png as save_png
 from clsas.plot.curves import cuts as cuts
 from clsas.plot.curves import tradeoff as tradeoff
+from clsas.plot.interferometry import heights as heights
+from clsas.plot.interferometry import interferogram as interferogram
 from clsas.plot.levels import image as image
 from clsas.plot.levels import image_db as image_db
 from clsas.plot.levels import image_html as image_html
@@ -33,10 +35,12 @@ __all__ = [
     "cuts",
     "echoes",
     "geometry",
+    "heights",
     "image",
     "image_db",
     "image_html",
     "inspection",
+    "interferogram",
     "mosaic",
     "patch_borders",
     "plan",

@@ -48,6 +48,8 @@ class Echoes:
         Direction in which the beam of each channel looks, as for `RangeLines`.
     georeference : Georeference, optional
         Where the coordinates lie on Earth.
+    bank_numbers : array_like of int, [channels], optional
+        Receiver bank of each channel, as for `RangeLines`.
 
     Raises
     ------
@@ -81,6 +83,7 @@ class Echoes:
     rx_velocity_m_s: NDArray[np.float64] | None = None
     look_direction: NDArray[np.float64] | None = None
     georeference: Georeference | None = None
+    bank_numbers: NDArray[np.int64] | None = None
 
     if TYPE_CHECKING:  # the constructor converts array_like arguments
 
@@ -97,6 +100,7 @@ class Echoes:
             rx_velocity_m_s: ArrayLike | None = None,
             look_direction: ArrayLike | None = None,
             georeference: Georeference | None = None,
+            bank_numbers: ArrayLike | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:

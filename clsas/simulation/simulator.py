@@ -87,7 +87,7 @@ def simulate(
     -------
     Echoes
         Complex baseband. `look_direction` is that of the pointing if element patterns are applied,
-        otherwise None.
+        otherwise None. `bank_numbers` are those of the sonar.
 
     Raises
     ------
@@ -183,7 +183,7 @@ def simulate(
         _add_noise(samples, float(snr_db), seed)
     return Echoes(
         samples, start, rate, pulse.carrier_hz, geometry.tx_m, geometry.rx_m, sound, pulse,
-        geometry.rx_velocity_m_s, look, track.georeference,
+        geometry.rx_velocity_m_s, look, track.georeference, sonar.channel_banks(track.pings),
     )  # fmt: skip
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -183,6 +184,52 @@ class BeamWindow:
                 f"which makes {width:g} degrees at wavelength_m = {wavelength:g} m"
             )
         return cls(width, shape, **({"element_length_m": length} | others))
+
+    def divided(self, count: int) -> tuple[BeamWindow, ...]:
+        """Return beams that divide this one into equal parts, from aft to forward.
+
+        Images with these beams are looks from different aspects: their speckle is independent, and
+        shadows fall in other directions. They resolve `count` times less along the track.
+
+        Parameters
+        ----------
+        count : int
+            Number of parts, at least 1. All are equally wide in the sine of the aspect angle, that
+            is along the track.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the number is not a positive whole number, the parts are too narrow, or the shape is
+            "inverse", whose weights do not follow from the width.
+
+        See Also
+        --------
+        clsas.multilook : Mean power of several looks.
+
+        Examples
+        --------
+        >>> import clsas
+        >>> [f"{each.squint_deg:.2f}" for each in clsas.BeamWindow(20).divided(3)]
+        ['-6.66', '0.00', '6.66']
+        """
+        count = validate.count("count", count)
+        if self.shape == "inverse":
+            raise ValueError(
+                "shape must not be 'inverse' to divide a beam: its weights follow from the angle "
+                "to the axis, and not from the width"
+            )
+        low, high = (math.sin(angle) for angle in self.limits_rad)
+        if (high - low) / count < math.radians(_NARROWEST):
+            raise ValueError(
+                f"count must leave parts of at least {_NARROWEST:g} degrees, got {count} parts of "
+                f"{self.width_deg:g} degrees"
+            )
+        edges_deg = np.degrees(np.arcsin(np.linspace(low, high, count + 1).clip(-1, 1)))
+        return tuple(
+            replace(self, width_deg=float(last - first), squint_deg=float(first + last) / 2)
+            for first, last in itertools.pairwise(edges_deg)
+        )
 
     @property
     def limits_rad(self) -> tuple[float, float]:

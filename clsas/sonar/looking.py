@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core import validate
+from clsas.core.banks import warn_of_banks
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, antennas_of, some_channels
@@ -94,6 +95,17 @@ def warn_behind(
     found = behind(lines, grid, last_range_m)
     if found is not None:
         validate.warn(f"{found.message}. {found.remedy[0].upper()}{found.remedy[1:]}")
+
+
+def warn_before_imaging(
+    lines: RangeLines, grid: Grid, last_range_m: NDArray[np.float64] | None = None
+) -> None:
+    """Warn of several banks in one image, and of pixels behind the elements.
+
+    Parameters are those of `behind`.
+    """
+    warn_of_banks(lines)
+    warn_behind(lines, grid, last_range_m)
 
 
 def behind(

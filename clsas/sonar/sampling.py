@@ -5,12 +5,14 @@ Equations in brackets are those of the thesis (Ødegaard 2004), [22]-[32].
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import reprs, validate
+from clsas.core import banks, reprs, validate
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
@@ -106,7 +108,8 @@ def check_sampling(
     [27], [31]. For elements without a length, the limit is the spacing that keeps the grating lobes
     of every target off the grid or out of the beam, whichever of the two spacings is wider. The
     ping rate must leave time for the last echo from the grid [24]. It is not checked for range
-    lines, which have no times.
+    lines, which have no times. Several receiver banks are checked one by one, since each forms an
+    image of its own; the findings are those of the worst.
 
     References
     ----------
@@ -143,6 +146,17 @@ def check_sampling(
             )
         validate.instance("track", track, Track)
         validate.instance("grid", grid, Grid)
+    if sonar.banks > 1:
+        options: dict[str, Any] = {
+            "beam": beam,
+            "element_length_m": element_length_m,
+            "wavelength_m": wavelength_m,
+        }
+        of_banks = [
+            check_sampling(sonar.bank(number), track, grid, **options)
+            for number in banks.present(sonar.bank_numbers)
+        ]
+        return _worst(of_banks)
     corners = None
     if grid is not None:
         validate.instance("grid", grid, Grid)
@@ -161,6 +175,16 @@ def check_sampling(
     if isinstance(sonar, Sonar) and isinstance(track, Track) and ranges is not None:
         found += _check_ping_rate(sonar, track, ranges)
     return found
+
+
+def _worst(of_banks: list[list[Finding]]) -> list[Finding]:
+    """Return the finding of each name that exceeds its limit by most."""
+    worst: dict[str, Finding] = {}
+    for finding in itertools.chain.from_iterable(of_banks):
+        known = worst.get(finding.name)
+        if known is None or finding.value * known.limit > known.value * finding.limit:
+            worst[finding.name] = finding
+    return list(worst.values())
 
 
 def _antennas_m(survey: Sonar | RangeLines, track: Track | Grid | None) -> tuple[NDArray, NDArray]:

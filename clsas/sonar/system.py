@@ -5,13 +5,13 @@ Equations in brackets are those of the thesis (Ødegaard 2004).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import reprs, validate
+from clsas.core import banks, reprs, validate
 from clsas.core.fourier import fourier_integral
 
 BARKER_13 = (1, 1, 1, 1, 1, -1, -1, 1, 1, -1, 1, -1, 1)
@@ -215,11 +215,16 @@ class Sonar:
         Element lengths along x, metres. An element without a length is omnidirectional in azimuth.
     tx_height_m, rx_height_m : float, optional
         Element heights, metres. An element without a height is omnidirectional in elevation.
+    bank_numbers : array_like of int, [receivers], optional
+        Bank of each receiver, for several rows of receivers at different heights: 0 for those of
+        the first bank, 1 for the second, and so on. Every bank has the same number of receivers.
+        None means that all receivers are one bank.
 
     Raises
     ------
     TypeError, ValueError
-        If a value has the wrong type or shape, is not finite or is outside its limits.
+        If a value has the wrong type or shape, is not finite or is outside its limits, or if banks
+        are not numbered from 0 or differ in their number of receivers.
 
     Examples
     --------
@@ -227,6 +232,13 @@ class Sonar:
     >>> pulse = clsas.Pulse(carrier_hz=100e3, bandwidth_hz=20e3, duration_s=1e-3)
     >>> clsas.Sonar(pulse, rx_m=[[-0.1, 0, 0], [0.1, 0, 0]], rx_length_m=0.2)
     Sonar(2 receivers over 0.2 m, carrier 100 kHz, bandwidth 20 kHz, elements of 0.2 m)
+
+    Two rows of 8 receivers, 0.25 m above each other:
+
+    >>> row_m = clsas.sonar.system.line_array(8, spacing_m=0.05)
+    >>> rx_m = [*row_m, *(row_m + [0, 0, 0.25])]
+    >>> clsas.Sonar(pulse, rx_m, bank_numbers=[0] * 8 + [1] * 8)
+    Sonar(2 banks of 8 receivers over 0.35 m, carrier 100 kHz, bandwidth 20 kHz)
     """
 
     pulse: Pulse
@@ -238,6 +250,7 @@ class Sonar:
     rx_length_m: float | None = None
     tx_height_m: float | None = None
     rx_height_m: float | None = None
+    bank_numbers: NDArray[np.int64] | None = None
 
     if TYPE_CHECKING:  # the constructor converts array_like arguments
 
@@ -252,6 +265,7 @@ class Sonar:
             rx_length_m: float | None = None,
             tx_height_m: float | None = None,
             rx_height_m: float | None = None,
+            bank_numbers: ArrayLike | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:  # noqa: D105
@@ -261,7 +275,7 @@ class Sonar:
         rate = 2 * band if self.sample_rate_hz is None else self.sample_rate_hz
         # A rate of exactly 1.25 bandwidths may be rounded down.
         least = band / PASSBAND * (1 - 1e-12)
-        fields = {
+        fields: dict[str, Any] = {
             "rx_m": validate.array("rx_m", self.rx_m, np.float64, (None, 3)),
             "tx_m": validate.array("tx_m", self.tx_m, np.float64, (3,)),
             "sample_rate_hz": validate.number("sample_rate_hz", rate, "Hz", least=least),
@@ -270,17 +284,19 @@ class Sonar:
         for name in ("tx_length_m", "rx_length_m", "tx_height_m", "rx_height_m"):
             size = getattr(self, name)
             fields[name] = None if size is None else validate.positive(name, size, "m")
+        if self.bank_numbers is not None:
+            fields["bank_numbers"] = _checked_banks(self.bank_numbers, len(fields["rx_m"]))
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
         """Return the array's size, the pulse's band and the elements' length."""
         pulse, length_m = self.pulse, float(np.ptp(self.rx_m, axis=0).max())
-        element_m = self.element_length_m
+        element_m, each = self.element_length_m, self.receivers // self.banks
+        several = f"{self.banks} banks of " if self.banks > 1 else ""
         return reprs.summary(
             self,
-            f"{self.receivers} receiver{'s' * (self.receivers > 1)} over "
-            f"{reprs.quantity(length_m, 'm')}",
+            f"{several}{each} receiver{'s' * (each > 1)} over {reprs.quantity(length_m, 'm')}",
             f"carrier {reprs.quantity(pulse.carrier_hz, 'Hz')}",
             f"bandwidth {reprs.quantity(pulse.bandwidth_hz, 'Hz')}",
             None if element_m is None else f"elements of {reprs.quantity(element_m, 'm')}",
@@ -290,6 +306,52 @@ class Sonar:
     def receivers(self) -> int:
         """Number of receivers."""
         return len(self.rx_m)
+
+    @property
+    def banks(self) -> int:
+        """Number of receiver banks."""
+        return len(banks.present(self.bank_numbers))
+
+    def bank(self, number: int) -> Sonar:
+        """Return the sonar with the receivers of one bank only, whose `bank_numbers` are None.
+
+        Parameters
+        ----------
+        number : int
+            Number of the bank, counted from 0.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If there is no such bank.
+
+        Examples
+        --------
+        >>> import clsas
+        >>> clsas.Sonar.hisas_1030().bank(1).receivers
+        32
+        """
+        index = banks.members(self.bank_numbers, number)
+        if self.bank_numbers is None:
+            return self
+        return replace(self, rx_m=self.rx_m[index], bank_numbers=None)
+
+    def channel_banks(self, pings: int) -> NDArray[np.int64] | None:
+        """Return the bank of every channel, [pings * receivers]; None for one bank.
+
+        Parameters
+        ----------
+        pings : int
+            Number of pings. Channels are in ping-major order, as those of `clsas.channels`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If `pings` is not a positive whole number, or the channels do not fit into memory.
+        """
+        pings = validate.count("pings", pings)
+        validate.memory("pings", 8 * pings * self.receivers)
+        return None if self.bank_numbers is None else np.tile(self.bank_numbers, pings)
 
     @property
     def wavelength_m(self) -> float:
@@ -347,6 +409,45 @@ class Sonar:
         length = 1500.0 / 100e3
         return cls(pulse, line_array(96, length), tx_length_m=length, rx_length_m=length)
 
+    @classmethod
+    def hisas_1030(cls) -> Sonar:
+        """Return an interferometric SAS with two banks, after Kongsberg's HISAS 1030 [1]_.
+
+        The published sonar works between 60 and 120 kHz with a bandwidth of typically 30 kHz, to
+        200 m at 2 m/s. Its two banks are 1.2 m long, have 32 receivers each, and lie about 20
+        wavelengths above each other. Elements of 1.2 m/32 = 37.5 mm resolve 2 cm along the track;
+        the bandwidth resolves 2.5 cm in range.
+
+        Choices are a carrier of 100 kHz, so that the baseline of 20 wavelengths is 0.3 m; a chirp
+        of 5 ms; and a transmitter as long as a receiver in the middle between both banks, in place
+        of a phased array that steers in elevation. Bank 0 is the lower one.
+
+        References
+        ----------
+        .. [1] Hansen, Callow, Sæbø, Synnes, "Challenges in seafloor imaging and mapping with
+           synthetic aperture sonar", IEEE Transactions on Geoscience and Remote Sensing 49, 2011.
+        """
+        pulse = Pulse(carrier_hz=100e3, bandwidth_hz=30e3, duration_s=5e-3)
+        length, baseline = 1.2 / 32, 20 * 1500.0 / 100e3
+        rx_m, numbers = stacked(line_array(32, length), (-baseline / 2, baseline / 2))
+        return cls(pulse, rx_m, tx_length_m=length, rx_length_m=length, bank_numbers=numbers)
+
+
+def _checked_banks(value: ArrayLike, receivers: int) -> NDArray[np.int64]:
+    """Return the bank of every receiver, [receivers]; raises TypeError or ValueError."""
+    numbers = banks.checked_numbers(value, receivers, "receivers")
+    counts = np.bincount(numbers)
+    if not counts.all():
+        raise ValueError(
+            f"bank_numbers must count banks from 0 without a gap, got {banks.present(numbers)}"
+        )
+    if np.ptp(counts):
+        raise ValueError(
+            "bank_numbers must give every bank the same number of receivers, got "
+            f"{', '.join(map(str, counts))}"
+        )
+    return numbers
+
 
 def _chips(name: str, value: object) -> tuple[int, ...]:
     """Return the chips of a phase code as ints; raises TypeError or ValueError."""
@@ -371,6 +472,16 @@ def line_array(receivers: int, spacing_m: float) -> NDArray[np.float64]:
     positions = np.zeros((receivers, 3))
     positions[:, 0] = spacing * (np.arange(receivers) - (receivers - 1) / 2)
     return positions
+
+
+def stacked(
+    row_m: NDArray[np.float64], heights_m: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return a row of receivers [n, 3] repeated at several heights, and their bank numbers."""
+    heights_m = validate.array("heights_m", heights_m, np.float64, (None,))
+    validate.memory("heights_m", 240 * len(row_m) * len(heights_m))
+    rows_m = row_m + np.multiply.outer(heights_m, [0.0, 0.0, 1.0])[:, None]
+    return rows_m.reshape(-1, 3), np.repeat(np.arange(len(heights_m)), len(row_m))
 
 
 def element_pattern(

@@ -1,7 +1,8 @@
 """Narrow-beam case: a wreck and its shadow, after chapter 6 of the thesis (Ødegaard 2004).
 
-The scene is `scenes/wreck.toml`. Its range lines take minutes to simulate and are cached. The
-benchmarks and scripts/thesis use these lines and the contrast of the shadow.
+The scene is `scenes/wreck.toml`, or `scenes/wreck_two_banks.toml`, which has two receiver banks.
+Their range lines take minutes to simulate and are cached. The benchmarks and scripts/thesis use
+these lines and the contrast of the shadow.
 """
 
 from __future__ import annotations
@@ -37,25 +38,25 @@ def grid(pixels: int) -> Grid:
     return Grid.plane((*X_M, pixels), (*Y_M, pixels))
 
 
-def scene() -> SceneFile:
-    """Return the built-in scene of the wreck."""
-    return parse_scene(built_in_scene("wreck"), name="wreck.toml", folder=Path())
+def scene(name: str = "wreck") -> SceneFile:
+    """Return a built-in scene of the wreck: "wreck" or "wreck_two_banks"."""
+    return parse_scene(built_in_scene(name), name=f"{name}.toml", folder=Path())
 
 
-def lines(progress: Callable[[int, int], None] | None = None) -> RangeLines:
-    """Return the range lines of the scene. The first call simulates them, which takes minutes.
+def lines(progress: Callable[[int, int], None] | None = None, *, name: str = "wreck") -> RangeLines:
+    """Return the range lines of a scene. The first call simulates them, which takes minutes.
 
     Later calls read them from the cache (`clsas.core.cache.private_folder`).
     """
-    digest = simulation_digest(built_in_scene("wreck"), Path())
-    path = private_folder() / f"wreck-{digest}.h5"
+    digest = simulation_digest(built_in_scene(name), Path())
+    path = private_folder() / f"{name.replace('_', '-')}-{digest}.h5"
     try:
         kept = load(path)
         if isinstance(kept, RangeLines):
             return kept
     except (FileFormatError, OSError):
         pass  # missing or incomplete
-    described = scene()
+    described = scene(name)
     sonar, track, targets = described.need("sonar", "track", "targets")
     echoes = simulate(sonar, track, targets, **described.simulate, progress=progress)
     made = compress(echoes, **described.compress)

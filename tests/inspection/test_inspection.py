@@ -16,6 +16,7 @@ from clsas.cli import main
 from clsas.core.pings import Transmissions
 from clsas.inspection.recording import levels_of
 from clsas.inspection.result import runs
+from clsas.sonar.system import line_array, stacked
 
 PINGS, ADVANCE_M = 200, 0.02
 GRID = clsas.Grid.plane((1.0, 3.0, 100), (18.0, 20.5, 120))
@@ -733,3 +734,33 @@ def test_a_device_that_does_not_exist_is_refused_though_none_is_needed(lines):
     still = replace(lines, tx_m=lines.tx_m[0], rx_m=lines.rx_m[0])
     with pytest.raises(clsas.DeviceError, match="no such"):
         clsas.inspect(still, device="no such")
+
+
+def test_two_banks_are_no_denser_array():
+    """A second row of receivers changes no finding, and images are those of one bank."""
+    pulse = clsas.Pulse(carrier_hz=100e3, bandwidth_hz=30e3, duration_s=1e-3)
+    rx_m, numbers = stacked(line_array(4, 0.03), (0.0, 3.0))
+    sonar = clsas.Sonar(pulse, rx_m, tx_length_m=0.06, rx_length_m=0.06, bank_numbers=numbers)
+    track = clsas.Track.straight((-1, 0, 5), (0.06, 0, 0), 34, 1.0)
+    points = clsas.PointTargets([[0.0, 20, 0], [0.3, 20.6, 0]])
+    lines = clsas.compress(clsas.simulate(sonar, track, points, range_m=(19.5, 23)))
+    grid = clsas.Grid.plane((-0.5, 0.5, 64), (19.7, 21, 64))
+    both = clsas.inspect(lines, grid, element_length_m=0.06)
+    alone = clsas.inspect(lines.bank(0), grid, element_length_m=0.06)
+    assert both.sign.centre_m == alone.sign.centre_m
+    assert both.sign.ratio == pytest.approx(alone.sign.ratio, rel=0.01)
+    assert both.pings == alone.pings == 34
+    assert [each.message for each in both.findings] == [each.message for each in alone.findings]
+    assert "8 receivers per ping in 2 banks" in both.describe()
+
+
+def test_a_baseline_does_not_excuse_a_slip_of_units():
+    """Advances in kilometres are found although a long baseline lies across the track."""
+    pulse = clsas.Pulse(carrier_hz=100e3, bandwidth_hz=30e3, duration_s=1e-3)
+    rx_m = [[0, 0, 0], [0.03, 0, 0], [0, 0, 0.5], [0.03, 0, 0.5]]
+    sonar = clsas.Sonar(pulse, rx_m, bank_numbers=[0, 0, 1, 1])
+    track = clsas.Track.straight((0, 0, 5), (0.06, 0, 0), 34, 1.0)
+    lines = clsas.compress(clsas.simulate(sonar, track, clsas.PointTargets([[1.0, 20, 0]])))
+    small = replace(lines, tx_m=1e-3 * lines.tx_m, rx_m=1e-3 * lines.rx_m)
+    assert "advance" in clsas.inspect(small.bank(0))
+    assert "advance" in clsas.inspect(small)

@@ -5,6 +5,7 @@ import pytest
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
+from clsas.measures.assessment import survey_lines
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.sampling import (
     check_sampling,
@@ -215,3 +216,39 @@ def test_arguments_beside_lines(arguments, message):
 def test_arguments_of_another_type(arguments, message):
     with pytest.raises(TypeError, match=message):
         check_sampling(*arguments)
+
+
+def test_banks_are_checked_one_by_one():
+    """Two rows above each other are no denser array, however they lie along the track."""
+    pulse = Pulse(100e3, 20e3, 1e-3)
+    course = Track.straight([0, 0, 10], [2, 0, 0], pings=10, ping_interval_s=0.1)
+    grid = Grid.plane((0, 2, 9), (40, 41, 9))
+    row_m = line_array(4, 0.1)
+    one = Sonar(pulse, row_m, rx_length_m=0.08)
+    staggered_m = row_m + [0.05, 0, 0.3]
+    two = Sonar(pulse, [*row_m, *staggered_m], rx_length_m=0.08, bank_numbers=[0] * 4 + [1] * 4)
+    (expected,) = check_sampling(one, course, grid)
+    (found,) = check_sampling(two, course, grid)
+    assert found.value == pytest.approx(expected.value)
+    assert found.limit == expected.limit
+    lines = survey_lines(two, course, grid)
+    (of_lines,) = check_sampling(lines, grid, element_length_m=0.08)
+    assert of_lines.value == pytest.approx(expected.value)
+    # As one array, the receivers would be close enough.
+    assert check_sampling(replace(two, bank_numbers=None), course, grid) == []
+
+
+def test_the_worst_bank_counts():
+    pulse = Pulse(100e3, 20e3, 1e-3)
+    course = Track.straight([0, 0, 10], [2, 0, 0], pings=2, ping_interval_s=0.01)
+    grid = Grid.plane((0, 2, 9), (40, 41, 9))
+    rx_m = [[0, 0, 0], [0.1, 0, 0], [0, 0, 0.3], [0.3, 0, 0.3]]
+    sonar = Sonar(pulse, rx_m, rx_length_m=0.08, bank_numbers=[0, 0, 1, 1])
+    found = {each.name: each for each in check_sampling(sonar, course, grid)}
+    assert set(found) == {"along_track_spacing", "ping_rate"}
+    (worse,) = (
+        each
+        for each in check_sampling(sonar.bank(1), course, grid)
+        if each.name == "along_track_spacing"
+    )
+    assert found["along_track_spacing"].value == worse.value

@@ -18,7 +18,13 @@ def data(folder: Path) -> dict[str, Call]:
     part = slice(2, 10, 2)
     points = clsas.Grid.points(grid.positions_m().reshape(-1, 3))
     axis = (0.0, 1.0, 5)
-    unset = {"rx_velocity_m_s": ("None",), "look_direction": ("None",), "georeference": ("None",)}
+    numbers = np.arange(40) % 2
+    of_channels = {
+        "rx_velocity_m_s": np.ones((40, 3)),
+        "look_direction": np.ones((40, 3)),
+        "bank_numbers": numbers,
+    }
+    unset = dict.fromkeys((*of_channels, "georeference"), ("None",))
     place = {"georeference": clsas.Georeference.local(60.39, 5.32, heading_deg=217.0)}
     return {
         "Grid": Call(
@@ -61,9 +67,11 @@ def data(folder: Path) -> dict[str, Call]:
         "Grid.window": Call(grid.window, {"rows": part, "columns": slice(1, 3)}),
         "RangeLines": Call(
             clsas.RangeLines,
-            fields(lines)
-            | {"rx_velocity_m_s": np.ones((40, 3)), "look_direction": np.ones((40, 3)), **place},
+            fields(lines) | of_channels | place,
             accepts=unset | {"samples": ("an Image",)},
+        ),
+        "RangeLines.bank": Call(
+            dataclasses.replace(lines, bank_numbers=numbers).bank, {"number": 1}
         ),
         "RangeLines.select": Call(lines.select, {"channels": np.array([1, 5, 30])}),
         "RangeLines.high_passed": Call(lines.high_passed, {"cutoff_hz": 95e3}),
@@ -94,8 +102,7 @@ def data(folder: Path) -> dict[str, Call]:
         "Image.to_xarray": Call(image.to_xarray, {}),
         "Echoes": Call(
             clsas.Echoes,
-            fields(s.echoes)
-            | {"rx_velocity_m_s": np.ones((40, 3)), "look_direction": np.ones((40, 3)), **place},
+            fields(s.echoes) | of_channels | place,
             accepts=unset | {"pulse": ("None",), "samples": ("an Image",)},
         ),
         "Replica": Call(
@@ -106,6 +113,12 @@ def data(folder: Path) -> dict[str, Call]:
             {"frequency_hz": np.array([0.0, 1e3, -2e3])},
             accepts={"frequency_hz": EMPTY},
         ),
+        "multilook": Call(
+            clsas.multilook,
+            {"images": [image, image], "window_m": 0.5},
+            accepts={"images": ("an Image",), "window_m": ("None",)},
+        ),
+        "sub_bands": Call(clsas.sub_bands, {"lines": lines, "count": 3}),
         "contrast": Call(clsas.contrast, {"image": image}, accepts={"image": ("list of it",)}),
         "entropy": Call(clsas.entropy, {"image": image}, accepts={"image": ("list of it",)}),
         "relative_error_db": Call(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -35,6 +36,9 @@ def pictures(folder: Path) -> dict[str, Call]:
     )
     volume = clsas.Image(np.arange(60.0).reshape(box.shape) + 1j, box)
     figure = plot.image_db(image)
+    zero = np.zeros(s.grid.shape)
+    fringes = SimpleNamespace(grid=s.grid, phase_rad=zero, coherence=zero)
+    relief = SimpleNamespace(image=image, height_m=zero, sd_m=zero, mask=zero == 0)
     return {
         "plot.image": Call(
             plot.image,
@@ -52,6 +56,14 @@ def pictures(folder: Path) -> dict[str, Call]:
             {"image": image, **levels, **chosen, **title},
             kinds=text,
             accepts=accepts,
+        ),
+        "plot.interferogram": Call(
+            plot.interferogram, {"interferogram": fringes, **title}, kinds=text
+        ),
+        "plot.heights": Call(
+            plot.heights,
+            {"heights": relief, "colours": "gray", **title},
+            kinds=text | {"colours": "text"},
         ),
         "plot.image_html": Call(plot.image_html, {"image": image}),
         "plot.before_and_after": Call(

@@ -49,10 +49,13 @@ def sonars(folder: Path) -> dict[str, Call]:
         ),
         "Sonar": Call(
             clsas.Sonar,
-            fields(s.sonar) | dict.fromkeys(sizes, 0.2),
-            accepts={each: optional for each in (*sizes, "sample_rate_hz")},
+            fields(s.sonar) | dict.fromkeys(sizes, 0.2) | {"bank_numbers": [0]},
+            accepts={each: optional for each in (*sizes, "sample_rate_hz", "bank_numbers")},
             names={"pulse": ("bandwidth_hz",)},
         ),
+        "Sonar.bank": Call(clsas.Sonar.hisas_1030().bank, {"number": 1}),
+        "Sonar.channel_banks": Call(clsas.Sonar.hisas_1030().channel_banks, {"pings": 3}),
+        "Sonar.hisas_1030": Call(clsas.Sonar.hisas_1030, {}),
         "Sonar.edgetech": Call(clsas.Sonar.edgetech, {}),
         "Sonar.sensotek": Call(clsas.Sonar.sensotek, {}),
         "Sonar.thesis_wide_beam": Call(clsas.Sonar.thesis_wide_beam, {}),
@@ -110,6 +113,7 @@ def sonars(folder: Path) -> dict[str, Call]:
         "BeamWindow.of_element": Call(
             clsas.BeamWindow.of_element, {"length_m": 0.1, "wavelength_m": 0.015, "shape": "hann"}
         ),
+        "BeamWindow.divided": Call(beam.divided, {"count": 3}),
         "BeamWindow.directions": Call(beam.directions, {"lines": s.lines}),
         "BeamWindow.weights": Call(
             beam.weights,

@@ -1,0 +1,127 @@
+"""Multi-look images: power averaged over windows of pixels, and over images of several looks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+
+from clsas.core import validate
+from clsas.core.digests import grid_digest
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+
+
+def multilook(images: Image | Sequence[Image], *, window_m: float | None = None) -> Image:
+    """Return an image whose power is the mean over several looks, over a window, or over both.
+
+    Speckle has as much variation as its mean. The mean of N independent looks varies by 1/sqrt(N)
+    of it, at the price of resolution: each look uses a part of the band or of the beam, or the
+    pixels of a look are those of a window. The looks of one survey are images of its sub-bands
+    (`sub_bands`), of parts of its beam (`BeamWindow.divided`), or both.
+
+    Parameters
+    ----------
+    images : Image or sequence of Image
+        One image, or several looks at one grid.
+    window_m : float, optional
+        Side of a square window, metres, which contains the pixels up to half a side before and
+        after its middle along rows and columns. Near the edges of the image these are fewer. None
+        averages only over the looks.
+
+    Returns
+    -------
+    Image
+        The root of the mean power. Its pixels are real: phases differ between looks.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument has the wrong type, there is nothing to average, the images have different
+        grids, or the grid consists of points and a window is given.
+
+    See Also
+    --------
+    sub_bands : Range lines of parts of the band.
+    contrast : 1/sqrt(N) for speckle of N looks.
+
+    Notes
+    -----
+    Multi-look mode of the HUGIN sonars is described in section 6.2 of Ødegaard (2004): the looks
+    reduce speckle, or are compared, since shadows differ between aspects.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> import numpy as np
+    >>> grid = clsas.Grid.plane((0, 5, 200), (40, 45, 200))
+    >>> random = np.random.default_rng(0)
+    >>> speckle = clsas.Image(random.standard_normal((200, 200, 2)) @ [1, 1j], grid)
+    >>> smooth = clsas.multilook(speckle, window_m=0.12)
+    >>> f"{clsas.contrast(speckle):.2f}, of 25 looks {clsas.contrast(smooth):.2f}"
+    '1.01, of 25 looks 0.20'
+    """
+    looks = _checked(images)
+    grid = looks[0].grid
+    if len(looks) == 1 and window_m is None:
+        raise ValueError("window_m must be given for a single image, or images be several looks")
+    size = None if window_m is None else window_pixels(grid, window_m)
+    validate.memory("images", 24 * grid.size)
+    largest = max(float(np.abs(look.pixels).max()) for look in looks) or 1.0
+    power = np.zeros(grid.shape)
+    for look in looks:
+        # Squares of large and of small pixels stay within floating point.
+        power += np.abs(look.pixels / np.float32(largest)).astype(np.float64) ** 2
+    power /= len(looks)
+    if size is not None:
+        power = _windowed_mean(power, size)
+    return Image((largest * np.sqrt(power)).astype(np.complex64), grid)
+
+
+def _checked(images: Image | Sequence[Image]) -> list[Image]:
+    """Return the looks as a list, all on one grid."""
+    if isinstance(images, Image):
+        return [images]
+    looks = validate.entries("images", images, "an Image, or a sequence of them")
+    if not looks:
+        raise ValueError("images must have at least one image, got none")
+    for look in looks:
+        validate.instance("every entry of images", look, Image)
+    digests = {grid_digest(look.grid) for look in looks}
+    if len(digests) > 1:
+        raise ValueError(f"images must have one grid, got {len(digests)} different ones")
+    return looks
+
+
+def window_pixels(grid: Grid, window_m: float) -> tuple[int, int]:
+    """Return the odd numbers of rows and columns that a window of a side in metres spans.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the grid consists of points, or the window is not a positive number or larger than the
+        grid.
+    """
+    if grid.points_m is not None:
+        raise ValueError("window_m must be left out: the images have points, not rows and columns")
+    window_m = validate.positive("window_m", window_m, "m")
+    counts = []
+    for step_m, count in zip(grid.vectors_m[1:], grid.shape, strict=True):
+        step = float(np.linalg.norm(step_m))
+        if window_m > count * step:
+            raise ValueError(
+                f"window_m must be at most the extent of the grid, {count * step:.4g} m, got "
+                f"{window_m:g} m"
+            )
+        counts.append(2 * math.floor(window_m / step / 2) + 1)
+    return counts[0], counts[1]
+
+
+def _windowed_mean(power: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the mean over the pixels of a window around each pixel that lie in the image."""
+    total = uniform_filter(power, size, mode="constant")
+    # Running sums leave rounding errors behind bright pixels, which must not become negative.
+    return np.maximum(total, 0.0) / uniform_filter(np.ones_like(power), size, mode="constant")

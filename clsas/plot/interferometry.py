@@ -1,0 +1,277 @@
+"""Pictures of what two receiver banks show: interferograms, and heights as shaded relief."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from clsas.core import validate
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.plot.canvas import axis_label, drawable, length_unit, new_figure, plain_ticks
+from clsas.plot.colours import colour_map
+from clsas.plot.levels import edges
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_MOST_PIXELS = 1500  # pixels drawn along an axis; pictures have fewer dots
+_PANEL_IN = 5.0  # longer side of a panel
+_LEAST_IN = 1.2  # shorter side of a panel, so that its labels fit
+_LABELS_IN = 1.3, 0.9  # room for the labels and the colour bar of a panel, across and upward
+_MASKED = (0.72, 0.72, 0.72)  # light grey, which none of the colour maps has
+_LIGHT_DEG = 315.0, 45.0  # from the upper left, as on maps, and 45 degrees above the horizon
+_SLOPE = 0.95  # share of the slopes that are drawn as gentler than 45 degrees
+_DARKEST = 0.3  # brightness of slopes that face away from the light, relative to level ground
+_WHITEST = 0.5  # share of white in the colours of slopes that face the light
+_HIGHEST = 0.98  # share of the deviations within the colours
+
+
+class Interferogram(Protocol):
+    """Phase and coherence of two images, as `interferogram` draws them."""
+
+    @property
+    def grid(self) -> Grid:
+        """Positions of the pixels."""
+
+    @property
+    def phase_rad(self) -> NDArray:
+        """Phase between both images, radians."""
+
+    @property
+    def coherence(self) -> NDArray:
+        """Coherence of both images, 0 to 1."""
+
+
+class Heights(Protocol):
+    """Heights on the grid of an image, as `heights` draws them."""
+
+    @property
+    def image(self) -> Image:
+        """Image on the relief."""
+
+    @property
+    def height_m(self) -> NDArray:
+        """Heights, metres."""
+
+    @property
+    def sd_m(self) -> NDArray:
+        """Standard deviations of the heights, metres."""
+
+    @property
+    def mask(self) -> NDArray:
+        """True where there is a height."""
+
+
+def interferogram(interferogram: Interferogram, *, title: str = "") -> Figure:
+    """Draw the phase of an interferogram in cyclic colours, and its coherence beside it.
+
+    Parameters
+    ----------
+    interferogram : Interferogram
+        Phase (radians) and coherence of two images on a plane or height map.
+    title : str
+        Title of the figure.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError, ValueError
+        If an argument has the wrong type, or the pixels are points or not finite.
+    """
+    given = "interferogram", interferogram
+    grid = _grid(*given, getattr(interferogram, "grid", None))
+    phase_rad = _values(*given, "phase_rad", grid)
+    coherence = _values(*given, "coherence", grid)
+    title = drawable("title", title)
+    figure, (left, right) = _panels(grid, title)
+    phase = _drawn(left, grid, np.angle(np.exp(1j * phase_rad)), "twilight_shifted", np.pi)
+    bar = figure.colorbar(phase, ax=left, label="Phase (rad)")
+    bar.set_ticks([-np.pi, -np.pi / 2, 0, np.pi / 2, np.pi], labels=["-π", "-π/2", "0", "π/2", "π"])
+    shown = _drawn(right, grid, coherence, "gray", 1.0, least=0.0)
+    figure.colorbar(shown, ax=right, label="Coherence")
+    left.set_title("Phase")
+    right.set_title("Coherence")
+    return figure
+
+
+def heights(heights: Heights, *, colours: str = "viridis", title: str = "") -> Figure:
+    """Draw heights as coloured relief with shading, and their standard deviation beside it.
+
+    The light comes from the upper left. Slopes are exaggerated so that 95 % of them seem gentler
+    than 45 degrees. Pixels without a height are grey.
+
+    Parameters
+    ----------
+    heights : Heights
+        Heights and standard deviations (metres) on the grid of an image, and a mask, which is True
+        where there is a height.
+    colours : str
+        Colour map of the heights: a name as for `image`.
+    title : str
+        Title of the figure.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError, ValueError
+        If an argument has the wrong type, the pixels are points, a height that is not masked is not
+        finite, or no pixel has a height.
+    """
+    given = "heights", heights
+    grid = _grid(*given, getattr(getattr(heights, "image", None), "grid", None))
+    known = _values(*given, "mask", grid).astype(bool)
+    if not known.any():
+        raise ValueError("heights must have at least one pixel that is not masked")
+    height_m, sd_m = (_values(*given, name, grid, known) for name in ("height_m", "sd_m"))
+    title = drawable("title", title)
+    chosen = colour_map(colours)
+    figure, (left, right) = _panels(grid, title)
+    low_m, high_m = float(height_m[known].min()), float(height_m[known].max())
+    # Drawn for the colour bar only: the relief covers it.
+    scale = _drawn(left, grid, np.where(known, height_m, low_m), chosen, high_m, least=low_m)
+    factor, _ = _unit(grid)
+    left.imshow(
+        _relief(_thinned(height_m), _thinned(known), _steps_m(grid), scale.cmap, scale.norm),
+        origin="lower", extent=_extent(grid, factor), interpolation="nearest",
+    )  # fmt: skip
+    figure.colorbar(scale, ax=left, label="Height (m)")
+    share = 1 - float(known.mean())
+    left.set_title(f"Height; {100 * share:.0f} % masked (grey)" if share else "Height")
+    most_m = float(np.quantile(sd_m[known], _HIGHEST)) or 1.0
+    shown = _drawn(right, grid, np.ma.masked_array(1e3 * sd_m, ~known), "magma", 1e3 * most_m, 0.0)
+    right.set_facecolor(_MASKED)
+    extend = "max" if sd_m[known].max() > most_m else "neither"
+    figure.colorbar(shown, ax=right, label="Deviation (mm)", extend=extend)
+    right.set_title("Standard deviation")
+    return figure
+
+
+def _relief(
+    height_m: NDArray, known: NDArray, steps_m: tuple[float, float], colours: Any, norm: Any
+) -> NDArray[np.float64]:
+    """Return colours [rows, columns, 3] of heights with hillshade; grey where none is known.
+
+    Slopes are those of the nearest known heights. `steps_m` are distances between rows and columns
+    upward and to the right of the picture, metres.
+    """
+    if not known.all():
+        nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+        height_m = height_m[tuple(nearest)]
+    # A single row or column has no slope across it.
+    upward, across = (
+        np.gradient(height_m, step_m, axis=axis) if height_m.shape[axis] > 1 else 0 * height_m
+        for axis, step_m in enumerate(steps_m)
+    )
+    steepest = float(np.quantile(np.hypot(upward, across)[known], _SLOPE))
+    if steepest > 0:
+        upward, across = upward / steepest, across / steepest
+    azimuth, elevation = np.radians(_LIGHT_DEG)
+    light = np.array(
+        [math.sin(azimuth) * math.cos(elevation), math.cos(azimuth) * math.cos(elevation),
+         math.sin(elevation)]
+    )  # fmt: skip
+    facing = (light[2] - light[0] * across - light[1] * upward) / np.sqrt(1 + across**2 + upward**2)
+    # Level ground keeps its colour.
+    dark = _DARKEST + (1 - _DARKEST) * np.clip(facing / light[2], 0, 1)
+    white = _WHITEST * np.clip((facing - light[2]) / (1 - light[2]), 0, 1)
+    shaded: NDArray[np.float64] = colours(norm(height_m))[..., :3] * dark[..., None]
+    shaded += (1 - shaded) * white[..., None]
+    shaded[~known] = _MASKED
+    return shaded
+
+
+def _grid(name: str, found: object, grid: object) -> Grid:
+    """Return the grid of a result; raise TypeError or ValueError if it cannot be drawn."""
+    if not isinstance(grid, Grid):
+        raise TypeError(f"{name} must be of type {name.capitalize()}, got {type(found).__name__}")
+    if grid.points_m is not None:
+        raise ValueError(f"{name} must be on a plane or height map to be drawn, got points")
+    return grid
+
+
+def _values(
+    name: str, found: object, field: str, grid: Grid, known: NDArray[np.bool_] | None = None
+) -> NDArray[np.float64]:
+    """Return a field of a result, float64 with the grid's shape; finite, or 0 where not known."""
+    values = getattr(found, field, None)
+    if values is None:
+        raise TypeError(f"{name} must have {field}, got {type(found).__name__}")
+    values = np.asarray(values, np.float64)
+    if known is not None and values.shape == known.shape:
+        values = np.where(known, values, 0.0)
+    return validate.array(f"{name}.{field}", values, np.float64, grid.shape)
+
+
+def _panels(grid: Grid, title: str) -> tuple[Figure, NDArray]:
+    """Return a figure and its two axes: beside each other, or above each other if they are wide."""
+    across, upward = grid.sides
+    high = abs(upward.step_m) * len(upward.places_m)
+    wide = abs(across.step_m) * len(across.places_m)
+    longest = max(high, wide)
+    width_in = max(_PANEL_IN * wide / longest, _LEAST_IN) + _LABELS_IN[0]
+    height_in = max(_PANEL_IN * high / longest, _LEAST_IN) + _LABELS_IN[1]
+    stacked = width_in > 1.5 * height_in
+    columns, rows = (1, 2) if stacked else (2, 1)
+    figure = new_figure(columns * width_in, rows * height_in, layout="compressed")
+    if title:
+        figure.suptitle(title)
+    return figure, figure.subplots(rows, columns)
+
+
+def _unit(grid: Grid) -> tuple[float, str]:
+    """Return the factor and the unit of the axes."""
+    return length_unit(max(float(np.abs(side.places_m).max()) for side in grid.sides))
+
+
+def _extent(grid: Grid, factor: float) -> tuple[float, float, float, float]:
+    """Return the edges of a picture: left, right, bottom, top."""
+    places = tuple(factor * side.places_m for side in grid.sides)
+    return (*edges(*places), *edges(*reversed(places)))
+
+
+def _steps_m(grid: Grid) -> tuple[float, float]:
+    """Return the steps between rows and between columns that are drawn, with their signs, metres.
+
+    A negative step is drawn to the left or downward.
+    """
+    across, upward = grid.sides
+    every = [_every(count) for count in grid.shape]
+    return upward.step_m * every[0], across.step_m * every[1]
+
+
+def _every(count: int) -> int:
+    """Return how many pixels share a dot."""
+    return max(-(-count // _MOST_PIXELS), 1)
+
+
+def _thinned(values: NDArray) -> NDArray:
+    """Return some of the pixels of a large array: means would mix phases, and cross steps."""
+    return values[:: _every(values.shape[0]), :: _every(values.shape[1])]
+
+
+def _drawn(
+    axes: Axes, grid: Grid, values: NDArray, colours: Any, most: float, least: float | None = None
+) -> Any:
+    """Draw values over metres or millimetres, in colours from `least` (or -most) to `most`."""
+    factor, unit = _unit(grid)
+    extent = _extent(grid, factor)
+    drawn = axes.imshow(
+        _thinned(values), cmap=colours, vmin=-most if least is None else least, vmax=most,
+        origin="lower", extent=extent, interpolation="nearest",
+    )  # fmt: skip
+    axes.set(xlim=sorted(extent[:2]), ylim=sorted(extent[2:]))
+    plain_ticks(axes)
+    across, upward = grid.sides
+    place = grid.georeference
+    axes.set_xlabel(axis_label(across.name, unit, place=place))
+    axes.set_ylabel(axis_label(upward.name, unit, place=place))
+    axes.set_aspect("equal" if min(grid.shape) > 1 else "auto")
+    return drawn

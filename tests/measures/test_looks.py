@@ -1,0 +1,155 @@
+"""Multi-look images: means of power over windows, sub-bands and parts of the beam."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import clsas
+
+GRID = clsas.Grid.plane((0, 3, 151), (40, 42, 101))
+
+
+def speckle(seed, grid=GRID):
+    random = np.random.default_rng(seed)
+    return clsas.Image(random.standard_normal((*grid.shape, 2)) @ [1, 1j], grid)
+
+
+def test_a_window_averages_power():
+    image = speckle(0)
+    found = clsas.multilook(image, window_m=0.1)
+    power = np.abs(image.pixels.astype(complex)) ** 2
+    assert np.abs(found.pixels[50, 70]) ** 2 == pytest.approx(power[48:53, 68:73].mean(), rel=1e-5)
+    # At a corner, only pixels inside count.
+    assert np.abs(found.pixels[0, 0]) ** 2 == pytest.approx(power[:3, :3].mean(), rel=1e-5)
+    assert not found.pixels.imag.any()
+    assert found.pixels.real.min() > 0
+
+
+def test_a_window_follows_the_steps_of_either_axis():
+    grid = clsas.Grid.plane((0, 3, 31), (40, 42, 101))
+    point = np.zeros(grid.shape, complex)
+    point[50, 15] = 1
+    spread = clsas.multilook(clsas.Image(point, grid), window_m=0.3).pixels.real > 1e-3
+    assert spread.any(axis=1).sum() == 15
+    assert spread.any(axis=0).sum() == 3
+
+
+def test_looks_average_power_and_reduce_speckle():
+    images = [speckle(seed) for seed in range(4)]
+    found = clsas.multilook(images)
+    power = np.mean([np.abs(image.pixels) ** 2 for image in images], axis=0)
+    np.testing.assert_allclose(np.abs(found.pixels) ** 2, power, rtol=1e-5)
+    assert clsas.contrast(found) == pytest.approx(0.5, abs=0.03)
+    assert clsas.contrast(clsas.multilook(images, window_m=0.06)) == pytest.approx(1 / 6, abs=0.02)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e30])
+def test_levels_of_any_unit(scale):
+    image = speckle(1)
+    scaled = clsas.Image((image.pixels * scale).astype(np.complex64), GRID)
+    found, expected = (clsas.multilook(each, window_m=0.1).pixels for each in (scaled, image))
+    np.testing.assert_allclose(found / np.float32(scale), expected, rtol=1e-5)
+
+
+def test_a_bright_point_leaves_no_trail():
+    """Sums that run past a point keep the power of dark pixels, down to -120 dB."""
+    pixels = np.full(GRID.shape, 1e-6, complex)
+    pixels[50, 20] = 1
+    found = clsas.multilook(clsas.Image(pixels, GRID), window_m=0.1).pixels.real
+    np.testing.assert_allclose(found[50, 30:], 1e-6, rtol=0.01)
+    zero = clsas.Image(np.zeros(GRID.shape, complex), GRID)
+    assert not clsas.multilook(zero, window_m=0.1).pixels.any()
+
+
+@pytest.mark.parametrize(
+    ("images", "window_m", "error", "message"),
+    [
+        (speckle(0), None, ValueError, "window_m must be given"),
+        ([], 0.1, ValueError, "images must have at least one"),
+        ([speckle(0), 3], 0.1, TypeError, "every entry of images must be"),
+        ([speckle(0), speckle(0, clsas.Grid.plane((0, 3, 9), (0, 1, 9)))], None, ValueError,
+         "one grid, got 2 different"),
+        (speckle(0), 2.5, ValueError, "at most the extent of the grid, 2.02 m"),
+        (speckle(0), -1.0, ValueError, "window_m must be"),
+        (clsas.Image(np.ones(3, complex), clsas.Grid.points(np.eye(3))), 0.1, ValueError,
+         "left out: the images have points"),
+    ],
+)  # fmt: skip
+def test_wrong_looks_are_refused(images, window_m, error, message):
+    with pytest.raises(error, match=message):
+        clsas.multilook(images, window_m=window_m)
+
+
+@pytest.fixture(scope="module")
+def seabed():
+    """Range lines of speckle from a short track, and a grid of resolution cells."""
+    random = np.random.default_rng(2)
+    count = 6000
+    xyz_m = random.uniform([-4, 18, 0], [4, 22, 0], (count, 3))
+    scatterers = clsas.PointTargets(xyz_m, random.standard_normal((count, 2)) @ [1, 1j])
+    tx_m = np.outer(np.arange(-60, 60) * 0.03, [1.0, 0, 0])
+    lines = clsas.simulate_lines(
+        tx_m, tx_m, scatterers, carrier_hz=100e3, bandwidth_hz=30e3, first_range_m=17.0, length=480
+    )
+    return lines, clsas.Grid.plane((-0.6, 0.6, 41), (19, 21, 81))
+
+
+@pytest.mark.parametrize("carrier_hz", [100e3, 96e3])
+def test_sub_bands_add_up_and_do_not_overlap(seabed, carrier_hz):
+    lines = replace(seabed[0], carrier_hz=carrier_hz)
+    parts = clsas.sub_bands(lines, 3)
+    np.testing.assert_allclose(
+        sum(each.samples for each in parts), lines.samples, atol=1e-6 * np.abs(lines.samples).max()
+    )
+    spectra = [np.abs(np.fft.fft(each.samples, 8 * 480)) ** 2 for each in parts]
+    shares = [each.sum() for each in spectra]
+    assert min(shares) > 0.3 * sum(shares)
+    for n, one in enumerate(parts):
+        for other in parts[n + 1 :]:
+            overlap = abs(np.vdot(one.samples, other.samples))
+            assert overlap < 0.02 * np.linalg.norm(one.samples) * np.linalg.norm(other.samples)
+
+
+def test_looks_of_a_survey_are_independent(seabed):
+    """The speckle of N sub-bands, and of N parts of the beam, varies by 1/sqrt(N)."""
+    lines, grid = seabed
+    one = clsas.backproject(lines, grid, beam=clsas.BeamWindow(8.0))
+    bands = [clsas.backproject(each, grid) for each in clsas.sub_bands(lines, 4)]
+    aspects = [
+        clsas.backproject(lines, grid, beam=beam) for beam in clsas.BeamWindow(8.0).divided(4)
+    ]
+    for looks in (bands, aspects):
+        reduced = clsas.contrast(clsas.multilook(looks)) / clsas.contrast(one)
+        assert reduced == pytest.approx(0.5, abs=0.12)
+    # Together, the looks have what the whole beam has, but for a channel at each of their borders.
+    total = sum(image.pixels for image in aspects)
+    norms = np.linalg.norm(total) * np.linalg.norm(one.pixels)
+    assert abs(np.vdot(total, one.pixels)) > 0.98 * norms
+
+
+@pytest.mark.parametrize(("count", "message"), [(1, "count must be"), (65, "count must be")])
+def test_wrong_numbers_of_bands_are_refused(seabed, count, message):
+    with pytest.raises(ValueError, match=message):
+        clsas.sub_bands(seabed[0], count)
+    short = clsas.RangeLines(
+        np.ones((2, 8), complex), 0, 0.1, np.zeros((2, 3)), [0, 0, 0], 1e5, 1500
+    )
+    with pytest.raises(ValueError, match="count must leave a cycle per line"):
+        clsas.sub_bands(short, 60)
+
+
+def test_a_beam_is_divided_along_the_track():
+    beam = clsas.BeamWindow(60.0, "hann", squint_deg=10.0, track_pings=7)
+    parts = beam.divided(3)
+    edges = [part.limits for part in parts]
+    assert edges[0][0] == pytest.approx(beam.limits[0])
+    assert edges[-1][1] == pytest.approx(beam.limits[1])
+    widths = [high - low for low, high in edges]
+    np.testing.assert_allclose(widths, np.ptp(beam.limits) / 3)
+    assert {(part.shape, part.track_pings) for part in parts} == {("hann", 7)}
+    assert clsas.BeamWindow(180.0).divided(2)[0].width_deg == pytest.approx(90)
+    with pytest.raises(ValueError, match="shape must not be 'inverse'"):
+        clsas.BeamWindow(10.0, "inverse", element_length_m=0.05).divided(2)
+    with pytest.raises(ValueError, match=r"count must leave parts of at least 0.001"):
+        clsas.BeamWindow(0.01).divided(20)
