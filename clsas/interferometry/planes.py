@@ -38,6 +38,8 @@ class Planes(NamedTuple):
         Magnitude of the sample coherence.
     growth : float64
         Variance of the height in the middle, relative to that of a windowed mean.
+    roughness_m : float64
+        Rms distance of the relief from the plane.
     """
 
     height_m: NDArray[np.float64]
@@ -45,6 +47,7 @@ class Planes(NamedTuple):
     column_slope_m: NDArray[np.float64]
     coherence: NDArray[np.float64]
     growth: NDArray[np.float64]
+    roughness_m: NDArray[np.float64]
 
 
 def fit_planes(
@@ -80,6 +83,8 @@ def fit_planes(
 
     h = _CentredSums(product * height_m, scale, window, second=False)
     wanted = np.stack([right(s.one, h.one), right(s.r, h.r), right(s.s, h.s)], axis=-1)
+    of_height = np.stack([h.one.real, h.r.real, h.s.real], axis=-1)
+    squared = (scale * window.sums(product * height_m**2)).real
     spread = [max((side**2 - 1) / 12, 1e-6) for side in window.sides]
     normal = np.empty((*product.shape, 3, 3))
     normal[..., 0, 0] = s.one.real
@@ -92,12 +97,15 @@ def fit_planes(
     normal[~solvable] = np.eye(3)
     inverse = np.linalg.inv(normal)
     found = np.einsum("...ij,...j->...i", inverse, wanted)
+    squared -= np.einsum("...i,...i", found, 2 * of_height)
+    squared += np.einsum("...i,...ij,...j", found, normal, found)
     return Planes(
         np.where(solvable, found[..., 0], height_m),
         np.where(solvable, found[..., 1], 0.0),
         np.where(solvable, found[..., 2], 0.0),
         np.where(solvable, np.abs(moments.coherence), 0.0),
         np.where(solvable, np.maximum(inverse[..., 0, 0], 1.0), 1.0),
+        np.where(solvable, np.sqrt(np.maximum(squared, 0.0)), 0.0),
     )
 
 

@@ -25,7 +25,12 @@ PASSES = 6
 """Most passes. Two or three are usual."""
 
 _CONVERGED = 0.3  # rms correction, in standard deviations; it then adds 4 % to the deviation
+_MEDIAN = 0.6745  # median absolute deviation of a Gaussian
 _FALSE_ALARM = 1e-3  # share of incoherent windows that exceed the threshold of coherence
+# Rms distance of the relief from the plane of a window, in deviations. Noise of the heights makes
+# 0.1 % of the windows of level seabeds rougher; those across steps are rougher by far. A parabola
+# displaces the height in the middle by about as much as it makes the window rough.
+_MOST_ROUGHNESS = 3.0
 _LEAST_FORESHORTENING = 0.2  # steeper slopes towards the sonar count as layover
 
 
@@ -108,8 +113,10 @@ def refine(
         valid = known & (facing > _LEAST_FORESHORTENING)
         valid &= coherence >= np.maximum(least_coherence, noise_coherence(seen, _FALSE_ALARM))
         valid &= np.abs(planes.height_m - first_m) < ambiguity_m / 4
+        valid &= planes.roughness_m < _MOST_ROUGHNESS * sd_m
         change = ((planes.height_m - relief_m) / sd_m)[valid]
-        correction = float(np.sqrt(np.mean(change**2))) if change.size else 0.0
+        # The median is not affected by the few pixels beside steps of the relief.
+        correction = float(np.median(np.abs(change))) / _MEDIAN if change.size else 0.0
         image = Image(images[0], on_relief)
         found = Refined(
             planes.height_m, sd_m, coherence, seen, -1 / rad_m, valid, image, correction
