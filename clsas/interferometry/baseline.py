@@ -74,9 +74,7 @@ class Baseline:
     rad_per_m: float
 
     @classmethod
-    def of(
-        cls, a: RangeLines, b: RangeLines, beam: BeamWindow | None, cycles_per_m: float
-    ) -> Self:
+    def of(cls, a: RangeLines, b: RangeLines, beam: BeamWindow | None, cycles_per_m: float) -> Self:
         """Return the baseline of two banks of one sonar."""
         channels = some_channels(a.channels)
         along = track_directions(a) if beam is None else beam.directions(a)
@@ -121,9 +119,7 @@ class Baseline:
             sight_m /= np.linalg.norm(sight_m, axis=2, keepdims=True)
             return np.einsum("pc,pci->pi", weight, sight_m)
 
-        of_a, of_b = (
-            (towards(lines.tx_m) + towards(lines.rx_m)) / 2 for lines in (self.a, self.b)
-        )
+        of_a, of_b = ((towards(lines.tx_m) + towards(lines.rx_m)) / 2 for lines in (self.a, self.b))
         return of_a - of_b, (of_a + of_b) / 2
 
 

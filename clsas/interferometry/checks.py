@@ -127,7 +127,9 @@ def _separation_m(baseline: Baseline) -> NDArray[np.float64]:
     return baseline.b.phase_centres_m[some] - baseline.a.phase_centres_m[some]
 
 
-def _check_below(baseline: Baseline, points_m: NDArray[np.float64], search_m: tuple[float, float]) -> None:
+def _check_below(
+    baseline: Baseline, points_m: NDArray[np.float64], search_m: tuple[float, float]
+) -> None:
     """Raise ValueError if heights to search reach the antennas."""
     some = baseline.channels
     antennas_m = np.concatenate([baseline.a.tx_m[some], baseline.a.rx_m[some]])
@@ -145,7 +147,9 @@ def _check_below(baseline: Baseline, points_m: NDArray[np.float64], search_m: tu
         )
 
 
-def _check_ranges(baseline: Baseline, points_m: NDArray[np.float64], search_m: tuple[float, float]) -> None:
+def _check_ranges(
+    baseline: Baseline, points_m: NDArray[np.float64], search_m: tuple[float, float]
+) -> None:
     """Raise ValueError if no line reaches the ends of the search anywhere on the grid."""
     some = baseline.channels
     first_m, last_m = baseline.a.first_range_m[some], baseline.a.last_range_m[some]

@@ -299,5 +299,3 @@ def _warn(refined: Refined) -> None:
             f"after {PASSES} passes the heights still change by {refined.correction:.2g} standard "
             "deviations: steep relief may need smaller windows"
         )
-
-

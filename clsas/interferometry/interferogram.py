@@ -167,11 +167,9 @@ def interferogram(a: Image, b: Image, window_m: float) -> Interferogram:
     found = Moments.of(a.pixels, b.pixels, window).coherence
     coherence = debiased(found, looks)
     deviation = phase_sd_rad(coherence, looks)
-    return Interferogram(
-        *(each.astype(np.float32) for each in (np.angle(found), coherence, looks, deviation)),
-        a.grid,
-        window_m,
-    )
+    parts = np.angle(found), coherence, looks, deviation
+    phase, magnitude, independent, noise = (each.astype(np.float32) for each in parts)
+    return Interferogram(phase, magnitude, independent, noise, a.grid, window_m)
 
 
 def window_within(grid: Grid, window_m: float) -> Window:

@@ -109,6 +109,17 @@ def fit_planes(
     )
 
 
+def edge_growth(window: Window, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return the `growth` of evenly lit windows, which is more than 1 at the edges of an image."""
+    excess = []
+    for n, side in zip(shape, window.sides, strict=True):
+        first = np.maximum(np.arange(n) - side // 2, 0)
+        last = np.minimum(np.arange(n) + side // 2, n - 1)
+        variance = np.maximum(((last - first + 1) ** 2 - 1) / 12, 1e-6)
+        excess.append(((first + last) / 2 - np.arange(n)) ** 2 / variance)
+    return 1 + excess[0][:, None] + excess[1][None, :]
+
+
 class _CentredSums:
     """Sums over windows of values times powers of the rows r and columns s from the middle."""
 

@@ -19,7 +19,7 @@ from clsas.interferometry.coherence import (
     phase_sd_rad,
 )
 from clsas.interferometry.pair import Pair
-from clsas.interferometry.planes import fit_planes
+from clsas.interferometry.planes import edge_growth, fit_planes
 
 PASSES = 6
 """Most passes. Two or three are usual."""
@@ -31,6 +31,9 @@ _FALSE_ALARM = 1e-3  # share of incoherent windows that exceed the threshold of 
 # 0.1 % of the windows of level seabeds rougher; those across steps are rougher by far. A parabola
 # displaces the height in the middle by about as much as it makes the window rough.
 _MOST_ROUGHNESS = 3.0
+# Variance in the middle of a window relative to that of an evenly lit one. It is 4 at the edge of a
+# shadow, beyond which a plane would be extrapolated.
+_MOST_GROWTH = 3.0
 _LEAST_FORESHORTENING = 0.2  # steeper slopes towards the sonar count as layover
 
 
@@ -99,9 +102,10 @@ def refine(
     known = np.isfinite(offset_m)
     # A slope that faces the sonar is imaged with more pixels per independent sample.
     _, level = sensitivity(grid, np.zeros(grid.shape), np.zeros((2, *grid.shape)), sights)
+    level_growth = edge_growth(window, grid.shape)
     looks_on_plane = looks * window.fullness(grid.shape) / level
     relief_m = first_m = filled(offset_m, known)
-    slope_m = np.stack(np.gradient(relief_m)) if min(grid.shape) > 1 else np.zeros((2, *grid.shape))
+    slope_m = np.array(np.gradient(relief_m))
     for done in range(1, PASSES + 1):
         on_relief = grid.with_height(relief_m)
         images = pair.images(on_relief)
@@ -113,6 +117,7 @@ def refine(
         valid = known & (facing > _LEAST_FORESHORTENING)
         valid &= coherence >= np.maximum(least_coherence, noise_coherence(seen, _FALSE_ALARM))
         valid &= np.abs(planes.height_m - first_m) < ambiguity_m / 4
+        valid &= planes.growth < _MOST_GROWTH * level_growth
         valid &= planes.roughness_m < _MOST_ROUGHNESS * sd_m
         change = ((planes.height_m - relief_m) / sd_m)[valid]
         # The median is not affected by the few pixels beside steps of the relief.
@@ -148,7 +153,8 @@ def sensitivity(
     sights : Lattice
     """
     _, row_step_m, column_step_m = grid.vectors_m
-    found = sights.at(*np.indices(grid.shape).astype(float), offset_m)
+    row, column = np.indices(grid.shape).astype(float)
+    found = sights.at(row, column, offset_m)
     tilt = np.array([row_step_m[2], column_step_m[2]])[:, None, None]
     facing = 1 - np.einsum("irc,rci->rc", slope_m + tilt, found[..., 1:])
     return found[..., 0] / np.maximum(facing, _LEAST_FORESHORTENING), facing
@@ -162,5 +168,3 @@ def filled(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.
         return np.zeros_like(values)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     return values[tuple(nearest)]
-
-

@@ -102,8 +102,9 @@ class Heights:
         parts: tuple[str, ...] = ()
         if self.mask.any():
             known_m = self.height_m[self.mask]
+            low_m, high_m = round(float(known_m.min()), 4), round(float(known_m.max()), 4)
             parts = (
-                f"height {reprs.span(*np.round([known_m.min(), known_m.max()], 4), 'm')}",
+                f"height {reprs.span(low_m, high_m, 'm')}",
                 f"median deviation {reprs.quantity(float(np.median(self.sd_m[self.mask])), 'm')}",
             )
         return reprs.summary(self, f"{reprs.by(self.mask.shape)} pixels", valid, *parts)

@@ -35,7 +35,9 @@ STEPS_PER_CYCLE = 6
 """Heights per height of ambiguity. With 4, phases between two heights are so large that the
 magnitude of the coherence misleads; 8 takes longer and finds the same heights."""
 
-_CANDIDATE_RAD = 1.3 * math.pi / STEPS_PER_CYCLE  # phase at the height nearest to a zero, and margin
+_CANDIDATE_RAD = (
+    1.3 * math.pi / STEPS_PER_CYCLE
+)  # phase at the height nearest to a zero, and margin
 _LEAST_SPACE = 3  # pixels beyond the outermost curve
 _PIXELS_AT_ONCE = 1 << 20  # of all heights that are imaged together; their positions take 24 MiB
 
@@ -92,15 +94,16 @@ class Curves:
 
     def _everywhere(self, index: int) -> NDArray[np.float64]:
         """Return the values of the lattice at every curve, at a height."""
+        known = self.lattice.rows, self.lattice.columns
         places = (
-            np.interp(np.arange(n), known, np.arange(len(known)))
-            for n, known in zip(self.grid.shape, (self.lattice.rows, self.lattice.columns))
+            np.interp(np.arange(n), at, np.arange(len(at)))
+            for n, at in zip(self.grid.shape, known, strict=True)
         )
         where = np.meshgrid(*places, indexing="ij")
         level = np.moveaxis(self.lattice.values[:, :, index], -1, 0)
         return np.stack([map_coordinates(each, where, order=1) for each in level], axis=-1)
 
-    def through(self, index: int, shape: tuple[int, int]) -> tuple[NDArray, NDArray]:
+    def through(self, index: int, shape: tuple[int, ...]) -> tuple[NDArray, NDArray]:
         """Return the curves that pass through the wanted pixels at a height, as rows and columns.
 
         Displacements vary slowly, so few iterations find the curve.
@@ -160,7 +163,7 @@ class Sweep:
     coherence: NDArray[np.float64]
 
     def relief(
-        self, shape: tuple[int, int], reliable: NDArray[np.bool_], ambiguity_m: float
+        self, shape: tuple[int, ...], reliable: NDArray[np.bool_], ambiguity_m: float
     ) -> Relief:
         """Return the heights of the wanted pixels.
 
@@ -238,13 +241,12 @@ def sweep(
         for index, a, b in zip(some, *pair.images(slab), strict=True):
             coherence[index] = Moments.of(a, b, window).coherence
         progress(some[-1] + 1)
-    index = likeliest(coherence, coarse)
-    best = np.take_along_axis(coherence, index[None], axis=0)[0].astype(np.complex128)
+    best = likeliest(coherence, coarse)
+    found = np.take_along_axis(coherence, best[None], axis=0)[0].astype(np.complex128)
     rad_m = np.empty(grid.shape)
-    for level in np.unique(index):
-        rad_m[index == level] = curves.rad_m(level)[index == level]
-    height_m = offset_m[index] - np.angle(best) / rad_m
-    return Sweep(curves, height_m, np.abs(best))
+    for level in np.unique(best):
+        rad_m[best == level] = curves.rad_m(level)[best == level]
+    return Sweep(curves, offset_m[best] - np.angle(found) / rad_m, np.abs(found))
 
 
 def likeliest(coherence: NDArray[np.complex64], coarse: Window) -> NDArray[np.intp]:
