@@ -25,6 +25,9 @@ PASSES = 6
 """Most passes. Two or three are usual."""
 
 _CONVERGED = 0.3  # rms correction, in standard deviations; it then adds 4 % to the deviation
+# Last correction of a pixel, in deviations, from which on it is not valid: its window reaches to
+# where the relief is unknown, and contains echoes of another height.
+_UNSETTLED = 2.0
 _MEDIAN = 0.6745  # median absolute deviation of a Gaussian
 _FALSE_ALARM = 1e-3  # share of incoherent windows that exceed the threshold of coherence
 # Rms distance of the relief from the plane of a window, in deviations. Noise of the heights makes
@@ -119,12 +122,13 @@ def refine(
         valid &= np.abs(planes.height_m - first_m) < ambiguity_m / 4
         valid &= planes.growth < _MOST_GROWTH * level_growth
         valid &= planes.roughness_m < _MOST_ROUGHNESS * sd_m
-        change = ((planes.height_m - relief_m) / sd_m)[valid]
+        change = np.abs(planes.height_m - relief_m) / sd_m
         # The median is not affected by the few pixels beside steps of the relief.
-        correction = float(np.median(np.abs(change))) / _MEDIAN if change.size else 0.0
+        correction = float(np.median(change[valid])) / _MEDIAN if valid.any() else 0.0
+        settled = valid & (change < _UNSETTLED)
         image = Image(images[0], on_relief)
         found = Refined(
-            planes.height_m, sd_m, coherence, seen, -1 / rad_m, valid, image, correction
+            planes.height_m, sd_m, coherence, seen, -1 / rad_m, settled, image, correction
         )
         progress(done)
         if found.converged:
