@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from clsas.files.xarrays import to_xarray
     from clsas.inspection.inspection import inspect
     from clsas.inspection.result import Inspection, PhaseSign
+    from clsas.interferometry.heights import heights
+    from clsas.interferometry.interferogram import Interferogram, interferogram
+    from clsas.interferometry.result import Heights
     from clsas.maps.exporting import export
     from clsas.measures.assessment import assess, survey_lines
     from clsas.measures.assessment_result import Assessment, Effect
@@ -74,9 +77,11 @@ __all__ = [
     "Finding",
     "Georeference",
     "Grid",
+    "Heights",
     "Image",
     "Imager",
     "Inspection",
+    "Interferogram",
     "Limit",
     "Limits",
     "Micronavigation",
@@ -108,7 +113,9 @@ __all__ = [
     "factorize",
     "from_full_matrix",
     "from_phase_history",
+    "heights",
     "inspect",
+    "interferogram",
     "limits",
     "list_devices",
     "load",
@@ -156,6 +163,9 @@ _MODULES = {
     "files.xarrays": "to_xarray",
     "inspection.inspection": "inspect",
     "inspection.result": "Inspection PhaseSign",
+    "interferometry.heights": "heights",
+    "interferometry.interferogram": "Interferogram interferogram",
+    "interferometry.result": "Heights",
     "maps.exporting": "export",
     "measures.assessment": "assess survey_lines",
     "measures.assessment_result": "Assessment Effect",

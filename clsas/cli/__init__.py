@@ -37,6 +37,7 @@ _GROUPS = {
         "process": ("processing", "Take a recording to a focused image, step by step."),
         "plan": ("images", "Show how an image would be formed, its time and its error."),
         "image": ("images", "Form an image of range lines, to a tolerance or exactly."),
+        "heights": ("heights", "Measure the heights of a seabed from two receiver banks."),
         "mosaic": ("mosaics", "Form an image of any size, patch by patch."),
         "view": ("view", "Show an image or a mosaic in a browser."),
         "show": ("show", "Draw an image, range lines, a plan, a recording or a mosaic."),

@@ -30,6 +30,7 @@ def load(path: Path, *kinds: type) -> Any:
         clsas.Echoes: " (clsas simulate makes them)",
         clsas.RangeLines: " (clsas compress makes them)",
         clsas.Image: " (clsas image makes it)",
+        clsas.Heights: " (clsas heights makes them)",
     }
     wanted = " or ".join(f"{kind.__name__}{hint.get(kind, '')}" for kind in kinds)
     raise ValueError(f"{path} must hold {wanted}, got {type(obj).__name__}")

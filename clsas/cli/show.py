@@ -138,8 +138,10 @@ def _read(path: Path) -> Shown:
             f"{path} is a scene, which has nothing to draw yet: clsas simulate {path} -o ECHOES.H5"
         )
     found = clsas.load(path)
-    if isinstance(found, clsas.Grid):
-        raise ValueError(f"{path} must hold an image, range lines or echoes, got only a Grid")
+    if isinstance(found, clsas.Grid | clsas.Interferogram | clsas.Heights):
+        raise ValueError(
+            f"{path} must hold an image, range lines or echoes, got only a {type(found).__name__}"
+        )
     return found
 
 

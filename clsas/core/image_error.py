@@ -56,7 +56,7 @@ def relative_error_db(
             f"image and reference must have one shape, got {given.shape} and {wanted.shape}"
         )
     if isinstance(image, Image) and isinstance(reference, Image):
-        _check_one_grid(image.grid, reference.grid)
+        check_one_grid(image.grid, reference.grid)
     if not wanted.any():
         raise ValueError("reference must not be zero everywhere")
     if darkest is not None:
@@ -79,7 +79,7 @@ def complex_values(name: str, image: Image | ArrayLike) -> NDArray[np.complex128
     return validate.array(name, values, np.complex128, (None,) * max(values.ndim, 1))
 
 
-def _check_one_grid(image: Grid, reference: Grid) -> None:
+def check_one_grid(image: Grid, reference: Grid, names: str = "image and reference") -> None:
     """Raise ValueError unless two grids of one shape have the same pixel positions."""
     part = [slice(None)] * 2
     if image.is_planar and reference.is_planar:
@@ -88,8 +88,7 @@ def _check_one_grid(image: Grid, reference: Grid) -> None:
     apart_m = np.abs(image.positions_m(*part) - positions_m).max()
     if apart_m > 1e-9 + 1e-14 * np.abs(positions_m).max():
         raise ValueError(
-            "image and reference must lie on one grid, got pixel positions that differ by up to "
-            f"{apart_m:g} m"
+            f"{names} must lie on one grid, got pixel positions that differ by up to {apart_m:g} m"
         )
 
 

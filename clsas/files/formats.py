@@ -35,7 +35,7 @@ def load(path: str | os.PathLike) -> Saved:
 
     Returns
     -------
-    Grid, RangeLines, Image or Echoes
+    Grid, RangeLines, Image, Echoes, Interferogram or Heights
         The object that was saved, bit for bit; RangeLines for CPHD files and recordings.
 
     Raises
@@ -105,7 +105,7 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     path : path-like
         File to write, in a folder that exists. The suffix selects the format: .h5, .hdf5, .he5 or
         no suffix for HDF5, and .cphd for CPHD (see `write_cphd`).
-    obj : Grid, RangeLines, Image or Echoes
+    obj : Grid, RangeLines, Image, Echoes, Interferogram or Heights
         The object. `load` returns it from HDF5 bit for bit.
 
     Raises

@@ -1,4 +1,4 @@
-"""Grids, range lines, echoes and images in HDF5 files.
+"""Grids, range lines, echoes, images and heights in HDF5 files.
 
 docs/format.md describes the schema. It follows the dataclasses: arrays are datasets, numbers and
 strings are attributes, nested objects are groups, and fields that are None are left out.
@@ -24,6 +24,8 @@ from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
+from clsas.interferometry.interferogram import Interferogram
+from clsas.interferometry.result import Heights
 from clsas.signal.echoes import Echoes
 from clsas.sonar.system import Pulse
 
@@ -36,13 +38,15 @@ _KINDS = {
     "echoes": Echoes,
     "pulse": Pulse,
     "georeference": Georeference,
+    "interferogram": Interferogram,
+    "heights": Heights,
 }
-_SAVED = (Grid, RangeLines, Image, Echoes)
+_SAVED = (Grid, RangeLines, Image, Echoes, Interferogram, Heights)
 
 SUFFIXES = (".h5", ".hdf5", ".he5")
 """Suffixes that HDF5 files may have."""
 
-Saved = Grid | RangeLines | Image | Echoes
+Saved = Grid | RangeLines | Image | Echoes | Interferogram | Heights
 
 
 class FileFormatError(ValueError):
@@ -56,7 +60,7 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     ----------
     path : path-like
         The file, whose folder must exist. Its name must have one of the `SUFFIXES` or none.
-    obj : Grid, RangeLines, Image or Echoes
+    obj : Grid, RangeLines, Image, Echoes, Interferogram or Heights
         The object; `load` returns it bit for bit.
 
     Raises
@@ -97,7 +101,7 @@ def load(path: str | os.PathLike) -> Saved:
 
     Returns
     -------
-    Grid, RangeLines, Image or Echoes
+    Grid, RangeLines, Image, Echoes, Interferogram or Heights
         The object that was saved, bit for bit.
 
     Raises

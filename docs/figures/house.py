@@ -33,6 +33,7 @@ FLOORS = (
             ("navigation", "where was the sonar?\nmicronavigation, autofocus"),
             ("inspection", "is the recording sound?\nlevels, spacing, phase sign"),
             ("measures", "how good is the image?\nquality, tradeoff, effects"),
+            ("interferometry", "how high is the seabed?\ninterferograms, heights"),
         ),
         BLUE,
     ),

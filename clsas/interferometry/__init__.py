@@ -1,0 +1,1 @@
+"""Interferograms of two receiver banks, and heights of the seabed."""

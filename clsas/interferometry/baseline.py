@@ -1,0 +1,188 @@
+"""How the phase between two banks changes with height, and where a scatterer above a plane appears.
+
+A scatterer above an imaged surface appears where its range and its position along the track are the
+same. Around a straight track, these points form a circle; t is its tangent, scaled to a rise of
+1 m. Along that curve an image shows the same speckle at every height. D is the gradient of the
+difference of the two banks' ranges. If a scatterer lies e higher along the curve than the pixel
+that shows it, the phase in that pixel is
+
+    arg(a b*) = -K e,   K = 2 k D.t.
+
+On a seabed whose slope along t is m.t, a scatterer e/(1 - m.t) higher along the curve belongs to a
+surface that is e higher at the pixel, so a height error e causes the phase -K e/(1 - m.t). The
+factor 1 - m.t is the foreshortening: less than 1 on slopes that face the sonar, 0 where the slope
+is perpendicular to the line of sight, and negative in layover.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines, some_channels
+from clsas.core.wavelengths import wavelength_m
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.directions import track_directions
+
+_POINTS_AT_ONCE = 64
+_LEAST_RISE = 1e-3  # of the tangent; directly below a track, no scatterer changes its height
+_LATTICE = 9  # points along either side of a grid; 5 and 17 give the same heights to 0.1 mm
+_LEVELS = 5  # heights of a lattice
+
+
+class Sight(NamedTuple):
+    """How two banks see some points.
+
+    Attributes
+    ----------
+    rad_m : float64 [points]
+        Change K of the phase per metre of height along the curves of equal range; 0 where the
+        curve does not rise.
+    tangent : float64 [points, 2]
+        x and y of the curve's tangent, per metre of rise.
+    """
+
+    rad_m: NDArray[np.float64]
+    tangent: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Baseline:
+    """Two banks, represented by some channels.
+
+    Attributes
+    ----------
+    a, b : RangeLines
+    channels : int64 [n]
+    along : float64 [n, 3]
+        Direction of the track at each channel.
+    beam : BeamWindow or None
+    rad_per_m : float
+        Two-way phase per metre of range in the middle of the band.
+    """
+
+    a: RangeLines
+    b: RangeLines
+    channels: NDArray[np.int64]
+    along: NDArray[np.float64]
+    beam: BeamWindow | None
+    rad_per_m: float
+
+    @classmethod
+    def of(cls, a: RangeLines, b: RangeLines, beam: BeamWindow | None, cycles_per_m: float) -> Self:
+        """Return the baseline of two banks of one sonar."""
+        channels = some_channels(a.channels)
+        along = track_directions(a) if beam is None else beam.directions(a)
+        return cls(a, b, channels, along[channels], beam, 2 * np.pi * cycles_per_m)
+
+    def sight(self, points_m: NDArray[np.float64]) -> Sight:
+        """Return how the banks see points, float64 [points, 3]."""
+        parts = max(len(points_m) // _POINTS_AT_ONCE, 1)
+        found = [self._sight(some) for some in np.array_split(points_m, parts)]
+        return Sight(*(np.concatenate(each) for each in zip(*found, strict=True)))
+
+    def _sight(self, points_m: NDArray[np.float64]) -> Sight:
+        weight = self._weights(points_m)
+        difference, mean = self._gradients(points_m, weight)
+        tangent = np.cross(weight @ self.along, mean)
+        rise = tangent[:, 2]
+        rises = np.abs(rise) > _LEAST_RISE * np.linalg.norm(tangent, axis=1)
+        tangent = np.where(rises[:, None], tangent / np.where(rises, rise, 1)[:, None], 0)
+        return Sight(self.rad_per_m * np.einsum("pi,pi->p", difference, tangent), tangent[:, :2])
+
+    def gradients(
+        self, points_m: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the gradients of the difference and of the mean of the ranges, [points, 3]."""
+        return self._gradients(points_m, self._weights(points_m))
+
+    def _weights(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the weights of the channels in points, float64 [points, channels]; sums are 1."""
+        if self.beam is None:
+            return np.full((len(points_m), len(self.channels)), 1 / len(self.channels))
+        sight_m = points_m[:, None] - self.a.phase_centres_m[self.channels]
+        sine = np.einsum("pci,ci->pc", sight_m, self.along) / np.linalg.norm(sight_m, axis=2)
+        weight = self.beam.weights(sine, wavelength_m(self.a))
+        total = weight.sum(axis=1, keepdims=True)
+        return np.where(total > 0, weight, 1) / np.where(total > 0, total, weight.shape[1])
+
+    def _gradients(
+        self, points_m: NDArray[np.float64], weight: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        def towards(antennas_m: NDArray[np.float64]) -> NDArray[np.float64]:
+            sight_m = points_m[:, None] - antennas_m[self.channels]
+            sight_m /= np.linalg.norm(sight_m, axis=2, keepdims=True)
+            return np.einsum("pc,pci->pi", weight, sight_m)
+
+        of_a, of_b = ((towards(lines.tx_m) + towards(lines.rx_m)) / 2 for lines in (self.a, self.b))
+        return of_a - of_b, (of_a + of_b) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Quantities at a few pixels and heights above a grid, interpolated linearly in between.
+
+    Attributes
+    ----------
+    rows, columns, offset_m : float64 [n], [m], [levels]
+    values : float64 [n, m, levels, quantities]
+    """
+
+    rows: NDArray[np.float64]
+    columns: NDArray[np.float64]
+    offset_m: NDArray[np.float64]
+    values: NDArray[np.float64]
+
+    def at(
+        self,
+        rows: NDArray[np.float64],
+        columns: NDArray[np.float64],
+        offset_m: NDArray[np.float64] | float,
+    ) -> NDArray[np.float64]:
+        """Return the quantities at places, which broadcast, [..., quantities].
+
+        The outermost values apply beyond the lattice.
+        """
+        axes, values = [], self.values
+        for axis, places in enumerate((self.rows, self.columns, self.offset_m)):
+            if len(places) == 1:  # interpolation needs two
+                places, values = np.array([0.0, 1.0]), np.repeat(values, 2, axis=axis)
+            axes.append(places)
+        inside = [
+            np.clip(each, places[0], places[-1])
+            for each, places in zip((rows, columns, offset_m), axes, strict=True)
+        ]
+        return RegularGridInterpolator(tuple(axes), values)(
+            np.stack(np.broadcast_arrays(*inside), axis=-1)
+        )
+
+
+def lattice_pixels(grid: Grid) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows and columns of a lattice over a grid."""
+    rows, columns = (
+        np.unique(np.linspace(0, n - 1, min(_LATTICE, n)).round().astype(int)) for n in grid.shape
+    )
+    return rows, columns
+
+
+def sight_lattice(baseline: Baseline, grid: Grid, search_m: tuple[float, float]) -> Lattice:
+    """Return K (rad/m) and the tangent, in rows and columns per metre of rise, above a plane."""
+    rows, columns = lattice_pixels(grid)
+    offset_m = np.linspace(*search_m, _LEVELS)
+    points_m = grid.positions_m()[np.ix_(rows, columns)][..., None, :]
+    points_m = points_m + offset_m[:, None] * np.array([0.0, 0.0, 1.0])
+    sight = baseline.sight(points_m.reshape(-1, 3))
+    values = np.column_stack([sight.rad_m, in_pixels(grid, sight.tangent)])
+    shape = (len(rows), len(columns), len(offset_m), 3)
+    return Lattice(rows.astype(float), columns.astype(float), offset_m, values.reshape(shape))
+
+
+def in_pixels(grid: Grid, horizontal_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return horizontal vectors, [..., 2] in x and y, as [..., 2] in rows and columns."""
+    _, row_step_m, column_step_m = grid.vectors_m
+    return horizontal_m @ np.linalg.inv(np.array([row_step_m[:2], column_step_m[:2]]))

@@ -1,0 +1,191 @@
+"""Checks of two banks, a grid and a range of heights, before anything is imaged."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.core import validate
+from clsas.core.geometry import pairwise_range_m
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines, antennas_of
+from clsas.interferometry.baseline import Baseline
+
+_APART = 0.1  # relative change of the distance between banks that waves of the track may cause
+_MOST_CYCLES = 1e3  # of phase within the search; more need more planes than anyone has time for
+_LEAST_PHASE_RAD = 0.1  # over the whole search; less is not above the noise of usual coherences
+
+
+def checked_search(search_m: ArrayLike) -> tuple[float, float]:
+    """Return the lowest and the highest height to search, metres."""
+    low_m, high_m = map(float, validate.array("search_m", search_m, np.float64, (2,)))
+    if not low_m < high_m:
+        raise ValueError(f"search_m must be (lowest, highest) in m, got ({low_m:g}, {high_m:g})")
+    return low_m, high_m
+
+
+def check_grid(grid: Grid) -> None:
+    """Raise ValueError unless a grid is a plane that heights along z can raise."""
+    if not grid.is_planar:
+        kind = "arbitrary points" if grid.points_m is not None else "a height map"
+        raise ValueError(f"grid must be a plane, above which heights are measured, got {kind}")
+    if min(grid.shape) < 2:
+        raise ValueError(f"grid must have at least 2 rows and 2 columns, got {grid.shape}")
+    normal = np.cross(*grid.vectors_m[1:])
+    if abs(normal[2]) < 0.1 * float(np.linalg.norm(normal)):
+        raise ValueError(
+            "grid must be a plane that heights along z can raise, got a vertical one: its steps "
+            f"are {grid.row_step_m} and {grid.column_step_m} m"
+        )
+
+
+def check_pair(a: RangeLines, b: RangeLines) -> None:
+    """Raise TypeError or ValueError unless two sets of lines can be those of two banks."""
+    validate.instance("a", a, RangeLines)
+    validate.instance("b", b, RangeLines)
+    if a.channels != b.channels or len(a.ping_starts) != len(b.ping_starts):
+        raise ValueError(
+            "a and b must contain the same pings, with as many channels each, got "
+            f"{_pings(a)} and {_pings(b)}"
+        )
+    for name, unit in (("carrier_hz", "Hz"), ("sound_speed_m_s", "m/s"), ("range_step_m", "m")):
+        first, second = getattr(a, name), getattr(b, name)
+        if not math.isclose(first, second, rel_tol=1e-9):
+            raise ValueError(
+                f"a and b must have the same {name}, got {first:.9g} and {second:.9g} {unit}"
+            )
+    apart_m = np.linalg.norm(a.phase_centres_m - b.phase_centres_m, axis=1)
+    usual_m = float(np.median(apart_m))
+    worst = int(np.abs(apart_m - usual_m).argmax())
+    if abs(apart_m[worst] - usual_m) > _APART * usual_m + 1e-6:
+        raise ValueError(
+            "a and b must contain the same pings in the same order: their phase centres are "
+            f"{usual_m:.3g} m apart in most channels, and {apart_m[worst]:.3g} m in channel {worst}"
+        )
+    for name, lines in (("a", a), ("b", b)):
+        if not lines.samples.any():
+            raise ValueError(f"{name} must contain echoes, got samples that are all zero")
+
+
+def _pings(lines: RangeLines) -> str:
+    return f"{len(lines.ping_starts)} pings of {lines.channels} channels in all"
+
+
+def check_geometry(
+    baseline: Baseline,
+    grid: Grid,
+    search_m: tuple[float, float],
+    relative_band: float,
+    least_coherence: float,
+) -> float:
+    """Return the height of ambiguity, metres; raise ValueError unless heights can be measured.
+
+    Parameters
+    ----------
+    baseline : Baseline
+    grid : Grid
+    search_m : (low, high)
+    relative_band : float
+        Bandwidth over the frequency in its middle.
+    least_coherence : float
+    """
+    points_m = grid.spread(5)
+    low_m, high_m = search_m
+    up = np.array([0.0, 0.0, 1.0])
+    sights = [baseline.sight(points_m + offset_m * up) for offset_m in (low_m, 0.0, high_m)]
+    rad_m = np.concatenate([each.rad_m for each in sights])
+    usual_rad_m = float(np.median(np.abs(rad_m)))
+    if usual_rad_m * (high_m - low_m) < _LEAST_PHASE_RAD:
+        apart_m = float(np.median(np.linalg.norm(_separation_m(baseline), axis=1)))
+        raise ValueError(
+            "a and b must be apart across the line of sight: their phase centres are "
+            f"{apart_m:.3g} m apart, and the phase between them changes by "
+            f"{usual_rad_m * (high_m - low_m):.2g} rad over search_m, less than "
+            f"{_LEAST_PHASE_RAD:g} rad"
+        )
+    _check_below(baseline, points_m, search_m)
+    if (rad_m > 0).any() and (rad_m < 0).any():
+        raise ValueError(
+            "a and b must see all of the grid and search_m from one side: the sign of the phase "
+            "changes within them. Divide the grid at the track's nadir"
+        )
+    _check_ranges(baseline, points_m, search_m)
+    ambiguity_m = 2 * math.pi / usual_rad_m
+    if high_m - low_m > _MOST_CYCLES * ambiguity_m:
+        raise ValueError(
+            f"search_m must span at most {_MOST_CYCLES:g} heights of ambiguity "
+            f"({ambiguity_m:.3g} m each), got {high_m - low_m:g} m"
+        )
+    _check_decorrelation(baseline, points_m, ambiguity_m, relative_band, least_coherence)
+    return ambiguity_m
+
+
+def _separation_m(baseline: Baseline) -> NDArray[np.float64]:
+    some = baseline.channels
+    return baseline.b.phase_centres_m[some] - baseline.a.phase_centres_m[some]
+
+
+def _check_below(
+    baseline: Baseline, points_m: NDArray[np.float64], search_m: tuple[float, float]
+) -> None:
+    """Raise ValueError if heights to search reach the antennas."""
+    some = baseline.channels
+    antennas_m = np.concatenate([baseline.a.tx_m[some], baseline.a.rx_m[some]])
+    lowest_m = float(antennas_m[:, 2].min() - points_m[:, 2].max())
+    highest_m = float(antennas_m[:, 2].max() - points_m[:, 2].min())
+    if lowest_m > 0 and search_m[1] >= lowest_m:
+        raise ValueError(
+            f"search_m must end below the sonar, which is {lowest_m:.4g} m above the grid, got "
+            f"{search_m[1]:g} m"
+        )
+    if highest_m < 0 and search_m[0] <= highest_m:
+        raise ValueError(
+            f"search_m must begin above the sonar, which is {-highest_m:.4g} m below the grid, got "
+            f"{search_m[0]:g} m"
+        )
+
+
+def _check_ranges(
+    baseline: Baseline, points_m: NDArray[np.float64], search_m: tuple[float, float]
+) -> None:
+    """Raise ValueError if no line reaches the ends of the search anywhere on the grid."""
+    some = baseline.channels
+    first_m, last_m = baseline.a.first_range_m[some], baseline.a.last_range_m[some]
+    for offset_m in search_m:
+        raised_m = points_m + [0.0, 0.0, offset_m]
+        range_m = pairwise_range_m(raised_m, *antennas_of(baseline.a, some))
+        if not ((range_m >= first_m) & (range_m <= last_m)).any():
+            raise ValueError(
+                f"search_m must lie within the range of the lines, {first_m.min():.5g} to "
+                f"{last_m.max():.5g} m: at {offset_m:g} m the grid is at {range_m.min():.5g} to "
+                f"{range_m.max():.5g} m"
+            )
+
+
+def _check_decorrelation(
+    baseline: Baseline,
+    points_m: NDArray[np.float64],
+    ambiguity_m: float,
+    relative_band: float,
+    least_coherence: float,
+) -> None:
+    """Raise ValueError if the banks are so far apart that a level seabed is not coherent.
+
+    From another elevation, one frequency samples another wavenumber of the seabed. The shift,
+    relative to the carrier, is |D|/|g| with D and g the horizontal gradients of the difference and
+    the mean of the ranges. Only the part of the band that both banks share is coherent (Gatelli et
+    al. 1994).
+    """
+    difference, mean = baseline.gradients(points_m)
+    of_ground = np.linalg.norm(mean[:, :2], axis=1)
+    shift = np.median(np.linalg.norm(difference[:, :2], axis=1) / np.maximum(of_ground, 1e-9))
+    left = 1 - float(shift) / relative_band
+    if left < least_coherence:
+        apart_m = float(np.median(np.linalg.norm(_separation_m(baseline), axis=1)))
+        raise ValueError(
+            f"a and b must be closer together: at {2 * apart_m:.3g} m between the banks, the "
+            f"height of ambiguity is {ambiguity_m:.2g} m and a level seabed has a coherence of at "
+            f"most {max(left, 0):.2f}, less than least_coherence = {least_coherence:g}"
+        )

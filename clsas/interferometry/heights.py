@@ -1,0 +1,301 @@
+"""Heights of the seabed from two banks of receivers.
+
+The method has two steps. A sweep finds, along curves of equal range, the heights at which the
+banks agree (`clsas.interferometry.sweep`); large windows decide between the cycles of the phase.
+Both banks are then imaged on that relief, and the phase that is left corrects it
+(`clsas.interferometry.refinement`), with a plane fitted in every window
+(`clsas.interferometry.planes`). Passes end when corrections are below the deviation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from clsas.core import reprs, validate
+from clsas.core.georeference import placed
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.core.wavelengths import cycles_per_m_at
+from clsas.interferometry.baseline import Baseline, sight_lattice
+from clsas.interferometry.checks import check_geometry, check_grid, check_pair, checked_search
+from clsas.interferometry.coherence import (
+    Window,
+    check_looks,
+    effective_looks,
+    noise_coherence,
+)
+from clsas.interferometry.interferogram import window_within
+from clsas.interferometry.pair import Pair
+from clsas.interferometry.refinement import PASSES, Refined, refine
+from clsas.interferometry.result import Heights
+from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, sweep
+from clsas.opencl.device import Device, open_device
+from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
+from clsas.signal.spectrum import measure_spectrum
+from clsas.sonar.beam import BeamWindow
+
+LEAST_COHERENCE = 0.5
+"""Default of the smallest coherence with a valid height."""
+
+_LOOKS = 50.0  # in the default window: a deviation of 0.1 rad at a coherence of 0.7
+_CYCLE_SD = 3.3  # half a cycle, in deviations of the height that the magnitude shows: 0.1 % wrong
+_FALSE_ALARM = 1e-3  # share of incoherent windows that exceed the threshold of the sweep
+
+
+def heights(
+    a: RangeLines,
+    b: RangeLines,
+    grid: Grid,
+    *,
+    search_m: ArrayLike,
+    window_m: float | None = None,
+    tolerance_db: float = -40.0,
+    least_coherence: float = LEAST_COHERENCE,
+    beam: BeamWindow | None = None,
+    device: Device | str | int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Heights:
+    """Return the heights of a seabed, and their deviations, from two banks of receivers.
+
+    Parameters
+    ----------
+    a, b : RangeLines
+        Range lines of the two banks: the same pings, with receivers at different heights.
+    grid : Grid
+        Plane above which heights are measured, along z.
+    search_m : (lowest, highest)
+        Heights above the plane between which the seabed lies, metres.
+    window_m : float, optional
+        Side of the windows in which the coherence is estimated, metres. It is the resolution of the
+        heights. By default windows contain about 50 independent samples.
+    tolerance_db : float
+        Largest relative rms error of the images, dB, as for `factorize`.
+    least_coherence : float
+        Smallest coherence of a valid height, 0.1 to 0.99.
+    beam : BeamWindow, optional
+        Weights of the channels by aspect angle.
+    device : Device, str or int, optional
+        See `clsas.opencl.device.choose`.
+    progress : callable, optional
+        Called as progress(steps done, steps at most).
+
+    Returns
+    -------
+    Heights
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument has the wrong type or is outside its limits; if the banks have different
+        pings, carriers or range steps, no distance across the line of sight, or one so large that a
+        level seabed is not coherent; if the grid is no plane, or a vertical one; if the search
+        reaches the sonar or lies outside the range of the lines; or if a window contains fewer than
+        4 independent samples.
+    DeviceError
+        If the device does not exist.
+
+    Warns
+    -----
+    ClsasWarning
+        If the search spans several heights of ambiguity and the grid is too small to tell them
+        apart; if less than a hundredth of the pixels is coherent; or if the corrections do not fall
+        below the deviation.
+
+    See Also
+    --------
+    interferogram : Phase and coherence of two images.
+
+    Notes
+    -----
+    Banks whose receivers are apart see a scatterer from different elevations. If both images are
+    formed on a surface that passes e below the scatterer, the scatterer has the phase [1]_ ::
+
+        arg(a b*) = -e K / (1 - m.t),   K = 2 k D.t
+
+    where D is the gradient of the difference between the two ranges, t is the tangent of the curve
+    on which range and position along the track are constant, per metre of rise, and m is the slope
+    of the seabed. The height of ambiguity, 2 pi/K, changes the phase by a cycle.
+
+    The sweep images both banks at six heights per cycle, along those curves. At the height of the
+    scatterers the phase is zero, and the magnitude of the coherence is largest. Large windows
+    decide between cycles, small ones determine the height. Both banks are then imaged on the relief
+    that was found. In every window a plane is fitted to the height plus what the remaining phase
+    adds to it, until corrections are below 0.3 deviations. The reported deviation is ::
+
+        sd = (1 - m.t) / |K| sqrt((1 - g^2) / (2 L g^2))
+
+    with the coherence g and L independent samples.
+
+    Images are coregistered because they are formed in the time domain, and a sway or yaw of the
+    track is accounted for like any other motion. The mask leaves out what is not coherent, pixels
+    on none of the curves (shadow), and pixels on several or on slopes that face the sonar too
+    steeply (layover).
+
+    Errors that all pixels have in common are not part of the deviation. A constant phase between
+    the banks, as from a delay of one receiver, adds `Heights.m_per_rad` per radian. A roll of the
+    baseline by 1 mrad tilts the seabed by about 1 mrad.
+
+    References
+    ----------
+    .. [1] Rodriguez and Martin, "Theory and design of interferometric synthetic aperture radars",
+       IEE Proceedings F 139(2), 1992.
+
+    Examples
+    --------
+    A flat seabed 0.2 m above the plane of the grid, 20 m away:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> random = np.random.default_rng(1)
+    >>> places_m = random.uniform([-0.6, 19.4, 0.2], [0.6, 21.2, 0.2], (6000, 3))
+    >>> amplitudes = random.standard_normal((6000, 2)) @ [1, 1j]
+    >>> scene = clsas.PointTargets(places_m, amplitudes)
+    >>> tx_m = np.outer(np.linspace(-2, 2, 81), [1, 0, 0]) + [0, 0, 6]
+    >>> lower, upper = (
+    ...     clsas.simulate_lines(
+    ...         tx_m, tx_m + [0, 0, up_m], scene, carrier_hz=100e3, bandwidth_hz=30e3
+    ...     )
+    ...     for up_m in (0.0, 0.2)
+    ... )
+    >>> grid = clsas.Grid.plane((-0.4, 0.4, 33), (19.8, 20.6, 33))
+    >>> found = clsas.heights(lower, upper, grid, search_m=(-0.4, 0.6))
+    >>> print(f"{np.median(found.height_m[found.mask]):.2f} m")
+    0.20 m
+    """
+    check_pair(a, b)
+    validate.instance("grid", grid, Grid)
+    check_grid(grid)
+    grid = placed(b, placed(a, grid))
+    search = checked_search(search_m)
+    tolerance_db = validate.number(
+        "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
+    )
+    least_coherence = validate.number("least_coherence", least_coherence, least=0.1, most=0.99)
+    validate.instance("beam", beam, BeamWindow, type(None))
+    validate.progress(progress)
+    if window_m is not None:
+        window_m = validate.positive("window_m", window_m, "m")
+        window_within(grid, window_m)
+    pair = Pair(a, b, tolerance_db, None, beam, open_device(device))
+    return measure(pair, grid, search, window_m, least_coherence, progress)
+
+
+def measure(
+    pair: Pair,
+    grid: Grid,
+    search_m: tuple[float, float],
+    window_m: float | None,
+    least_coherence: float,
+    progress: Callable[[int, int], None] | None,
+) -> Heights:
+    """Return the heights that a pair of banks shows; parameters are those of `heights`."""
+    spectrum = measure_spectrum(pair.a)
+    cycles_per_m = float(cycles_per_m_at(pair.a, spectrum.centre))
+    band_cycles_per_m = 1 / (spectrum.oversampling * pair.a.range_step_m)
+    baseline = Baseline.of(pair.a, pair.b, pair.beam, cycles_per_m)
+    relative_band = band_cycles_per_m / abs(cycles_per_m)
+    ambiguity_m = check_geometry(baseline, grid, search_m, relative_band, least_coherence)
+
+    heights_m = _sweep_heights(search_m, ambiguity_m)
+    curves = Curves.over(baseline, grid, heights_m)
+    validate.memory("grid and search_m", 8 * len(heights_m) * curves.grid.size)
+    window, window_m, looks = _window(pair, grid, window_m)
+    check_looks(window_m, looks)
+    coarse = _coarse_window(looks, window, relative_band, least_coherence)
+    if len(heights_m) > STEPS_PER_CYCLE + 1:
+        _check_size(grid, coarse, ambiguity_m)
+
+    total = len(heights_m) + PASSES
+    report = progress or (lambda done, total: None)
+    found = sweep(pair, curves, window, coarse, lambda done: report(done, total))
+    threshold = max(least_coherence, float(noise_coherence(looks, _FALSE_ALARM / len(heights_m))))
+    relief = found.relief(grid.shape, found.coherence >= threshold, ambiguity_m)
+    refined = refine(
+        pair,
+        grid,
+        np.where(relief.surfaces == 1, relief.offset_m, np.nan),
+        sight_lattice(baseline, grid, search_m),
+        window,
+        looks,
+        least_coherence,
+        ambiguity_m,
+        lambda done: report(len(heights_m) + done, total),
+    )
+    report(total, total)
+    _warn(refined)
+    return Heights(
+        refined.offset_m,
+        refined.sd_m,
+        refined.coherence,
+        refined.valid,
+        refined.looks,
+        refined.m_per_rad,
+        refined.image,
+        window_m,
+    )
+
+
+def _sweep_heights(search_m: tuple[float, float], ambiguity_m: float) -> np.ndarray:
+    """Return heights a sixth of a cycle apart, one of them beyond either end of the search."""
+    step_m = ambiguity_m / STEPS_PER_CYCLE
+    count = math.ceil((search_m[1] - search_m[0]) / step_m) + 2
+    return sum(search_m) / 2 + step_m * (np.arange(count + 1) - count / 2)
+
+
+def _window(pair: Pair, grid: Grid, window_m: float | None) -> tuple[Window, float, float]:
+    """Return the window, its side in metres, and the number of looks in it."""
+    images = pair.images(grid)
+    if window_m is not None:
+        window = Window.of(grid, window_m)
+        return window, window_m, effective_looks(images, window)
+    _, *steps_m = grid.vectors_m
+    pixel_m = max(float(np.linalg.norm(step)) for step in steps_m)
+    side_m = min(n * float(np.linalg.norm(s)) for n, s in zip(grid.shape, steps_m, strict=True))
+    trial = Window.of(grid, min(9 * pixel_m, side_m))
+    density = effective_looks(images, trial) / trial.pixels
+    pixel_m2 = math.prod(float(np.linalg.norm(step)) for step in steps_m)
+    window_m = min(math.sqrt(_LOOKS * pixel_m2 / density), side_m)
+    window = Window.of(grid, window_m)
+    return window, window_m, density * window.pixels
+
+
+def _coarse_window(
+    looks: float, window: Window, relative_band: float, least_coherence: float
+) -> Window:
+    """Return the window that decides between cycles of the phase.
+
+    From the magnitude of the coherence alone, N looks determine the difference of two ranges to
+    sqrt(3/(2 N)) sqrt(1 - g^2)/(pi g) range resolutions (Bamler and Eineder 2005). Half a cycle is
+    half the relative bandwidth of a range resolution.
+    """
+    per_look = math.sqrt(1.5 * (1 - least_coherence**2)) / (math.pi * least_coherence)
+    needed = (_CYCLE_SD * per_look / (relative_band / 2)) ** 2
+    return window.scaled(math.sqrt(max(needed / looks, 1)))
+
+
+def _check_size(grid: Grid, coarse: Window, ambiguity_m: float) -> None:
+    """Warn if a grid is too small to tell the cycles of the phase apart."""
+    if coarse.rows > grid.shape[0] or coarse.columns > grid.shape[1]:
+        validate.warn(
+            f"the grid has {reprs.by(grid.shape)} pixels, and windows of {coarse.rows} x "
+            f"{coarse.columns} are needed to tell heights {ambiguity_m:.3g} m apart (the height of "
+            "ambiguity) where the coherence is low: make the grid larger, or search_m smaller"
+        )
+
+
+def _warn(refined: Refined) -> None:
+    share = float(refined.valid.mean())
+    if share < 0.01:
+        validate.warn(
+            f"only {100 * share:.2g} % of the pixels are coherent: the seabed may lie outside "
+            "search_m, or the positions of the banks may be wrong"
+        )
+    elif not refined.converged:
+        validate.warn(
+            f"after {PASSES} passes the heights still change by {refined.correction:.2g} standard "
+            "deviations: steep relief may need smaller windows"
+        )

@@ -1,0 +1,174 @@
+"""Heights from the phase that is left on a relief, pass by pass until it stands still."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.interferometry.baseline import Lattice
+from clsas.interferometry.coherence import (
+    Window,
+    debiased,
+    noise_coherence,
+    phase_sd_rad,
+)
+from clsas.interferometry.pair import Pair
+from clsas.interferometry.planes import edge_growth, fit_planes
+
+PASSES = 6
+"""Most passes. Two or three are usual."""
+
+_CONVERGED = 0.3  # rms correction, in standard deviations; it then adds 4 % to the deviation
+# Last correction of a pixel, in deviations, from which on it is not valid: its window reaches to
+# where the relief is unknown, and contains echoes of another height.
+_UNSETTLED = 2.0
+_MEDIAN = 0.6745  # median absolute deviation of a Gaussian
+_FALSE_ALARM = 1e-3  # share of incoherent windows that exceed the threshold of coherence
+# Rms distance of the relief from the plane of a window, in deviations. Noise of the heights makes
+# 0.1 % of the windows of level seabeds rougher; those across steps are rougher by far. A parabola
+# displaces the height in the middle by about as much as it makes the window rough.
+_MOST_ROUGHNESS = 3.0
+# Variance in the middle of a window relative to that of an evenly lit one. It is 4 at the edge of a
+# shadow, beyond which a plane would be extrapolated.
+_MOST_GROWTH = 3.0
+_LEAST_FORESHORTENING = 0.2  # steeper slopes towards the sonar count as layover
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """Heights above a plane, [rows, columns] each, after the last pass.
+
+    Attributes
+    ----------
+    offset_m, sd_m, coherence, looks, m_per_rad : float64
+    valid : bool
+    image : Image
+        Image of the first bank on the relief of the last pass.
+    correction : float
+        Rms of the last correction, in standard deviations.
+    """
+
+    offset_m: NDArray[np.float64]
+    sd_m: NDArray[np.float64]
+    coherence: NDArray[np.float64]
+    looks: NDArray[np.float64]
+    m_per_rad: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    image: Image
+    correction: float
+
+    @property
+    def converged(self) -> bool:
+        """True if the last correction is well below the deviation."""
+        return self.correction <= _CONVERGED
+
+
+def refine(
+    pair: Pair,
+    grid: Grid,
+    offset_m: NDArray[np.float64],
+    sights: Lattice,
+    window: Window,
+    looks: float,
+    least_coherence: float,
+    ambiguity_m: float,
+    progress: Callable[[int], None],
+) -> Refined:
+    """Return heights, starting from those of a sweep.
+
+    Parameters
+    ----------
+    pair : Pair
+    grid : Grid
+        The plane.
+    offset_m : float64 [rows, columns]
+        Heights above the plane, NaN where unknown.
+    sights : Lattice
+        K and the tangent of the curves, from `sight_lattice`.
+    window : Window
+    looks : float
+        Effective number of looks of a window on the plane. They must not be measured on a relief:
+        its small errors shift the phase of neighbouring pixels, which then seem uncorrelated.
+    least_coherence : float
+        Smallest coherence of a valid height.
+    ambiguity_m : float
+        Height of ambiguity. Corrections beyond a quarter of it are not credible.
+    progress : callable
+        Called with the number of passes done.
+    """
+    known = np.isfinite(offset_m)
+    # A slope that faces the sonar is imaged with more pixels per independent sample.
+    _, level = sensitivity(grid, np.zeros(grid.shape), np.zeros((2, *grid.shape)), sights)
+    level_growth = edge_growth(window, grid.shape)
+    looks_on_plane = looks * window.fullness(grid.shape) / level
+    relief_m = first_m = filled(offset_m, known)
+    slope_m = np.array(np.gradient(relief_m))
+    for done in range(1, PASSES + 1):
+        on_relief = grid.with_height(relief_m)
+        images = pair.images(on_relief)
+        rad_m, facing = sensitivity(grid, relief_m, slope_m, sights)
+        planes = fit_planes(images, relief_m, -1 / rad_m, window)
+        seen = looks_on_plane * np.maximum(facing, _LEAST_FORESHORTENING)
+        coherence = debiased(planes.coherence, seen)
+        sd_m = phase_sd_rad(coherence, seen / planes.growth) / np.abs(rad_m)
+        valid = known & (facing > _LEAST_FORESHORTENING)
+        valid &= coherence >= np.maximum(least_coherence, noise_coherence(seen, _FALSE_ALARM))
+        valid &= np.abs(planes.height_m - first_m) < ambiguity_m / 4
+        valid &= planes.growth < _MOST_GROWTH * level_growth
+        valid &= planes.roughness_m < _MOST_ROUGHNESS * sd_m
+        change = np.abs(planes.height_m - relief_m) / sd_m
+        # The median is not affected by the few pixels beside steps of the relief.
+        correction = float(np.median(change[valid])) / _MEDIAN if valid.any() else 0.0
+        settled = valid & (change < _UNSETTLED)
+        image = Image(images[0], on_relief)
+        found = Refined(
+            planes.height_m, sd_m, coherence, seen, -1 / rad_m, settled, image, correction
+        )
+        progress(done)
+        if found.converged:
+            break
+        relief_m = filled(planes.height_m, valid)
+        slope_m = np.stack([planes.row_slope_m, planes.column_slope_m])
+    return found
+
+
+def sensitivity(
+    grid: Grid,
+    offset_m: NDArray[np.float64],
+    slope_m: NDArray[np.float64],
+    sights: Lattice,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the change of phase per metre of height error, rad/m, and the foreshortening.
+
+    Parameters
+    ----------
+    grid : Grid
+        The plane.
+    offset_m : float64 [rows, columns]
+        Heights above it.
+    slope_m : float64 [2, rows, columns]
+        Their slopes, metres per row and per column.
+    sights : Lattice
+    """
+    _, row_step_m, column_step_m = grid.vectors_m
+    row, column = np.indices(grid.shape).astype(float)
+    found = sights.at(row, column, offset_m)
+    tilt = np.array([row_step_m[2], column_step_m[2]])[:, None, None]
+    facing = 1 - np.einsum("irc,rci->rc", slope_m + tilt, found[..., 1:])
+    return found[..., 0] / np.maximum(facing, _LEAST_FORESHORTENING), facing
+
+
+def filled(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return values in which unknown ones are those of the nearest known pixel, or 0 if none is."""
+    if known.all():
+        return values
+    if not known.any():
+        return np.zeros_like(values)
+    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return values[tuple(nearest)]

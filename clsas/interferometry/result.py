@@ -1,0 +1,121 @@
+"""Heights of a seabed, with their deviations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.core import reprs, validate
+from clsas.core.georeference import Georeference
+from clsas.core.image import Image
+
+
+@dataclass(frozen=True, eq=False)
+class Heights:
+    """Heights of a seabed above a plane, pixel by pixel, with their standard deviations.
+
+    Attributes
+    ----------
+    height_m : float64 [rows, columns]
+        Height above the plane of the grid, metres along z. NaN outside the mask.
+    sd_m : float64 [rows, columns]
+        Standard deviation of the height, metres. NaN outside the mask. It contains the noise of
+        the phase, but not errors that all pixels have in common, such as those of the positions of
+        the banks; see `m_per_rad`.
+    coherence : float64 [rows, columns]
+        Magnitude of the coherence of both banks on the relief, 0 to 1, without bias.
+    mask : bool [rows, columns]
+        True where the height is valid. False in shadow, in layover and where the images are not
+        coherent. Nothing is filled in there.
+    looks : float64 [rows, columns]
+        Effective number of independent samples behind each height.
+    m_per_rad : float64 [rows, columns]
+        Change of the height per radian of phase between the banks, metres. A constant error of the
+        phase displaces all heights by so much.
+    image : Image
+        Image of the first bank on the relief. Its grid has the heights of the last pass but one,
+        which differ from `height_m` by less than its deviation, and the nearest valid height
+        outside the mask, because a pixel must lie somewhere.
+    window_m : float
+        Side of the windows, metres.
+
+    See Also
+    --------
+    heights : Function that returns this result.
+    """
+
+    height_m: NDArray[np.float64]
+    sd_m: NDArray[np.float64]
+    coherence: NDArray[np.float64]
+    mask: NDArray[np.bool_]
+    looks: NDArray[np.float64]
+    m_per_rad: NDArray[np.float64]
+    image: Image
+    window_m: float
+
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
+
+        def __init__(
+            self,
+            height_m: ArrayLike,
+            sd_m: ArrayLike,
+            coherence: ArrayLike,
+            mask: ArrayLike,
+            looks: ArrayLike,
+            m_per_rad: ArrayLike,
+            image: Image,
+            window_m: float,
+        ) -> None: ...
+
+    def __post_init__(self) -> None:
+        """Check every field and convert it."""
+
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        validate.instance("image", self.image, Image)
+        put("window_m", validate.positive("window_m", self.window_m, "m"))
+        shape = self.image.shape
+        mask = np.asarray(self.mask)
+        if mask.dtype != np.bool_ or mask.shape != shape:
+            raise ValueError(
+                f"mask must be bools of shape {shape}, got {mask.dtype} of shape {mask.shape}"
+            )
+        put("mask", _read_only(mask))
+        for name in ("coherence", "looks", "m_per_rad"):
+            put(name, validate.array(name, getattr(self, name), np.float64, shape))
+        for name in ("height_m", "sd_m"):
+            given = np.asarray(getattr(self, name))
+            if given.shape == shape and given.dtype.kind == "f":
+                validate.array(f"{name} within the mask", given[mask], np.float64, None)
+                given = np.where(mask, given, np.nan)
+                put(name, _read_only(given.astype(np.float64)))
+            else:  # raises
+                validate.array(name, given, np.float64, shape)
+
+    def __repr__(self) -> str:
+        """Return the shape, the valid share, the span of heights and the median deviation."""
+        valid = f"{100 * self.mask.mean():.3g} % valid"
+        parts: tuple[str, ...] = ()
+        if self.mask.any():
+            known_m = self.height_m[self.mask]
+            low_m, high_m = round(float(known_m.min()), 4), round(float(known_m.max()), 4)
+            parts = (
+                f"height {reprs.span(low_m, high_m, 'm')}",
+                f"median deviation {reprs.quantity(float(np.median(self.sd_m[self.mask])), 'm')}",
+            )
+        return reprs.summary(self, f"{reprs.by(self.mask.shape)} pixels", valid, *parts)
+
+    @property
+    def georeference(self) -> Georeference | None:
+        """Georeference of the grid; None if unknown."""
+        return self.image.georeference
+
+
+def _read_only(values: NDArray) -> NDArray:
+    view = np.ascontiguousarray(values).view()
+    view.flags.writeable = False
+    return view

@@ -1,0 +1,268 @@
+"""First heights of a seabed: where along curves of equal range the two banks agree.
+
+Both banks are imaged at many heights along the curves on which a scatterer keeps its range and its
+position along the track (`clsas.interferometry.baseline`). Every curve shows the same speckle at
+all heights, so its coherence is largest at the height of the scatterers: there the phase is zero,
+and the ranges of both banks agree to a fraction of the resolution. On horizontal planes, by
+contrast, a wrong height shows the speckle of another place, which may be brighter and therefore
+more coherent.
+
+The phase repeats with the height of ambiguity, and the magnitude of the coherence falls so slowly
+that a window of tens of looks may not tell the cycles apart. So the heights at which the phase is
+zero are candidates, and a larger window decides between them: for every height, the largest
+coherence within half a height of ambiguity is averaged over that window. The relief may therefore
+vary by most of a height of ambiguity within the large window, and the resolution of heights remains
+that of the small one. Nothing is unwrapped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates, maximum_filter1d
+
+from clsas.core.grid import Grid
+from clsas.interferometry.baseline import Baseline, Lattice, in_pixels, lattice_pixels
+from clsas.interferometry.coherence import Moments, Window
+from clsas.interferometry.pair import Pair
+
+STEPS_PER_CYCLE = 6
+"""Heights per height of ambiguity. With 4, phases between two heights are so large that the
+magnitude of the coherence misleads; 8 takes longer and finds the same heights."""
+
+_CANDIDATE_RAD = (
+    1.3 * math.pi / STEPS_PER_CYCLE
+)  # phase at the height nearest to a zero, and margin
+_LEAST_SPACE = 3  # pixels beyond the outermost curve
+_PIXELS_AT_ONCE = 1 << 20  # of all heights that are imaged together; their positions take 24 MiB
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Curves of equal range through the pixels of a plane.
+
+    Attributes
+    ----------
+    grid : Grid
+        The plane. It extends beyond the pixels whose heights are wanted, so that every pixel at
+        every height lies on a curve through it.
+    corner : (row, column)
+        The pixel of `grid` that is the first of the wanted ones.
+    offset_m : float64 [heights]
+        Heights above the plane.
+    lattice : Lattice
+        Displacement of a curve, in rows and columns, and K (rad/m), at every height.
+    """
+
+    grid: Grid
+    corner: tuple[int, int]
+    offset_m: NDArray[np.float64]
+    lattice: Lattice
+
+    @classmethod
+    def over(cls, baseline: Baseline, grid: Grid, offset_m: NDArray[np.float64]) -> Self:
+        """Return the curves that reach a plane's pixels at any of the heights."""
+        reach = _traced(baseline, grid, offset_m).values[..., :2].reshape(-1, 2)
+        before = (np.ceil(np.maximum(reach.max(axis=0), 0)) + _LEAST_SPACE).astype(int)
+        after = (np.ceil(np.maximum(-reach.min(axis=0), 0)) + _LEAST_SPACE).astype(int)
+        origin_m, row_step_m, column_step_m = grid.vectors_m
+        wide = replace(
+            grid,
+            origin_m=origin_m - before[0] * row_step_m - before[1] * column_step_m,
+            shape=tuple(np.array(grid.shape) + before + after),
+        )
+        corner = int(before[0]), int(before[1])
+        return cls(wide, corner, offset_m, _traced(baseline, wide, offset_m))
+
+    def points_m(self, index: int) -> NDArray[np.float64]:
+        """Return the positions of all curves at a height, float64 [rows, columns, 3]."""
+        _, row_step_m, column_step_m = self.grid.vectors_m
+        shift = self._everywhere(index)
+        points_m = self.grid.positions_m()
+        points_m[..., :2] += shift[..., :1] * row_step_m[:2] + shift[..., 1:2] * column_step_m[:2]
+        points_m[..., 2] += self.offset_m[index]
+        return points_m
+
+    def rad_m(self, index: int) -> NDArray[np.float64]:
+        """Return K of all curves at a height, rad/m, float64 [rows, columns]."""
+        return self._everywhere(index)[..., 2]
+
+    def _everywhere(self, index: int) -> NDArray[np.float64]:
+        """Return the values of the lattice at every curve, at a height."""
+        known = self.lattice.rows, self.lattice.columns
+        places = (
+            np.interp(np.arange(n), at, np.arange(len(at)))
+            for n, at in zip(self.grid.shape, known, strict=True)
+        )
+        where = np.meshgrid(*places, indexing="ij")
+        level = np.moveaxis(self.lattice.values[:, :, index], -1, 0)
+        return np.stack([map_coordinates(each, where, order=1) for each in level], axis=-1)
+
+    def through(self, index: int, shape: tuple[int, ...]) -> tuple[NDArray, NDArray]:
+        """Return the curves that pass through the wanted pixels at a height, as rows and columns.
+
+        Displacements vary slowly, so few iterations find the curve.
+        """
+        pixel = np.indices(shape).astype(float) + np.array(self.corner)[:, None, None]
+        level = replace(
+            self.lattice,
+            offset_m=self.offset_m[index : index + 1],
+            values=self.lattice.values[:, :, index : index + 1],
+        )
+        curve = pixel
+        for _ in range(3):
+            shift = level.at(curve[0], curve[1], 0.0)
+            curve = pixel - np.moveaxis(shift[..., :2], -1, 0)
+        return curve[0], curve[1]
+
+
+def _traced(baseline: Baseline, grid: Grid, offset_m: NDArray[np.float64]) -> Lattice:
+    """Return the displacement and K of curves through a few pixels of a plane (midpoint rule)."""
+    rows, columns = lattice_pixels(grid)
+    start_m = grid.positions_m()[np.ix_(rows, columns)].reshape(-1, 3)
+
+    def rising(points_m: NDArray[np.float64], rise_m: float) -> NDArray[np.float64]:
+        tangent = baseline.sight(points_m).tangent
+        return rise_m * np.column_stack([tangent, np.ones(len(tangent))])
+
+    values = np.empty((len(start_m), len(offset_m), 3))
+    upwards = [i for i, z in enumerate(offset_m) if z >= 0]
+    downwards = [i for i, z in enumerate(offset_m) if z < 0][::-1]
+    for indices in (upwards, downwards):
+        points_m, height_m = start_m, 0.0
+        for index in indices:
+            rise_m = float(offset_m[index]) - height_m
+            middle_m = points_m + rising(points_m, rise_m / 2)
+            points_m, height_m = points_m + rising(middle_m, rise_m), float(offset_m[index])
+            values[:, index, :2] = in_pixels(grid, (points_m - start_m)[:, :2])
+            values[:, index, 2] = baseline.sight(points_m).rad_m
+    shape = (len(rows), len(columns), len(offset_m), 3)
+    return Lattice(rows.astype(float), columns.astype(float), offset_m, values.reshape(shape))
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """Most likely height of the scatterers on every curve.
+
+    Attributes
+    ----------
+    curves : Curves
+    offset_m : float64 [rows, columns]
+        Height above the plane.
+    coherence : float64 [rows, columns]
+        Magnitude of the sample coherence at the height.
+    """
+
+    curves: Curves
+    offset_m: NDArray[np.float64]
+    coherence: NDArray[np.float64]
+
+    def relief(
+        self, shape: tuple[int, ...], reliable: NDArray[np.bool_], ambiguity_m: float
+    ) -> Relief:
+        """Return the heights of the wanted pixels.
+
+        A pixel has the height at which it lies on a curve whose scatterers have that height. In
+        shadow there is none, and in layover there are several.
+
+        Parameters
+        ----------
+        shape : (rows, columns)
+        reliable : bool [rows, columns]
+            Curves whose height counts.
+        ambiguity_m : float
+            Height of ambiguity. Heights that differ by more than half of it are not neighbours on
+            one surface.
+        """
+        found = np.where(reliable, self.offset_m, np.nan)
+        count, height_m = np.zeros(shape, int), np.full(shape, np.nan)
+        below, last_m = np.full(shape, np.nan), 0.0
+        for index, offset_m in enumerate(self.curves.offset_m):
+            at = self.curves.through(index, shape)
+            above = map_coordinates(found, at, order=1, cval=np.nan) - offset_m
+            with np.errstate(invalid="ignore"):
+                crossed = (below >= 0) & (above < 0) & (below - above < ambiguity_m / 2)
+            share = below[crossed] / (below - above)[crossed]
+            height_m[crossed] = last_m + share * (offset_m - last_m)
+            count += crossed
+            below, last_m = above, float(offset_m)
+        return Relief(height_m, count)
+
+
+@dataclass(frozen=True, eq=False)
+class Relief:
+    """Heights of pixels above a plane.
+
+    Attributes
+    ----------
+    offset_m : float64 [rows, columns]
+        The only or the highest surface; NaN where there is none.
+    surfaces : int [rows, columns]
+        Number of surfaces: 0 in shadow and where images are not coherent, several in layover.
+    """
+
+    offset_m: NDArray[np.float64]
+    surfaces: NDArray[np.int64]
+
+
+def sweep(
+    pair: Pair,
+    curves: Curves,
+    window: Window,
+    coarse: Window,
+    progress: Callable[[int], None],
+) -> Sweep:
+    """Return the most likely height along every curve.
+
+    Parameters
+    ----------
+    pair : Pair
+    curves : Curves
+    window : Window
+        Window of the heights.
+    coarse : Window
+        Window that decides between cycles of the phase.
+    progress : callable
+        Called with the number of heights done.
+    """
+    grid, offset_m = curves.grid, curves.offset_m
+    coherence = np.empty((len(offset_m), *grid.shape), np.complex64)
+    at_once = max(_PIXELS_AT_ONCE // grid.size, 1)
+    for first in range(0, len(offset_m), at_once):
+        some = range(first, min(first + at_once, len(offset_m)))
+        slab = Grid.points(
+            np.stack([curves.points_m(index) for index in some]), georeference=grid.georeference
+        )
+        for index, a, b in zip(some, *pair.images(slab), strict=True):
+            coherence[index] = Moments.of(a, b, window).coherence
+        progress(some[-1] + 1)
+    best = likeliest(coherence, coarse)
+    found = np.take_along_axis(coherence, best[None], axis=0)[0].astype(np.complex128)
+    rad_m = np.empty(grid.shape)
+    for level in np.unique(best):
+        rad_m[best == level] = curves.rad_m(level)[best == level]
+    return Sweep(curves, offset_m[best] - np.angle(found) / rad_m, np.abs(found))
+
+
+def likeliest(coherence: NDArray[np.complex64], coarse: Window) -> NDArray[np.intp]:
+    """Return the index of the most likely height for every pixel, [rows, columns].
+
+    Parameters
+    ----------
+    coherence : complex64 [heights, rows, columns]
+        Coherence in small windows, at `STEPS_PER_CYCLE` heights per cycle of the phase.
+    coarse : Window
+        Window that decides between cycles.
+    """
+    magnitude = np.abs(coherence)
+    candidate = np.abs(np.angle(coherence)) <= _CANDIDATE_RAD
+    score = np.where(candidate, magnitude, coherence.real)
+    cycle = maximum_filter1d(score, STEPS_PER_CYCLE + 1, axis=0, mode="nearest")
+    support = coarse.sums(cycle) / (coarse.pixels * coarse.fullness(score.shape[1:]))
+    # Where two neighbouring heights are candidates of the same cycle, the closer one counts.
+    return np.where(candidate, support + 1e-3 * coherence.real, -1).argmax(axis=0)

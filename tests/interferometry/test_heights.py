@@ -1,0 +1,329 @@
+"""Heights of simulated reliefs against the reliefs themselves."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from reliefs import GRID, banks, flat_banks, truth
+
+import clsas
+from clsas.core.validate import ClsasWarning
+from clsas.interferometry.heights import heights, measure
+from clsas.interferometry.pair import Pair
+from clsas.opencl.device import open_device
+
+AMBIGUITY_M = 2.06  # 2 pi R/(k B): a wavelength of 15 mm, 34.2 m of range, 0.25 m between the banks
+WINDOW_M = 0.22
+COHERENT = 0.7
+SEEDS = (
+    1,
+    2,
+)  # a scene has about 80 independent windows, so the mean of one varies by 0.11 deviations
+
+
+def flat(x, y):
+    return 0 * x + 0 * y
+
+
+def facing(x, y):
+    return 0.5 * (y - 32) + 0 * x
+
+
+def averted(x, y):
+    return -0.25 * (y - 32) + 0 * x
+
+
+def across(x, y):
+    return 0.5 * x + 0 * y
+
+
+def dunes(x, y):
+    return 0.15 * np.sin(2 * np.pi * (y - 32) / 3) + 0.05 * x
+
+
+def rock(x, y):
+    return 0.3 * np.exp(-2 * (x**2 + (y - 32) ** 2))
+
+
+def step(x, y):
+    return 1.5 * AMBIGUITY_M * (x > 0) + 0 * y
+
+
+SCENES = {
+    "flat": (flat, {}),
+    "facing": (facing, {}),
+    "averted": (averted, {}),
+    "across": (across, {}),
+    "dunes": (dunes, {}),
+    "rock": (rock, {}),
+    "step": (step, {}),
+    "sway and roll": (dunes, {"sway_m": 0.1, "roll_rad": 0.05}),
+}
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """Errors of every scene at two levels of noise, computed once from several seeds each."""
+    found = {}
+
+    def of(name, snr_db):
+        if (name, snr_db) not in found:
+            relief, options = SCENES[name]
+            search_m = (-1.0, 4.0) if relief is step else (-1.5, 1.5)
+            results = [
+                heights(
+                    *banks(relief, snr_db=snr_db, seed=seed, **options), GRID,
+                    search_m=search_m, window_m=WINDOW_M,
+                )
+                for seed in SEEDS
+            ]  # fmt: skip
+            found[name, snr_db] = Errors(
+                *(
+                    np.stack(each)
+                    for each in zip(
+                        *(
+                            (r.height_m - truth(relief), r.sd_m, r.mask, r.coherence)
+                            for r in results
+                        ),
+                        strict=True,
+                    )
+                )
+            )
+        return found[name, snr_db]
+
+    return of
+
+
+class Errors(NamedTuple):
+    """Errors of heights, [seeds, rows, columns]."""
+
+    error_m: np.ndarray
+    sd_m: np.ndarray
+    mask: np.ndarray
+    coherence: np.ndarray
+
+
+def coherent(result):
+    return result.mask & (result.coherence > COHERENT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("snr_db", [17, 7])
+@pytest.mark.parametrize("name", SCENES)
+def test_errors_are_as_large_as_predicted(measured, name, snr_db):
+    result = measured(name, snr_db)
+    some = coherent(result)
+    # The side of the dunes and the rock that faces away is too dark at 7 dB.
+    assert some.mean() > (0.8 if snr_db == 17 else 0.5)
+    rms_m, predicted_m = (
+        np.sqrt(np.mean(each[some] ** 2)) for each in (result.error_m, result.sd_m)
+    )
+    assert 0.7 * predicted_m < rms_m < 1.3 * predicted_m
+    assert abs(np.mean(result.error_m[some] / result.sd_m[some])) < 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("snr_db", [17, 7])
+def test_intervals_contain_the_truth_as_often_as_they_say(measured, snr_db):
+    inside = []
+    for name in SCENES:
+        result = measured(name, snr_db)
+        some = coherent(result)
+        inside.append(np.mean(np.abs(result.error_m[some]) < 1.96 * result.sd_m[some]))
+    assert 0.93 < np.mean(inside) < 0.97
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("snr_db", [17, 7])
+def test_no_cycle_is_wrong(measured, snr_db):
+    for name in SCENES:
+        result = measured(name, snr_db)
+        wrong = np.abs(result.error_m[result.mask]) > AMBIGUITY_M / 2
+        assert wrong.mean() < 0.005
+
+
+@pytest.mark.slow
+def test_relief_of_several_heights_of_ambiguity():
+    def tall(x, y):
+        return 1.0 * np.sin(2 * np.pi * (y - 32) / 12) + 0.1 * np.sin(np.pi * x)
+
+    grid = clsas.Grid.plane((-0.5, 0.5, 51), (29, 35, 301))
+    extent_m = (-0.9, 0.9), (27.5, 36.5)
+    lines = banks(tall, snr_db=10, extent_m=extent_m, baseline_m=1.5)
+    result = heights(*lines, grid, search_m=(-1.3, 1.3), window_m=0.18)
+    some = coherent(result)
+    assert some.mean() > 0.7
+    ambiguity_m = 2 * np.pi * np.median(np.abs(result.m_per_rad))
+    error_m = result.height_m - truth(tall, grid)
+    assert np.ptp(truth(tall, grid)) > 5.8 * ambiguity_m
+    assert np.mean(np.abs(error_m[result.mask]) > ambiguity_m / 2) < 0.005
+    rms_m, predicted_m = (np.sqrt(np.mean(each[some] ** 2)) for each in (error_m, result.sd_m))
+    assert rms_m < 1.3 * predicted_m
+
+
+@pytest.mark.slow
+def test_the_tolerance_adds_little_to_the_deviation():
+    lines = banks(dunes, snr_db=17)
+    device = open_device()
+    errors_m = []
+    for tolerance_db, accuracy_db in ((-40.0, None), (None, -70.0)):
+        pair = Pair(*lines, tolerance_db, accuracy_db, None, device)
+        result = measure(pair, GRID, (-1.0, 1.0), WINDOW_M, 0.5, None)
+        some = coherent(result)
+        errors_m.append(np.sqrt(np.mean((result.height_m - truth(dunes))[some] ** 2)))
+    assert errors_m[0] < 1.1 * errors_m[1]
+
+
+@pytest.mark.slow
+def test_low_coherence_is_masked():
+    # A signal-to-noise ratio of q gives a coherence of q/(1 + q).
+    lines = banks(flat, snr_db=10 * np.log10(0.3 / 0.7))
+    with pytest.warns(ClsasWarning, match="of the pixels are coherent"):
+        result = heights(*lines, GRID, search_m=(-1.5, 1.5), window_m=WINDOW_M)
+    assert result.mask.mean() < 0.01
+    assert np.isnan(result.height_m[~result.mask]).all()
+    assert np.isnan(result.sd_m[~result.mask]).all()
+    assert np.median(result.coherence) < 0.45
+
+
+@pytest.mark.slow
+def test_shadow_and_layover_are_masked():
+    def cliff(x, y):
+        return 1.0 * (y < 31.6) + 0 * x
+
+    def wall(x, y):
+        return 1.0 * (y > 32.4) + 0 * x
+
+    shadow = heights(*banks(cliff, snr_db=17), GRID, search_m=(-1.0, 2.0), window_m=WINDOW_M)
+    # At a depression of 19 degrees, 1 m casts a shadow of 2.9 m.
+    dark = truth(lambda x, y: y + 0 * x) > 31.6
+    assert shadow.mask[dark].mean() < 0.01
+    assert shadow.mask[truth(lambda x, y: y + 0 * x) < 31.5].mean() > 0.9
+
+    layover = heights(*banks(wall, snr_db=17), GRID, search_m=(-1.0, 2.0), window_m=WINDOW_M)
+    # The top of the wall lies at the range of the ground 0.38 m in front of it.
+    place = truth(lambda x, y: y + 0 * x)
+    mixed = (place > 32.1) & (place < 32.7)
+    assert layover.mask[mixed].mean() < 0.2
+    error_m = (layover.height_m - truth(wall))[layover.mask]
+    assert np.mean(np.abs(error_m) > 5 * layover.sd_m[layover.mask]) < 0.005
+
+
+def test_results_describe_themselves():
+    result = heights(*flat_banks(), GRID, search_m=(-0.5, 0.5))
+    assert 0.2 < result.window_m < 0.4
+    assert 30 < np.median(result.looks) < 70
+    assert "x 81 pixels" in repr(result)
+    assert "% valid, height -0.0" in repr(result)
+    assert result.image.grid.height_m is not None
+    expected = AMBIGUITY_M / (2 * np.pi)
+    assert np.median(np.abs(result.m_per_rad)) == pytest.approx(expected, rel=0.03)
+    assert not result.height_m.flags.writeable
+    assert not result.mask.flags.writeable
+
+
+def test_banks_in_the_other_order_give_the_same_heights():
+    first, second = flat_banks()
+    one = heights(first, second, GRID, search_m=(-0.5, 0.5), window_m=WINDOW_M)
+    other = heights(second, first, GRID, search_m=(-0.5, 0.5), window_m=WINDOW_M)
+    both = one.mask & other.mask
+    assert both.mean() > 0.95
+    assert np.abs(one.height_m - other.height_m)[both].max() < 0.5 * one.sd_m[both].max()
+
+
+def test_planes_and_georeferences_carry_over():
+    first, second = flat_banks()
+    place = clsas.Georeference.local(60.39, 5.32, heading_deg=90)
+    plane = clsas.Grid.oriented([-0.6, 31.0, -0.3], [0, 0.02, 0.002], [0.02, 0, -0.002], (81, 61))
+    result = heights(
+        replace(first, georeference=place), replace(second, georeference=place), plane,
+        search_m=(-0.5, 0.8), window_m=WINDOW_M,
+    )  # fmt: skip
+    assert result.georeference == place
+    assert result.mask.mean() > 0.95
+    error_m = result.height_m + plane.positions_m()[..., 2]  # the seabed lies at z = 0
+    some = result.mask
+    assert np.sqrt(np.mean((error_m[some] / result.sd_m[some]) ** 2)) < 1.3
+
+
+def test_progress_counts_to_its_total():
+    calls = []
+    heights(
+        *flat_banks(), GRID, search_m=(-0.5, 0.5), window_m=WINDOW_M,
+        progress=lambda done, total: calls.append((done, total)),
+    )  # fmt: skip
+    done, totals = zip(*calls, strict=True)
+    assert list(done) == sorted(done)
+    assert len(set(totals)) == 1
+    assert done[-1] == totals[-1]
+
+
+class TestBadInput:
+    def refused(self, match, a=None, b=None, grid=GRID, error=ValueError, **options):
+        first, second = flat_banks()
+        given = {"search_m": (-0.5, 0.5)} | options
+        with pytest.raises(error, match=match):
+            heights(first if a is None else a, second if b is None else b, grid, **given)
+
+    def test_different_pings(self):
+        _, second = flat_banks()
+        self.refused("same pings.*120 pings.*119 pings", b=second.select(slice(1, None)))
+        order = np.r_[1, 0, 2 : second.channels]
+        self.refused("same pings in the same order.*channel", b=second.select(order))
+
+    def test_other_carrier(self):
+        _, second = flat_banks()
+        self.refused("same carrier_hz", b=replace(second, carrier_hz=90e3))
+
+    def test_silence(self):
+        first, _ = flat_banks()
+        self.refused("b must contain echoes", b=replace(first, samples=0 * first.samples))
+
+    def test_no_baseline(self):
+        first, _ = flat_banks()
+        self.refused("apart across the line of sight", b=first)
+        along = replace(first, rx_m=first.rx_m + [0.3, 0, 0])
+        self.refused("apart across the line of sight", b=along)
+
+    def test_baseline_too_long(self):
+        first, _ = flat_banks()
+        far = replace(first, rx_m=first.rx_m + [0, 0, 40.0])
+        self.refused("closer together: at 40 m between the banks", b=far)
+
+    def test_search(self):
+        self.refused("must end below the sonar, which is 12 m", search_m=(-1, 12.5))
+        self.refused("within the range of the lines", search_m=(-60, 1))
+        self.refused("lowest, highest", search_m=(1, -1))
+        self.refused("search_m must have shape", search_m=(1, 2, 3))
+        self.refused("search_m must be finite", search_m=(np.nan, 1))
+
+    def test_grids(self):
+        raised = GRID.with_height(np.zeros(GRID.shape))
+        self.refused("grid must be a plane.*a height map", grid=raised)
+        points = clsas.Grid.points(GRID.positions_m())
+        self.refused("grid must be a plane.*arbitrary points", grid=points)
+        upright = clsas.Grid.oriented([-1, 32, -1], [0, 0, 0.02], [0.02, 0, 0], (99, 99))
+        self.refused("a vertical one", grid=upright)
+        narrow = clsas.Grid.plane((0, 1, 51), (32, 32, 1))
+        self.refused("at least 2 rows and 2 columns", grid=narrow)
+        self.refused("grid must be of type Grid", grid=1, error=TypeError)
+
+    def test_windows_and_limits(self):
+        self.refused("at least 4 independent samples", window_m=0.03)
+        self.refused("window_m must be finite and > 0 and <= 1.62 m", window_m=3.0)
+        self.refused("least_coherence must be", least_coherence=1.5)
+        self.refused("tolerance_db must be", tolerance_db=-5)
+        self.refused("beam must be of type", beam=20, error=TypeError)
+        self.refused("a must be of type RangeLines", a=3, error=TypeError)
+
+    def test_nothing_coherent(self):
+        first, second = flat_banks()
+        random = np.random.default_rng(4)
+        noise = (random.standard_normal((*second.samples.shape, 2)) @ [1, 1j]).astype(np.complex64)
+        with pytest.warns(ClsasWarning, match="of the pixels are coherent"):
+            result = heights(
+                first, replace(second, samples=noise), GRID, search_m=(-0.5, 0.5),
+                window_m=WINDOW_M,
+            )  # fmt: skip
+        assert result.mask.mean() < 0.01
