@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import conditioning, pings, reprs, validate
 from clsas.core.georeference import Georeference
+from clsas.core.sound_speed import SoundSpeed
 
 _PER_CHANNEL = ("first_range_m", "tx_m", "rx_m", "rx_velocity_m_s", "look_direction")
 GOLDEN = (np.sqrt(5) - 1) / 2
@@ -59,6 +60,10 @@ class RangeLines:
         warn if pixels lie behind the elements.
     georeference : Georeference, optional
         Where the coordinates lie on Earth. Images of these lines have it too.
+    sound_speed : SoundSpeed, optional
+        Sound speed over depth. Imagers then account for refraction, and `sound_speed_m_s` only
+        converts times to ranges: range r belongs to the two-way delay 2 r / sound_speed_m_s. None
+        means that the speed is `sound_speed_m_s` everywhere.
 
     Raises
     ------
@@ -107,6 +112,7 @@ class RangeLines:
     rx_velocity_m_s: NDArray[np.float64] | None = None
     look_direction: NDArray[np.float64] | None = None
     georeference: Georeference | None = None
+    sound_speed: SoundSpeed | None = None
 
     if TYPE_CHECKING:  # the constructor converts array_like arguments
 
@@ -122,6 +128,7 @@ class RangeLines:
             rx_velocity_m_s: ArrayLike | None = None,
             look_direction: ArrayLike | None = None,
             georeference: Georeference | None = None,
+            sound_speed: SoundSpeed | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -374,6 +381,7 @@ def checked_channels(received: Any, start: str) -> dict[str, Any]:
         If a field has the wrong type or shape, or is outside its limits.
     """
     validate.instance("georeference", received.georeference, Georeference, type(None))
+    validate.instance("sound_speed", received.sound_speed, SoundSpeed, type(None))
     channels = received.samples.shape[0]
     shapes: dict[str, tuple[int, ...]] = {start: (channels,)}
     shapes |= {"tx_m": (channels, 3), "rx_m": (channels, 3)}
@@ -392,6 +400,9 @@ def checked_channels(received: Any, start: str) -> dict[str, Any]:
         validate.number("the speed of rx_velocity_m_s", fastest_m_s, "m/s", below=speed_m_s)
     if "look_direction" in checked:
         checked["look_direction"] = _unit_vectors("look_direction", checked["look_direction"])
+    if received.sound_speed is not None:
+        for name in ("tx_m", "rx_m"):
+            received.sound_speed.check_reaches(checked[name][:, 2], name)
     return checked
 
 

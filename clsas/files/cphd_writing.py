@@ -60,7 +60,7 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
     TypeError
         If `lines` are not range lines.
     ValueError
-        If the lines have receiver velocities, or the file's name has another suffix.
+        If the lines have receiver velocities or a profile of the sound speed, or the file's name has another suffix.
     ImportError
         If sarkit is not installed (extra `radar`).
     OSError
@@ -96,6 +96,8 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
         raise ValueError(
             "lines must not have rx_velocity_m_s: CPHD cannot describe motion during flight"
         )
+    if lines.sound_speed is not None:
+        raise ValueError("lines must not have sound_speed: CPHD assumes straight rays")
     origin_m = np.rint(lines.phase_centres_m.mean(axis=0))
     origin_m *= np.abs(origin_m).max() > _NEAR_M
     vectors, signal = _vectors(lines, origin_m)

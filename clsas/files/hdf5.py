@@ -24,6 +24,7 @@ from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
+from clsas.core.sound_speed import SoundSpeed
 from clsas.signal.echoes import Echoes
 from clsas.sonar.system import Pulse
 
@@ -36,6 +37,7 @@ _KINDS = {
     "echoes": Echoes,
     "pulse": Pulse,
     "georeference": Georeference,
+    "sound_speed": SoundSpeed,
 }
 _SAVED = (Grid, RangeLines, Image, Echoes)
 

@@ -168,6 +168,7 @@ def compress(
         rx_velocity_m_s=echoes.rx_velocity_m_s,
         look_direction=echoes.look_direction,
         georeference=echoes.georeference,
+        sound_speed=echoes.sound_speed,
     )
 
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.core import reprs, validate
 from clsas.core.georeference import Georeference
 from clsas.core.lines import checked_channels
+from clsas.core.sound_speed import SoundSpeed
 from clsas.sonar.system import Pulse
 
 
@@ -48,6 +49,8 @@ class Echoes:
         Direction in which the beam of each channel looks, as for `RangeLines`.
     georeference : Georeference, optional
         Where the coordinates lie on Earth.
+    sound_speed : SoundSpeed, optional
+        Sound speed over depth, as for `RangeLines`.
 
     Raises
     ------
@@ -81,6 +84,7 @@ class Echoes:
     rx_velocity_m_s: NDArray[np.float64] | None = None
     look_direction: NDArray[np.float64] | None = None
     georeference: Georeference | None = None
+    sound_speed: SoundSpeed | None = None
 
     if TYPE_CHECKING:  # the constructor converts array_like arguments
 
@@ -97,6 +101,7 @@ class Echoes:
             rx_velocity_m_s: ArrayLike | None = None,
             look_direction: ArrayLike | None = None,
             georeference: Georeference | None = None,
+            sound_speed: SoundSpeed | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:
