@@ -1,4 +1,4 @@
-"""Sound speed that varies with depth: profiles, and the speed that temperature and salinity give."""
+"""Sound speed that varies with depth, measured or from temperature and salinity."""
 
 from __future__ import annotations
 

@@ -60,7 +60,8 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
     TypeError
         If `lines` are not range lines.
     ValueError
-        If the lines have receiver velocities or a profile of the sound speed, or the file's name has another suffix.
+        If the lines have receiver velocities or a profile of the sound speed, or the file's name
+        has another suffix.
     ImportError
         If sarkit is not installed (extra `radar`).
     OSError
