@@ -9,7 +9,7 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, read_beam, read_grid, read_request
+from clsas.cli.inputs import load_lines, read_beam, read_grid, read_request
 from clsas.cli.outputs import json_able, report
 from clsas.cli.parameters import INPUT
 from clsas.files.cphd import START as CPHD
@@ -67,7 +67,7 @@ def assess(
     simulate = described.simulate
     known: dict[str, Any] = {}
     if is_lines:
-        lines = load(file, clsas.RangeLines)
+        lines = load_lines(file, described)
         sonar, track = described.sonar, described.track
         # A scene that describes another survey than the lines provides only grid and beam.
         if sonar and track and sonar.receivers * track.pings == lines.channels:
@@ -76,7 +76,7 @@ def assess(
         sonar, track = described.need("sonar", "track")
         survey = {
             name: simulate[name]
-            for name in ("motion_in_flight", "phase_centres")
+            for name in ("motion_in_flight", "phase_centres", "sound_speed")
             if name in simulate
         }
         lines = clsas.survey_lines(sonar, track, grid, **survey, **described.compress)

@@ -16,7 +16,7 @@ import clsas
 from clsas.cli import options
 from clsas.cli.inputs import (
     DEFAULT_REQUEST,
-    load,
+    load_lines,
     read_beam,
     read_grid,
     read_levels,
@@ -105,7 +105,7 @@ def image(
     # `clsas simulate` has already warned about the scene's own grid.
     if described.targets is None or grid is not described.grid:
         warn_of_sampling(described, grid)
-    lines = load(lines_file, clsas.RangeLines)
+    lines = load_lines(lines_file, described)
     opened = open_device(device)
     chosen, planned_s = None, None
     if request.keys() & set(PLAN_KEYS):
@@ -295,7 +295,7 @@ def plan(
     described, grid = read_grid(scene, given)
     request = read_request(described, given)
     beam = read_beam(described, given)
-    lines = load(lines_file, clsas.RangeLines)
+    lines = load_lines(lines_file, described)
     if not request.keys() & set(PLAN_KEYS):
         request = DEFAULT_REQUEST
     chosen = clsas.plan(lines, grid, **request, beam=beam, device=device)

@@ -35,6 +35,14 @@ def load(path: Path, *kinds: type) -> Any:
     raise ValueError(f"{path} must hold {wanted}, got {type(obj).__name__}")
 
 
+def load_lines(path: Path, described: SceneFile) -> clsas.RangeLines:
+    """Return the range lines in a file, with the scene's sound speed unless they have their own."""
+    lines: clsas.RangeLines = load(path, clsas.RangeLines)
+    if described.sound_speed is None or lines.sound_speed is not None:
+        return lines
+    return replace(lines, sound_speed=described.sound_speed)
+
+
 def read_scene(path: Path) -> SceneFile:
     """Return a scene; raise UsageError if the command would replace a file that it refers to."""
     described = config.read_scene(path)

@@ -47,6 +47,7 @@ from clsas.opencl.device import Device, open_device
 from clsas.planning.former import former
 from clsas.planning.planner import plan
 from clsas.signal.readout import Readout
+from clsas.signal.refraction import homogeneous
 from clsas.sonar.beam import BeamWindow
 
 UNKNOWNS = ("sway", "heave", "surge")
@@ -188,12 +189,21 @@ def autofocus(
     validate.progress(progress)
     names = checked_unknowns(unknowns, UNKNOWNS)
     check_navigation(lines, 10, "autofocus", may_stand=True)
-    readout = Readout.of(_of_unit_level(lines), READ_DB)
-    passage = Passage.of(lines, names, mean_wavelength_m(readout))
-    focus = _Focus(readout, grid, passage, beam, open_device(device), progress)
+    # Antennas move alike in the water of a profile and in the homogeneous water that replaces it.
+    water = homogeneous(lines, grid, beam, IMAGE_TOLERANCE_DB)
+    straight = water.lines(lines)
+    readout = Readout.of(_of_unit_level(straight), READ_DB)
+    passage = Passage.of(straight, names, mean_wavelength_m(readout))
+    focus = _Focus(readout, water.grid, passage, beam, open_device(device), progress)
     focus.check_geometry(names)
     found = focus.result()
-    return replace(found, lines=replace(found.lines, samples=lines.samples))
+    if lines.sound_speed is None:
+        return replace(found, lines=replace(found.lines, samples=lines.samples))
+    moved = {
+        name: getattr(lines, name) + (getattr(found.lines, name) - getattr(straight, name))
+        for name in ("tx_m", "rx_m")
+    }
+    return replace(found, lines=replace(lines, **moved))
 
 
 def _of_unit_level(lines: RangeLines) -> RangeLines:

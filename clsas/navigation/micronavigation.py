@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,6 +22,7 @@ from clsas.navigation.smoother import Step, persistence, shape_deviation_m, smoo
 from clsas.navigation.swath import Swath, check_sizes, checked_swath
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
+from clsas.signal.ray_delays import at_speed
 from clsas.sonar.track import Track
 
 UNKNOWNS = ("sway", "yaw", "surge")
@@ -248,6 +249,15 @@ def micronavigate(
     if "sway" not in names:
         raise ValueError(f"unknowns must include 'sway', got {names}")
     check_navigation(lines, 2, "micronavigation", may_stand=False)
+    given = lines
+    if lines.sound_speed is not None:
+        # Echoes arrive with the wavelength of the water at the array.
+        speed_m_s = float(lines.sound_speed.at(lines.rx_m[:, 2]).mean())
+        if range_m is not None:
+            scale = speed_m_s / lines.sound_speed_m_s
+            near_m, far_m = validate.array("range_m", range_m, np.float64, (2,))
+            range_m = scale * float(near_m), scale * float(far_m)
+        lines = at_speed(lines, speed_m_s)
     array = Array.of(lines)
     swath = checked_swath(lines, range_m, window_m, side, seabed_z_m, element_length_m)
     accuracy = Accuracy.of(array.pings, sway_sd_m, yaw_sd_rad, surge_sd_m, correlation_pings)
@@ -263,7 +273,11 @@ def micronavigate(
             f"{int(np.argmin(correlator.live))}). They are left out"
         )
     found = measured(array, correlator, names, accuracy.deviations[:, :2], most_step_m, progress)
-    return _result(lines, array, swath, found, accuracy)
+    result = _result(lines, array, swath, found, accuracy)
+    if given is lines:
+        return result
+    positions = {"tx_m": result.lines.tx_m, "rx_m": result.lines.rx_m}
+    return replace(result, lines=replace(given, **positions))
 
 
 def _result(

@@ -22,6 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsas.core import validate
 from clsas.core.decibels import in_db, power
@@ -34,6 +35,47 @@ from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import REFRACTION, SHARE
 
 _LEVEL_M = 1e-6  # relief of a grid that counts as level
+
+
+@dataclass(frozen=True, eq=False)
+class StraightRays:
+    """Straight rays of the mean speed, and their errors at the visible pixels of a sample.
+
+    Attributes
+    ----------
+    sound_speed_m_s : float
+        Mean speed: that with which they fit the delays along exact rays best.
+    error : float
+        Squared phase error of the worst pixel, rad^2.
+    away_s : float64 [pairs]
+        Errors of the delays.
+    """
+
+    sound_speed_m_s: float
+    error: float
+    away_s: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, sample: RaySample) -> StraightRays:
+        """Return the straight rays that fit a sample best."""
+        lines = at_speed(sample.lines, sample.mean_speed_m_s())
+        range_m = straight_m(lines, sample.points_m)
+        away_s = (2 * range_m / lines.sound_speed_m_s - sample.delay_s)[sample.visible]
+        return cls(lines.sound_speed_m_s, sample.error(lines, range_m), away_s)
+
+    @property
+    def rms_s(self) -> float:
+        """Rms error of the delays, seconds."""
+        return float(np.sqrt(np.mean(self.away_s**2)))
+
+    @property
+    def most_s(self) -> float:
+        """Largest error of the delays, seconds."""
+        return float(np.abs(self.away_s).max())
+
+    def image_error(self, frequency_hz: float) -> float:
+        """Return the relative error power of an image at one frequency."""
+        return float(np.mean(4 * np.sin(np.pi * frequency_hz * self.away_s) ** 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,15 +92,15 @@ class Homogeneous:
         Apparent antennas and the changes of range axes; None for straight rays of the mean speed.
     error : float
         Upper bound of the relative error power of images.
-    mean_error : float
-        The same for straight rays of the mean speed.
+    straight : StraightRays or None
+        Straight rays of the mean speed and their errors; None without a profile.
     """
 
     grid: Grid
     sound_speed_m_s: float = 0.0
     change: Change | None = None
     error: float = 0.0
-    mean_error: float = 0.0
+    straight: StraightRays | None = None
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -112,13 +154,13 @@ def homogeneous(
     if not sample.visible.any():
         middle = profile.mean_m_s(float(lines.tx_m[0, 2]), float((low[2] + high[2]) / 2))
         return Homogeneous(grid, middle)
-    mean_m_s = sample.mean_speed_m_s()
-    mean_error = _mean_error(sample, mean_m_s)
+    straight = StraightRays.of(sample)
+    mean_m_s, mean_error = straight.sound_speed_m_s, straight.error
     allowed = 0.0 if allowed_db is None else power(allowed_db)
     if mean_error <= SHARE * allowed:
-        return Homogeneous(grid, mean_m_s, None, mean_error, mean_error)
+        return Homogeneous(grid, mean_m_s, None, mean_error, straight)
     change = Change.of(lines, sample, allowed_db, sample.middle_m)
-    best = Homogeneous(grid, change.sound_speed_m_s, change, change.error(sample), mean_error)
+    best = Homogeneous(grid, change.sound_speed_m_s, change, change.error(sample), straight)
     if best.error > SHARE * allowed and not _is_level(grid):
         change = Change.of(lines, sample, allowed_db, sample.middles_m(lines))
         moved = apparent_grid(grid, lines, sample, change)
@@ -132,12 +174,6 @@ def homogeneous(
             f"{allowed_db:.3g} dB are requested: form the image in parts, as clsas.mosaic does"
         )
     return best
-
-
-def _mean_error(sample: RaySample, sound_speed_m_s: float) -> float:
-    """Return the squared phase error of the worst pixel with straight rays of one speed, rad^2."""
-    lines = at_speed(sample.lines, sound_speed_m_s)
-    return sample.error(lines, straight_m(lines, sample.points_m))
 
 
 def _is_level(grid: Grid) -> bool:
