@@ -95,7 +95,9 @@ def test_a_ray_that_turns_above_arrives_where_an_ode_solver_says(distance):
     assert found.time_s == pytest.approx(time_s, rel=1e-9)
 
 
-@pytest.mark.parametrize(("distance", "one", "other"), [(60, -5, -25), (20, -11, -40), (90, -9, -14)])
+@pytest.mark.parametrize(
+    ("distance", "one", "other"), [(60, -5, -25), (20, -11, -40), (90, -9, -14)]
+)
 def test_slopes_are_the_changes_of_time(distance, one, other):
     def time_s(*move):
         away, up, down = move

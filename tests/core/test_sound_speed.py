@@ -36,7 +36,9 @@ def test_speed_is_linear_between_depths():
     assert np.array_equal(profile.z_m, [20, 10, 7, -40])
 
 
-@pytest.mark.parametrize(("one", "other"), [(-2, -40), (-11, -12), (-40, -10), (-13, -13), (0, -60)])
+@pytest.mark.parametrize(
+    ("one", "other"), [(-2, -40), (-11, -12), (-40, -10), (-13, -13), (0, -60)]
+)
 def test_the_mean_speed_is_that_of_the_time(one, other):
     profile = SoundSpeed(DEPTH, SPEED)
     found = profile.mean_m_s(one, other)
