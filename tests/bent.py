@@ -1,5 +1,7 @@
 """Travel times along rays by quadrature, which share nothing with the library's closed forms."""
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
@@ -14,12 +16,8 @@ def travel_times(depth_m, speed_m_s, upper_m, lower_m, farthest_m, count=6000):
     horizontal slowness, so that a Hermite spline through the pairs is accurate to rounding.
     """
     edges = [upper_m, *(d for d in depth_m if upper_m < d < lower_m), lower_m]
-    depth = np.concatenate(
-        [(a + b + (b - a) * NODES) / 2 for a, b in zip(edges[:-1], edges[1:], strict=True)]
-    )
-    weight = np.concatenate(
-        [(b - a) * WEIGHTS / 2 for a, b in zip(edges[:-1], edges[1:], strict=True)]
-    )
+    depth = np.concatenate([(a + b + (b - a) * NODES) / 2 for a, b in pairwise(edges)])
+    weight = np.concatenate([(b - a) * WEIGHTS / 2 for a, b in pairwise(edges)])
     speed = np.interp(depth, depth_m, speed_m_s)
     ends = np.interp(edges, depth_m, speed_m_s)
     height, fastest = lower_m - upper_m, ends.max()

@@ -38,6 +38,12 @@ class Change:
         Height of the seabed that the offsets are for.
     tx_z_m, rx_z_m : float64 [channels]
         Apparent heights of the transmitters, and of the receivers at transmission.
+    ahead_s : float64 [channels]
+        Time by which the delay at the middle is longer than in homogeneous water. A moving receiver
+        is ahead by as much at transmission, so that it is in the right place when echoes arrive.
+    climb : float64 [channels]
+        Apparent over real vertical velocity of moving receivers: the ratio of the sines of the
+        angles at which echoes arrive.
     kinds : int64 [channels]
         Number of every channel's pair of heights.
     limits_m : float64 [kinds, 2]
@@ -52,6 +58,8 @@ class Change:
     level_m: float
     tx_z_m: NDArray[np.float64]
     rx_z_m: NDArray[np.float64]
+    ahead_s: NDArray[np.float64]
+    climb: NDArray[np.float64]
     kinds: NDArray[np.int64]
     limits_m: NDArray[np.float64]
     coefficients: NDArray[np.float64]
@@ -78,11 +86,10 @@ class Change:
         near, far = float(distance.min()), float(distance.max())
         speed = float(profile.at(level))
         tx_z = lines.tx_m[:, 2]
-        rx_z, moved = lines.rx_m[:, 2], np.zeros(lines.channels)
-        if lines.rx_velocity_m_s is not None:
-            out = _times(profile, middle_m, tx_z, level)
-            moved = 2 * out * lines.rx_velocity_m_s[:, 2]
-            rx_z = rx_z + moved
+        rx_z, middle_s = lines.rx_m[:, 2], np.zeros(lines.channels)
+        if lines.rx_velocity_m_s is not None:  # heights when the echoes of the middle arrive
+            middle_s = 2 * _times(profile, middle_m, tx_z, level)
+            rx_z = rx_z + middle_s * lines.rx_velocity_m_s[:, 2]
         given = np.stack([tx_z, rx_z, np.broadcast_to(middle_m, tx_z.shape)], axis=1)
         triples, kinds = np.unique(given, axis=0, return_inverse=True)
         kinds, middle_m, pairs = kinds.reshape(-1), triples[:, 2], triples[:, :2]
@@ -101,16 +108,28 @@ class Change:
         )
         accuracy_db = _RESAMPLED_DB if allowed_db is None else allowed_db - _MARGIN_DB
         accuracy_db = min(accuracy_db, _RESAMPLED_DB)
+        path_m = sum(np.hypot(middle_m, each - level) for each in apparent.T)[kinds]
+        tx_z, rx_z = apparent[kinds].T
+        climb = np.ones(lines.channels)
+        if lines.rx_velocity_m_s is not None:
+            arriving = _rays_to(profile, middle_m, pairs[:, 1], level)
+            climb = (-arriving.one_slope_s_m / arriving.other_slope_s_m)[kinds]
+            rx_z = rx_z - path_m / speed * climb * lines.rx_velocity_m_s[:, 2]
         return cls(
-            speed, level, apparent[kinds, 0], apparent[kinds, 1] - moved, kinds, limits,
-            coefficients, accuracy_db,
+            speed, level, tx_z, rx_z, middle_s - path_m / speed, climb, kinds, limits, coefficients,
+            accuracy_db,
         )  # fmt: skip
 
     def antennas(self, lines: RangeLines, channels: NDArray[np.int64] | slice) -> RangeLines:
         """Return lines of some channels with apparent antennas and unchanged samples."""
-        tx_m, rx_m = np.array(lines.tx_m), np.array(lines.rx_m)
+        tx_m, rx_m, velocity = np.array(lines.tx_m), np.array(lines.rx_m), lines.rx_velocity_m_s
+        if velocity is not None:
+            rx_m += self.ahead_s[channels, None] * velocity
+            velocity = velocity.copy()
+            velocity[:, 2] *= self.climb[channels]
         tx_m[:, 2], rx_m[:, 2] = self.tx_z_m[channels], self.rx_z_m[channels]
-        return replace(at_speed(lines, self.sound_speed_m_s), tx_m=tx_m, rx_m=rx_m)
+        moved = at_speed(lines, self.sound_speed_m_s)
+        return replace(moved, tx_m=tx_m, rx_m=rx_m, rx_velocity_m_s=velocity)
 
     def offsets_m(
         self, channels: NDArray[np.int64], range_m: NDArray[np.float64]

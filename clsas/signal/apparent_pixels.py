@@ -17,6 +17,8 @@ from clsas.signal.apparent_antennas import Change
 from clsas.signal.ray_delays import FLIGHT_STEPS, RaySample
 
 _MOVED_AT_ONCE = 1 << 15  # pixels whose apparent positions are found together; bounds memory
+_NEWTON_STEPS = 3  # the first one leaves micrometres for antennas decimetres apart
+_LEAST_SLOPE = 1e-3  # of range over height; below it a pixel is level with the antennas
 _AROUND = 0.02  # share of a distance, over which the curvature of rays is measured
 
 
@@ -41,7 +43,6 @@ def apparent_grid(grid: Grid, lines: RangeLines, sample: RaySample, change: Chan
     distance_m, nearest = cKDTree(centres_m[:, :2]).query(places_m[:, :2])
     bend = _curvature(profile, float(np.median(distance_m)), level.tx_m[0, 2], change.level_m)
     delay = _delays_of(profile, level, distance_m, places_m[:, 2])
-    apparent_z = (change.tx_z_m + change.rx_z_m) / 2
     moved_m = places_m.copy()
     for first in range(0, len(moved_m), _MOVED_AT_ONCE):
         some = slice(first, first + _MOVED_AT_ONCE)
@@ -52,11 +53,34 @@ def apparent_grid(grid: Grid, lines: RangeLines, sample: RaySample, change: Chan
         range_m = wanted_m.copy()
         for _ in range(FLIGHT_STEPS):
             range_m = wanted_m - change.offsets_m(channel, range_m[:, None])[:, 0]
-        offset_m = moved_m[some, :2] - centres_m[channel, :2]
-        below2 = range_m**2 - np.einsum("ni,ni->n", offset_m, offset_m)
-        side = np.sign(apparent_z[channel] - change.level_m)
-        moved_m[some, 2] = apparent_z[channel] - side * np.sqrt(np.maximum(below2, 0.0))
+        aside_m = np.linalg.norm(moved_m[some, :2] - centres_m[channel, :2], axis=1)
+        antennas_z_m = change.tx_z_m[channel], change.rx_z_m[channel]
+        moved_m[some, 2] = _heights(range_m, aside_m, antennas_z_m, change.level_m)
     return Grid.points(moved_m.reshape(*grid.shape, 3), georeference=grid.georeference)
+
+
+def _heights(
+    range_m: NDArray[np.float64],
+    aside_m: NDArray[np.float64],
+    antennas_z_m: tuple[NDArray[np.float64], NDArray[np.float64]],
+    level_m: float,
+) -> NDArray[np.float64]:
+    """Return heights at some ranges of a transmitter and a receiver above each other, [n].
+
+    Newton's method starts at the height that one antenna between them gives.
+    """
+    middle_m = sum(antennas_z_m) / 2
+    side = np.sign(middle_m - level_m)
+    height_m = middle_m - side * np.sqrt(np.maximum(range_m**2 - aside_m**2, 0.0))
+    for _ in range(_NEWTON_STEPS):
+        below_m = [each - height_m for each in antennas_z_m]
+        paths_m = [np.hypot(aside_m, each) for each in below_m]
+        excess_m = sum(paths_m) / 2 - range_m
+        slope = -sum(b / p for b, p in zip(below_m, paths_m, strict=True)) / 2
+        height_m = height_m - np.divide(
+            excess_m, slope, out=np.zeros_like(height_m), where=np.abs(slope) > _LEAST_SLOPE
+        )
+    return height_m
 
 
 def _at_heights(lines: RangeLines, tx_z_m: float, rx_z_m: float) -> RangeLines:

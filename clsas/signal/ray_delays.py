@@ -16,7 +16,7 @@ from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
 POINTS = 9
-"""Number of sample pixels along either side of a grid."""
+"""Number of sample pixels along either side of a grid; points without rows have its square."""
 
 FLIGHT_STEPS = 4
 """Iterations for a moving receiver. Each multiplies the error by v/c, which is below 0.05."""
@@ -111,7 +111,7 @@ class RaySample:
         some = np.union1d(
             some_channels(lines.channels, _CHANNELS), [0, lines.channels - 1, *extreme]
         ).astype(np.int64)
-        part, points_m = lines.select(some), grid.spread(POINTS)
+        part, points_m = lines.select(some), sample_points_m(grid)
         assert part.sound_speed is not None
         straight_m = pairwise_range_m(
             points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
@@ -185,6 +185,11 @@ class RaySample:
         seen = np.maximum(np.count_nonzero(self.visible, axis=1), 1)
         highest_hz = lines.carrier_hz + lines.sound_speed_m_s / (2 * lines.range_step_m)
         return float((2 * np.pi * highest_hz) ** 2 * (square.sum(axis=1) / seen).max())
+
+
+def sample_points_m(grid: Grid) -> NDArray[np.float64]:
+    """Return sample pixels all over a grid, [n, 3], metres."""
+    return grid.spread(POINTS if len(grid.shape) == 2 else POINTS**2)
 
 
 def straight_m(lines: RangeLines, points_m: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -30,7 +30,7 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.signal.apparent_antennas import Change
 from clsas.signal.apparent_pixels import apparent_grid
-from clsas.signal.ray_delays import POINTS, RaySample, at_speed, straight_m
+from clsas.signal.ray_delays import RaySample, at_speed, sample_points_m, straight_m
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import REFRACTION, SHARE
 
@@ -164,7 +164,7 @@ def homogeneous(
     if best.error > SHARE * allowed and not _is_level(grid):
         change = Change.of(lines, sample, allowed_db, sample.middles_m(lines))
         moved = apparent_grid(grid, lines, sample, change)
-        error = change.error(sample, moved.spread(POINTS))
+        error = change.error(sample, sample_points_m(moved))
         if error < best.error:
             best = replace(best, grid=moved, change=change, error=error)
     best = replace(best, error=best.error + power(change.accuracy_db))
