@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from clsas.core.image import Image
     from clsas.core.image_error import relative_error_db
     from clsas.core.lines import RangeLines
+    from clsas.core.sound_speed import SoundSpeed
     from clsas.core.validate import ClsasWarning
     from clsas.exact.backprojection import backproject
     from clsas.exact.wavenumber import wavenumber
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from clsas.files.full_matrix import read_full_matrix
     from clsas.files.hdf5 import FileFormatError
     from clsas.files.phase_histories import read_phase_history
+    from clsas.files.sound_speed_files import read_sound_speed
     from clsas.files.xarrays import to_xarray
     from clsas.inspection.inspection import inspect
     from clsas.inspection.result import Inspection, PhaseSign
@@ -97,6 +99,7 @@ __all__ = [
     "Replica",
     "Seabed",
     "Sonar",
+    "SoundSpeed",
     "Store",
     "Track",
     "Tradeoff",
@@ -130,6 +133,7 @@ __all__ = [
     "read_cphd",
     "read_full_matrix",
     "read_phase_history",
+    "read_sound_speed",
     "relative_error_db",
     "save",
     "simulate",
@@ -149,6 +153,7 @@ _MODULES = {
     "core.image": "Image",
     "core.image_error": "relative_error_db",
     "core.lines": "RangeLines",
+    "core.sound_speed": "SoundSpeed",
     "core.validate": "ClsasWarning",
     "exact.backprojection": "backproject",
     "exact.wavenumber": "wavenumber",
@@ -160,6 +165,7 @@ _MODULES = {
     "files.full_matrix": "read_full_matrix",
     "files.hdf5": "FileFormatError",
     "files.phase_histories": "read_phase_history",
+    "files.sound_speed_files": "read_sound_speed",
     "files.xarrays": "to_xarray",
     "inspection.inspection": "inspect",
     "inspection.result": "Inspection PhaseSign",

@@ -70,7 +70,7 @@ def assess(
     simulate = described.simulate
     known: dict[str, Any] = {}
     if is_lines:
-        lines = load_lines(file, bank)
+        lines = load_lines(file, bank, described)
         sonar, track = described.sonar, described.track
         if sonar is not None and sonar.banks > 1 and lines.banks == 1:
             sonar = sonar.bank(bank or 0)
@@ -82,7 +82,7 @@ def assess(
         sonar = sonar.bank(bank or 0)
         survey = {
             name: simulate[name]
-            for name in ("motion_in_flight", "phase_centres")
+            for name in ("motion_in_flight", "phase_centres", "sound_speed")
             if name in simulate
         }
         lines = clsas.survey_lines(sonar, track, grid, **survey, **described.compress)

@@ -107,7 +107,7 @@ def image(
     # `clsas simulate` has already warned about the scene's own grid.
     if described.targets is None or grid is not described.grid:
         warn_of_sampling(described, grid)
-    lines = load_lines(lines_file, bank)
+    lines = load_lines(lines_file, bank, described)
     opened = open_device(device)
     chosen, planned_s = None, None
     if request.keys() & set(PLAN_KEYS):
@@ -299,7 +299,7 @@ def plan(
     described, grid = read_grid(scene, given)
     request = read_request(described, given)
     beam = read_beam(described, given)
-    lines = load_lines(lines_file, bank)
+    lines = load_lines(lines_file, bank, described)
     if not request.keys() & set(PLAN_KEYS):
         request = DEFAULT_REQUEST
     chosen = clsas.plan(lines, grid, **request, beam=beam, device=device)

@@ -36,9 +36,16 @@ def load(path: Path, *kinds: type) -> Any:
     raise ValueError(f"{path} must hold {wanted}, got {type(obj).__name__}")
 
 
-def load_lines(path: Path, bank: int | None) -> clsas.RangeLines:
-    """Return the range lines of a file, or those of one of their receiver banks."""
+def load_lines(
+    path: Path, bank: int | None, described: SceneFile | None = None
+) -> clsas.RangeLines:
+    """Return the range lines of a file, or those of one of their receiver banks.
+
+    They get the sound speed of the scene unless they have their own.
+    """
     lines: clsas.RangeLines = load(path, clsas.RangeLines)
+    if described and described.sound_speed is not None and lines.sound_speed is None:
+        lines = replace(lines, sound_speed=described.sound_speed)
     if bank is None:
         return lines
     try:

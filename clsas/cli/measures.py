@@ -152,7 +152,7 @@ def tradeoff(
         title = lines_file.name
         described, grid = read_grid(scene, given)
         beam = read_beam(described, given)
-        lines = load_lines(lines_file, bank)
+        lines = load_lines(lines_file, bank, described)
     elif case is None:
         raise click.UsageError("give either LINES.H5 or --case")
     else:

@@ -19,7 +19,11 @@ def lines_digest(lines: RangeLines) -> str:
         others.pop(name, None)
     # Changing this order would invalidate the digests in stores and plans.
     arrays = [others.pop(name) for name in ("tx_m", "rx_m", "first_range_m")]
-    return _digest(np.array(lines.samples.shape), *arrays, numbers, *others.values())
+    others_given = list(others.values())
+    if (profile := lines.sound_speed) is not None:
+        surface = np.array([profile.surface_z_m])
+        others_given += [profile.depth_m, profile.speed_m_s, surface]
+    return _digest(np.array(lines.samples.shape), *arrays, numbers, *others_given)
 
 
 def grid_digest(grid: Grid) -> str:

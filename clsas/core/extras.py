@@ -23,6 +23,7 @@ PACKAGES = {
     "workers": (*_MOSAIC, "distributed>=2024.1", "cryptography>=42.0"),
     "maps": (*_FILES, *_XARRAY, "rasterio>=1.4", "pyproj>=3.6", "h5netcdf>=1.3"),
     "radar": (*_FILES, *_SIGNAL, "sarkit>=1.8", "lxml>=5.1"),
+    "water": ("gsw>=3.6",),
 }
 """Requirements of every extra, as `pyproject.toml` has them. Extras that others include come first:
 a message about a missing package names the first extra that requires it."""

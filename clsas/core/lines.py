@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import banks, conditioning, pings, reprs, validate
 from clsas.core.georeference import Georeference
+from clsas.core.sound_speed import SoundSpeed
 
 _PER_CHANNEL = (
     "first_range_m",
@@ -69,6 +70,10 @@ class RangeLines:
     bank_numbers : array_like of int, shape [channels], optional
         Receiver bank of each channel, counted from 0, for sonars with several rows of receivers at
         different heights. None means that all receivers are one bank.
+    sound_speed : SoundSpeed, optional
+        Sound speed over depth. Imagers then account for refraction, and `sound_speed_m_s` only
+        converts times to ranges: range r belongs to the two-way delay 2 r / sound_speed_m_s. None
+        means that the speed is `sound_speed_m_s` everywhere.
 
     Raises
     ------
@@ -118,6 +123,7 @@ class RangeLines:
     look_direction: NDArray[np.float64] | None = None
     georeference: Georeference | None = None
     bank_numbers: NDArray[np.int64] | None = None
+    sound_speed: SoundSpeed | None = None
 
     if TYPE_CHECKING:  # the constructor converts array_like arguments
 
@@ -134,6 +140,7 @@ class RangeLines:
             look_direction: ArrayLike | None = None,
             georeference: Georeference | None = None,
             bank_numbers: ArrayLike | None = None,
+            sound_speed: SoundSpeed | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -430,6 +437,7 @@ def checked_channels(received: Any, start: str) -> dict[str, Any]:
         If a field has the wrong type or shape, or is outside its limits.
     """
     validate.instance("georeference", received.georeference, Georeference, type(None))
+    validate.instance("sound_speed", received.sound_speed, SoundSpeed, type(None))
     channels = received.samples.shape[0]
     shapes: dict[str, tuple[int, ...]] = {start: (channels,)}
     shapes |= {"tx_m": (channels, 3), "rx_m": (channels, 3)}
@@ -450,6 +458,9 @@ def checked_channels(received: Any, start: str) -> dict[str, Any]:
         checked["bank_numbers"] = banks.checked_numbers(received.bank_numbers, channels, "channels")
     if "look_direction" in checked:
         checked["look_direction"] = _unit_vectors("look_direction", checked["look_direction"])
+    if received.sound_speed is not None:
+        for name in ("tx_m", "rx_m"):
+            received.sound_speed.check_reaches(checked[name][:, 2], name)
     return checked
 
 

@@ -16,6 +16,7 @@ from clsas.exact.preparation import Preparation
 from clsas.exact.run import execute
 from clsas.opencl.device import Device, open_device
 from clsas.signal.ambiguity import BEST_DB, ambiguity
+from clsas.signal.refraction import homogeneous
 from clsas.signal.spectrum import OUTSIDE, line_energy, measure_spectrum, occupied_band
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches
@@ -174,7 +175,9 @@ def prepare(
     accuracy_db = check_input(lines, grid, beam, accuracy_db, BEST_ACCURACY_DB)
     grid = placed(lines, grid)
     fixed = taps is not None and upsampling is not None
-    model = simplify(lines, grid, beam, None if fixed or full_model else accuracy_db)
+    allowed_db = None if fixed or full_model else accuracy_db
+    water = homogeneous(lines, grid, beam, allowed_db)
+    model = simplify(water.lines(lines), water.grid, beam, allowed_db)
     along = None if model.beam is None else model.beam.directions(model.lines)
     device = open_device(device)
     energy = line_energy(model.lines.samples)
@@ -194,7 +197,7 @@ def prepare(
         along=along,
         taps=taps,
         upsampling=upsampling,
-        left_out_error=model.error,
+        left_out_error=model.error + water.error,
     )
     return Preparation(
         device,
@@ -206,10 +209,11 @@ def prepare(
         requested_db=0.0 if fixed else accuracy_db,
         ambiguity=left_open,
         given_grid=grid,
-        left_out=model.left_out,
-        left_out_error=model.error,
+        left_out=(*model.left_out, *water.left_out),
+        left_out_error=model.error + water.error,
         is_reached=is_reached,
         band=occupied_band(spectrum, OUTSIDE * power(accuracy_db)),
+        water=water,
     )
 
 

@@ -15,6 +15,7 @@ from clsas.exact.tiles import Tiles
 from clsas.opencl.device import Device
 from clsas.signal.ambiguity import Ambiguity
 from clsas.signal.interpolation import Interpolator, Resampling
+from clsas.signal.refraction import Homogeneous
 from clsas.sonar.beam import BeamWindow
 
 
@@ -56,6 +57,8 @@ class Preparation:
         pixel.
     band : (centre, half width)
         Band for which the interpolation is made, cycles per sample.
+    water : Homogeneous or None
+        Homogeneous water of `lines` and `grid`, to which lines with other samples are converted.
     """
 
     device: Device
@@ -75,6 +78,7 @@ class Preparation:
     left_out_error: float = 0.0
     is_reached: bool = True
     band: tuple[float, float] = (0.0, 0.5)
+    water: Homogeneous | None = None
 
     @property
     def predicted_error_db(self) -> float:

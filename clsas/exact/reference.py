@@ -16,6 +16,7 @@ from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.wavelengths import wavelength_m
 from clsas.exact.preparation import Preparation
+from clsas.signal.ray_delays import delays_s
 from clsas.signal.readout import interpolated
 from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow, normalising
@@ -171,6 +172,16 @@ def sampled_error_db(
     return relative_error_db(image.pixels.ravel()[chosen], correct)
 
 
+def _ranges_m(lines: RangeLines, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the ranges of points for every channel, along rays, [channels, points]."""
+    if lines.sound_speed is None:
+        motion = lines.rx_velocity_m_s, lines.sound_speed_m_s
+        return pairwise_range_m(points_m, lines.tx_m, lines.rx_m, *motion).T
+    channel, point = np.divmod(np.arange(lines.channels * len(points_m)), len(points_m))
+    delay_s = delays_s(lines, channel, points_m[point])
+    return lines.sound_speed_m_s / 2 * delay_s.reshape(lines.channels, len(points_m))
+
+
 def _sum_channels(
     lines: RangeLines,
     points_m: ArrayLike,
@@ -191,9 +202,7 @@ def _sum_channels(
     step = max(_PAIRS_AT_ONCE // len(points), 1)
     for first in range(0, lines.channels, step):
         block = lines.select(slice(first, first + step))
-        range_m = pairwise_range_m(
-            points, block.tx_m, block.rx_m, block.rx_velocity_m_s, block.sound_speed_m_s
-        ).T
+        range_m = _ranges_m(block, points)
         position = (range_m - block.first_range_m[:, None]) / block.range_step_m
         values = evaluate(block.samples.astype(np.complex128), position)
         if beam is not None and along is not None:

@@ -90,6 +90,8 @@ class ExactImager:
         """
         validate.progress(progress)
         p = self.preparation
+        if p.water is not None:
+            lines = p.water.lines(lines)
         if lines.samples is not p.lines.samples:
             check_numbers(lines, p.beam)
             p = replace(p, lines=replace(p.lines, samples=lines.samples))

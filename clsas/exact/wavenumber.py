@@ -17,6 +17,7 @@ from clsas.core.lines import RangeLines
 from clsas.exact.checks import check_numbers
 from clsas.exact.migration import migrate
 from clsas.exact.straight_track import Aspects, Band, StraightTrack, aspects_of, band_of, straighten
+from clsas.signal.refraction import homogeneous
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches, warn_unreached
 from clsas.sonar.looking import warn_before_imaging
@@ -59,7 +60,8 @@ def wavenumber(
     Raises
     ------
     TypeError, ValueError
-        If an argument has the wrong type or is out of range, the grid is not a plane, its rows are
+        If an argument has the wrong type or is out of range, the grid is not a plane (a level one
+        for lines with a profile of the sound speed), its rows are
         at an angle of more than 5 degrees to the track, it is closer than a wavelength, all phase
         centres coincide, aspect angles exceed 85 degrees, the beam normalises, or arrays do not fit
         into memory.
@@ -130,6 +132,11 @@ def wavenumber(
     check_numbers(lines, beam)
     if beam is not None and beam.normalise:
         raise ValueError("beam must not normalise here; use clsas.backproject for that")
+    if lines.sound_speed is not None:
+        water = homogeneous(lines, grid, beam, None)
+        if not water.grid.is_planar:
+            raise ValueError("grid must be level for lines with a profile of the sound speed")
+        lines = water.lines(lines)
     band = band_of(lines)
     track = straighten(lines, grid, beam, motion_compensation)
     aspects = aspects_of(lines, track, beam, band)

@@ -17,6 +17,7 @@ from clsas.factorized.sectors import Roots
 from clsas.factorized.surface import Surface
 from clsas.opencl.device import Device, aligned
 from clsas.plans.plan import Plan
+from clsas.signal.refraction import Homogeneous, homogeneous
 from clsas.sonar.coverage import reaches, warn_unreached
 from clsas.sonar.simplify import Model, leave_out
 
@@ -33,11 +34,14 @@ class Known:
         Its mean track, of the shape that the factorization has.
     surface : Surface or None
         The surface of its grid.
+    water : Homogeneous or None
+        Homogeneous water of the scene.
     """
 
     model: Model | None = None
     track: MeanTrack | None = None
     surface: Surface | None = None
+    water: Homogeneous | None = None
 
 
 NOTHING = Known()
@@ -71,7 +75,10 @@ class FactorizedImager:
         known: Known = NOTHING,
         warned: bool = False,
     ) -> None:
-        model = known.model or leave_out(lines, grid, plan.beam, plan.left_out)
+        self._water = known.water or homogeneous(lines, grid, plan.beam, plan.tolerance_db)
+        model = known.model or leave_out(
+            self._water.lines(lines), self._water.grid, plan.beam, plan.left_out
+        )
         self.grid, self.plan, self.device = grid, plan, device.for_stages()
         self._model, self._warned = model, warned
         self._along = None if model.beam is None else model.beam.directions(model.lines)
@@ -95,6 +102,7 @@ class FactorizedImager:
             Called as progress(pixels done, pixels).
         """
         model, grid = self._model, self.grid
+        lines = self._water.lines(lines)
         if self.plan.left_out:
             lines = replace(model.lines, samples=lines.samples)
         largest = check_numbers(lines, model.beam)

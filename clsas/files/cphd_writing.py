@@ -60,8 +60,8 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
     TypeError
         If `lines` are not range lines.
     ValueError
-        If the lines have receiver velocities or several banks, or the file's name has another
-        suffix.
+        If the lines have receiver velocities, several banks or a profile of the sound speed, or the
+        file's name has another suffix.
     ImportError
         If sarkit is not installed (extra `radar`).
     OSError
@@ -102,6 +102,8 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
             f"lines must be of one bank, got {lines.banks}: write lines.bank(0) and the others to "
             "files of their own"
         )
+    if lines.sound_speed is not None:
+        raise ValueError("lines must not have sound_speed: CPHD assumes straight rays")
     origin_m = np.rint(lines.phase_centres_m.mean(axis=0))
     origin_m *= np.abs(origin_m).max() > _NEAR_M
     vectors, signal = _vectors(lines, origin_m)

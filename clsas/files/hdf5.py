@@ -26,6 +26,7 @@ from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.interferometry.interferogram import Interferogram
 from clsas.interferometry.result import Heights
+from clsas.core.sound_speed import SoundSpeed
 from clsas.signal.echoes import Echoes
 from clsas.sonar.system import Pulse
 
@@ -40,6 +41,7 @@ _KINDS = {
     "georeference": Georeference,
     "interferogram": Interferogram,
     "heights": Heights,
+    "sound_speed": SoundSpeed,
 }
 _SAVED = (Grid, RangeLines, Image, Echoes, Interferogram, Heights)
 

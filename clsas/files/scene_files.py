@@ -19,6 +19,7 @@ from pydantic import ValidationError
 from clsas.core import reading, validate
 from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
+from clsas.core.sound_speed import SoundSpeed
 from clsas.core.version import __version__
 from clsas.files.mistakes import explain
 from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS, SceneTables
@@ -38,13 +39,14 @@ class SceneFile:
     ----------
     name : str
         Origin of the scene, for messages.
-    sonar, track, grid, georeference
+    sonar, track, grid, georeference, sound_speed
         From the tables of these names. Track and grid have the georeference.
     targets : PointTargets, Seabed, or a tuple of both
         From the tables `targets` and `seabed`.
     simulate, compress, image : dict
-        Keyword arguments for `clsas.simulate`, for `clsas.compress`, and for `clsas.plan` (one of
-        `PLAN_KEYS`) or `clsas.backproject` (any of `EXACT_KEYS`); the latter may include a `beam`.
+        Keyword arguments for `clsas.simulate` (with the sound speed), for `clsas.compress`, and for
+        `clsas.plan` (one of `PLAN_KEYS`) or `clsas.backproject` (any of `EXACT_KEYS`); the latter may
+        include a `beam`.
     mosaic : dict
         Paths that `clsas mosaic` reads (`lines`) and writes (`store`), and its `patches` and
         `memory_mib`.
@@ -53,7 +55,7 @@ class SceneFile:
         keyword arguments of the steps `calibrate`, `navigate` and `focus`.
     files : dict
         Paths of the files that the scene refers to, by key: "track.file", "grid.height_file",
-        "mosaic.lines", "process.lines".
+        "sound_speed.file", "mosaic.lines", "process.lines".
     """
 
     name: str
@@ -62,6 +64,7 @@ class SceneFile:
     targets: Scene | None = None
     grid: Grid | None = None
     georeference: Georeference | None = None
+    sound_speed: SoundSpeed | None = None
     simulate: dict[str, Any] = field(default_factory=dict)
     compress: dict[str, Any] = field(default_factory=dict)
     image: dict[str, Any] = field(default_factory=dict)
@@ -132,8 +135,9 @@ def simulation_digest(text: bytes, folder: Path) -> str:
     tables = reading.parse_toml(text)
     used = {name: table for name, table in tables.items() if name not in _IMAGING}
     digest = hashlib.sha256(json.dumps([__version__, used], sort_keys=True, default=str).encode())
-    if isinstance(file := tables.get("track", {}).get("file"), str):
-        digest.update(reading.read_bytes(folder / file))
+    for table in ("track", "sound_speed"):
+        if isinstance(file := tables.get(table, {}).get("file"), str):
+            digest.update(reading.read_bytes(folder / file))
     return digest.hexdigest()[:12]
 
 

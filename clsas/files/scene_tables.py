@@ -20,6 +20,7 @@ from clsas.exact.backprojection import BEST_ACCURACY_DB
 from clsas.files.georeference_table import GeoreferenceTable
 from clsas.files.grid_tables import GridTable
 from clsas.files.process_tables import ProcessTable
+from clsas.files.sound_speed_table import SoundSpeedTable
 from clsas.files.survey_tables import SonarTable, TrackTable
 from clsas.files.tables import Table, Vector, located
 from clsas.planning.request import checked_pairs, tolerance_in_db
@@ -208,6 +209,7 @@ class SceneTables(Table):
     targets: list[_Target] | None = None
     seabed: _Seabed | None = None
     grid: GridTable | None = None
+    sound_speed: SoundSpeedTable | None = None
     georeference: GeoreferenceTable | None = None
     simulate: _Simulate = _Simulate()
     compress: _Compress = _Compress()
@@ -237,6 +239,7 @@ class SceneTables(Table):
         paths = {
             "track.file": self.track and self.track.file,
             "grid.height_file": self.grid and self.grid.height_file,
+            "sound_speed.file": self.sound_speed and self.sound_speed.file,
             "mosaic.lines": self.mosaic.lines,
             "process.lines": self.process.lines,
         }
@@ -244,13 +247,18 @@ class SceneTables(Table):
         track = self.track.build(folder, place) if self.track else None
         if track is not None:
             place = track.georeference  # its own, if it consists of latitudes and longitudes
+        profile = self.sound_speed.build(folder) if self.sound_speed else None
+        simulate = self.simulate.build()
+        if profile is not None:
+            simulate["sound_speed"] = profile
         return dict(
             sonar=self.sonar.build() if self.sonar else None,
             track=track,
             targets=tuple(parts) if len(parts) > 1 else parts[0] if parts else None,
             grid=replace(self.grid.build(folder), georeference=place) if self.grid else None,
             georeference=place,
-            simulate=self.simulate.build(),
+            sound_speed=profile,
+            simulate=simulate,
             compress=self.compress.build(),
             image=self.image.build(),
             mosaic=self.mosaic.build(folder),

@@ -16,6 +16,7 @@ from clsas.core.decibels import in_db, power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
+from clsas.core.sound_speed import SoundSpeed
 from clsas.core.wavelengths import band_wavelength_m
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
@@ -39,11 +40,12 @@ from clsas.plans.factorization import Factorization
 from clsas.plans.plan import Plan
 from clsas.signal.compression import Window
 from clsas.signal.compression import check_options as check_compression
+from clsas.signal.refraction import homogeneous
 from clsas.signal.spectrum import measure_spectrum
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.simplify import RELIEF, SHARE, leave_out
+from clsas.sonar.simplify import REFRACTION, RELIEF, SHARE, leave_out
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Pointing, Track, channels
 
@@ -117,7 +119,9 @@ def assess(
     -----
     Errors are computed in float64 for a sample of channels and pixels:
     `clsas.measures.effects.errors_without` has the equation. Without an effect, an image is planned
-    like the one with all effects, and the difference of their times is the cost of the effect.
+    like the one with all effects, and the difference of their times is the cost of the effect. The
+    cost of refraction is the time that it took to convert the lines. The other effects are those of
+    the converted lines.
 
     Examples
     --------
@@ -141,7 +145,14 @@ def assess(
         "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
     )
     repeats = validate.count("repeats", repeats, least=0)
-    survey = Survey(lines, grid, beam, sonar, track, pointing, element_pattern, ends)
+    validate.instance("lines", lines, RangeLines)
+    validate.instance("grid", grid, Grid)
+    start, water = time.perf_counter(), None
+    if lines.sound_speed is not None:
+        water = homogeneous(lines, grid, beam, None)
+        lines, grid = water.lines(lines), water.grid
+    refraction_s = time.perf_counter() - start
+    survey = Survey(lines, grid, beam, sonar, track, pointing, element_pattern, ends, water)
     device = open_device(device)
     images = _images(survey, partial(plan, tolerance_db=tolerance_db, device=device, costs=costs))
     full, left_out = images[_FULL].plan, images.get(_FORMED, images[_FULL]).plan.left_out
@@ -156,6 +167,10 @@ def assess(
     if not full.is_exact and device.info.half_precision:
         errors[SINGLE] = ErrorWithout(in_db(half_precision_error(len(full.sides))))
     allowed = SHARE * power(tolerance_db)
+    if water is not None and water.straight is not None:
+        seconds[REFRACTION] = seconds[_FULL] - refraction_s
+        if water.straight.error <= allowed:
+            left_out = (*left_out, REFRACTION)
     return Assessment(
         tolerance_db=tolerance_db,
         wavelength_m=band_wavelength_m(lines, measure_spectrum(lines).centre),
@@ -212,6 +227,7 @@ def survey_lines(
     phase_centres: bool = False,
     window: Window = "none",
     oversampling: float = 2.0,
+    sound_speed: SoundSpeed | None = None,
 ) -> RangeLines:
     """Return range lines of a single point, with the geometry and the band of a survey.
 
@@ -229,6 +245,8 @@ def survey_lines(
         As for `clsas.simulate`.
     window, oversampling
         As for `clsas.compress`.
+    sound_speed : SoundSpeed, optional
+        Sound speed over depth, as for `clsas.simulate`.
 
     Returns
     -------
@@ -263,8 +281,13 @@ def survey_lines(
     pulse = sonar.pulse
     step_m = sonar.sound_speed_m_s / (2 * float(oversampling) * pulse.bandwidth_hz)
     range_m = pairwise_range_m(grid.spread(_POINTS), *geometry, sonar.sound_speed_m_s)
-    first_m = range_m.min(axis=0) - _MARGIN * step_m
-    extent = float((range_m.max(axis=0) - first_m).max() / step_m)
+    near_m, far_m = range_m.min(axis=0), range_m.max(axis=0)
+    if sound_speed is not None:
+        validate.instance("sound_speed", sound_speed, SoundSpeed)
+        near_m = near_m * (sonar.sound_speed_m_s / sound_speed.speed_m_s.max())
+        far_m = far_m * (sonar.sound_speed_m_s / sound_speed.speed_m_s.min())
+    first_m = near_m - _MARGIN * step_m
+    extent = float((far_m - first_m).max() / step_m)
     validate.memory("oversampling", 8 * len(first_m) * extent)
     length = math.ceil(extent) + _MARGIN
     middle = np.ravel_multi_index([n // 2 for n in grid.shape], grid.shape)
@@ -280,6 +303,7 @@ def survey_lines(
         first_range_m=first_m,
         length=length,
         rx_velocity_m_s=geometry.rx_velocity_m_s,
+        sound_speed=sound_speed,
     )
     return replace(lines, bank_numbers=sonar.channel_banks(track.pings))
 

@@ -17,9 +17,10 @@ from clsas.core.lines import RangeLines, some_channels
 from clsas.core.wavelengths import band_wavelength_m, cycles_per_m_at, wavelength_m
 from clsas.factorized.surface import surface_of
 from clsas.signal.ambiguity import ends_error
+from clsas.signal.refraction import Homogeneous
 from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.simplify import APART, MOTION, RELIEF
+from clsas.sonar.simplify import APART, MOTION, REFRACTION, RELIEF
 from clsas.sonar.system import Sonar, element_pattern
 from clsas.sonar.track import Pointing, Track
 from clsas.sonar.visibility import sines
@@ -34,6 +35,7 @@ KEYS = {
     MOTION: "[simulate] motion_in_flight = false",
     APART: "[simulate] phase_centres = true",
     RELIEF: "",
+    REFRACTION: "no [sound_speed]",
     SWAY: "no [track.sway], [track.yaw], ...",
     PATTERN: "[simulate] element_pattern = false",
     BEAM: "no [image.beam]",
@@ -61,6 +63,9 @@ class Survey:
         True if the lines contain the sonar's element patterns.
     ends : bool
         True if recorded data end where the lines do.
+    water : Homogeneous or None
+        Homogeneous water of `lines` and `grid` if they replace lines in a profile of the sound
+        speed.
 
     Raises
     ------
@@ -76,6 +81,7 @@ class Survey:
     pointing: Pointing | None = None
     element_pattern: bool = True
     ends: bool = True
+    water: Homogeneous | None = None
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -110,6 +116,7 @@ class Survey:
             MOTION: lines.rx_velocity_m_s is not None,
             APART: not np.array_equal(lines.tx_m, lines.rx_m),
             RELIEF: not surface_of(self.grid).is_plane,
+            REFRACTION: self.water is not None,
             SWAY: bool(track_errors_m(lines).any()),
             PATTERN: self.directive is not None and self.element_pattern,
             BEAM: self.beam is not None,
@@ -176,6 +183,13 @@ def errors_without(survey: Survey) -> dict[str, ErrorWithout]:
     if beam is not None:
         with_it, without = sample.weights * of_lines, sample.inside * of_lines
         errors[BEAM] = _error_of_weights(with_it, without)
+    if survey.water is not None and (straight := survey.water.straight) is not None:
+        cycles_per_s = survey.water.sound_speed_m_s / sample.wavelength_m
+        errors[REFRACTION] = ErrorWithout(
+            in_db(straight.image_error(cycles_per_s)),
+            straight.rms_s * cycles_per_s,
+            straight.most_s * cycles_per_s,
+        )
     if survey.ends:
         along = None if beam is None else beam.directions(lines)
         errors[ENDS] = ErrorWithout(

@@ -292,6 +292,8 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
                 f"{path}: georeference must equal that of the survey's first file, "
                 f"{found[0].georeference}, got {geometry.georeference}"
             )
+        if geometry.sound_speed != found[0].sound_speed:
+            raise ValueError(f"{path}: sound_speed must equal that of the survey's first file")
         different = geometry.per_channel.keys() ^ found[0].per_channel.keys()
         for name in different - {_LOOK}:
             raise ValueError(f"{path}: {name} must be in all files of the survey or in none")

@@ -75,7 +75,11 @@ class SurveyVisibility:
         if geometry.rx_velocity_m_s is not None:
             speed = np.linalg.norm(geometry.rx_velocity_m_s, axis=1) / geometry.sound_speed_m_s
             extent_m += 1.1 * speed * (middle_m + radius_m)
-        return middle_m - extent_m, middle_m + extent_m
+        near_m, far_m = middle_m - extent_m, middle_m + extent_m
+        if (profile := geometry.sound_speed) is not None:
+            near_m = near_m * (geometry.sound_speed_m_s / profile.speed_m_s.max())
+            far_m = far_m * (geometry.sound_speed_m_s / profile.speed_m_s.min())
+        return near_m, far_m
 
     def channels(self, grid: Grid) -> NDArray[np.bool_]:
         """Return which channels may contribute to a grid, bool [channels]."""

@@ -48,6 +48,7 @@ from clsas.opencl.device import Device, open_device
 from clsas.planning.former import former
 from clsas.planning.planner import plan
 from clsas.signal.readout import Readout
+from clsas.signal.refraction import homogeneous
 from clsas.sonar.beam import BeamWindow
 
 UNKNOWNS = ("sway", "heave", "surge")
@@ -190,15 +191,18 @@ def autofocus(
     validate.progress(progress)
     names = checked_unknowns(unknowns, UNKNOWNS)
     check_navigation(lines, 10, "autofocus", may_stand=True)
-    focused = first_bank(lines)
-    readout = Readout.of(_of_unit_level(focused), READ_DB)
-    passage = Passage.of(focused, names, mean_wavelength_m(readout))
-    focus = _Focus(readout, grid, passage, beam, open_device(device), progress)
+    bank = first_bank(lines)
+    # Antennas move alike in the water of a profile and in the homogeneous water that replaces it.
+    water = homogeneous(bank, grid, beam, IMAGE_TOLERANCE_DB)
+    straight = water.lines(bank)
+    readout = Readout.of(_of_unit_level(straight), READ_DB)
+    passage = Passage.of(straight, names, mean_wavelength_m(readout))
+    focus = _Focus(readout, water.grid, passage, beam, open_device(device), progress)
     focus.check_geometry(names)
-    return _of_all_banks(focus.result(), focused, lines)
+    return _of_given(focus.result(), straight, lines)
 
 
-def _of_all_banks(found: Autofocus, focused: RangeLines, lines: RangeLines) -> Autofocus:
+def _of_given(found: Autofocus, focused: RangeLines, lines: RangeLines) -> Autofocus:
     """Return a result for the lines `focused`, applied to all channels of the same pings."""
     one_of_ping = focused.ping_starts[lines.ping_numbers]
     moved_m = found.correction_m[one_of_ping]

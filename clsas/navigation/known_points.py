@@ -80,7 +80,8 @@ def calibrate_track(
     ------
     TypeError, ValueError
         If an argument has the wrong type or is outside its limits; if fewer than three channels
-        have samples where a point is expected; or if no point is seen.
+        have samples where a point is expected; if no point is seen; or if lines have a profile of
+        the sound speed.
 
     Warns
     -----
@@ -126,6 +127,11 @@ def calibrate_track(
     (-0.1, 1500.0)
     """
     validate.instance("lines", lines, RangeLines)
+    if lines.sound_speed is not None:
+        raise ValueError(
+            "lines must not have sound_speed: ranges of known points determine a constant speed. "
+            "Calibrate replace(lines, sound_speed=None), near the sonar, and add the profile then"
+        )
     points = validate.array("points_m", points_m, np.float64, (None, 3))
     names = checked_unknowns(unknowns, UNKNOWNS)
     validate.progress(progress)

@@ -22,6 +22,7 @@ from clsas.navigation.smoother import Step, persistence, shape_deviation_m, smoo
 from clsas.navigation.swath import Swath, check_sizes, checked_swath
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
+from clsas.signal.ray_delays import at_speed
 from clsas.sonar.track import Track
 
 UNKNOWNS = ("sway", "yaw", "surge")
@@ -250,6 +251,14 @@ def micronavigate(
         raise ValueError(f"unknowns must include 'sway', got {names}")
     check_navigation(lines, 2, "micronavigation", may_stand=False)
     array_lines = first_bank(lines)
+    if lines.sound_speed is not None:
+        # Echoes arrive with the wavelength of the water at the array.
+        speed_m_s = float(lines.sound_speed.at(array_lines.rx_m[:, 2]).mean())
+        if range_m is not None:
+            scale = speed_m_s / lines.sound_speed_m_s
+            near_m, far_m = validate.array("range_m", range_m, np.float64, (2,))
+            range_m = scale * float(near_m), scale * float(far_m)
+        array_lines = at_speed(array_lines, speed_m_s)
     array = Array.of(array_lines)
     swath = checked_swath(array_lines, range_m, window_m, side, seabed_z_m, element_length_m)
     accuracy = Accuracy.of(array.pings, sway_sd_m, yaw_sd_rad, surge_sd_m, correlation_pings)

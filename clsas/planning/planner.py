@@ -28,6 +28,7 @@ from clsas.planning.search import Allowed
 from clsas.planning.visibility_model import LinesModel, VisibilityModel, model_of
 from clsas.plans.factorization import UNREACHED
 from clsas.plans.plan import Plan
+from clsas.signal.refraction import Homogeneous, homogeneous
 from clsas.signal.spectrum import OUTSIDE
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches, warn_unreached
@@ -206,11 +207,17 @@ class Planned:
 def planned(request: Request) -> Planned:
     """Return the plan of a request, with what its image needs again."""
     device = open_device(request.device)
+    given = request
+    water = homogeneous(
+        given.lines, given.grid, given.beam, None if given.full_model else given.tolerance_db
+    )
+    request = given.with_scene(water.lines(given.lines), water.grid)
     scene = _simplified(request)
     model = model_of(
         scene.lines, scene.grid, scene.beam, OUTSIDE * power(request.tolerance_db or 0.0)
     )
-    exact_db, factorized_db = _left_to_methods_db(request.tolerance_db, model, scene.error)
+    left_out = scene.error + water.error
+    exact_db, factorized_db = _left_to_methods_db(request.tolerance_db, model, left_out)
     exact = expect(model, exact_db, device)
     is_reached = reaches(request.lines, request.grid, request.beam, model.channels_along)
     costs = _known_costs(request, exact, device, is_reached)
@@ -221,10 +228,10 @@ def planned(request: Request) -> Planned:
     else:  # an image of zeros needs no search, nor memory
         found, track = exact_plan(model, conditions, UNREACHED), None
         warn_unreached(request.lines, request.grid, request.beam, model.channels_along)
-    chosen = _completed(found, request, scene, model, costs)
+    chosen = _completed(found, given, scene, water, model, costs)
     if chosen.is_exact or not isinstance(model, VisibilityModel):
         return Planned(chosen)
-    return Planned(chosen, Known(scene, track, model.surface))
+    return Planned(chosen, Known(scene, track, model.surface, water))
 
 
 def _simplified(request: Request) -> Model:
@@ -318,14 +325,22 @@ def _worth_a_search(request: Request, exact: Exact, costs: Costs) -> bool:
 
 
 def _completed(
-    found: Plan, request: Request, scene: Model, model: LinesModel, costs: KnownCosts
+    found: Plan,
+    request: Request,
+    scene: Model,
+    water: Homogeneous,
+    model: LinesModel,
+    costs: KnownCosts,
 ) -> Plan:
     """Return a plan of the simplified scene as one of the request: with all errors, and origins."""
     ambiguity, errors = model.ambiguity, found.errors
     if not found.is_exact:
         errors = errors.times(1 / ambiguity.least_brightness)
     errors = replace(
-        errors, line_ends=ambiguity.ends, aliasing=ambiguity.aliasing, left_out=scene.error
+        errors,
+        line_ends=ambiguity.ends,
+        aliasing=ambiguity.aliasing,
+        left_out=scene.error + water.error,
     )
     prediction = replace(
         found.prediction,
@@ -338,10 +353,10 @@ def _completed(
         found,
         tolerance_db=request.tolerance_db,
         prediction=prediction,
-        left_out=scene.left_out,
+        left_out=(*scene.left_out, *water.left_out),
         beam=request.beam,
     )
-    if not scene.left_out:
+    if not scene.left_out and request.lines.sound_speed is None:
         return found
     return replace(
         found, lines_digest=lines_digest(request.lines), grid_digest=grid_digest(request.grid)

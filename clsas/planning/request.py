@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field
@@ -87,6 +88,13 @@ class Request:
         validate.flag("full_model", self.full_model)
         if self.memory_bytes is not None:
             self._set("memory_bytes", validate.count("memory_bytes", self.memory_bytes))
+
+    def with_scene(self, lines: RangeLines, grid: Grid) -> Request:
+        """Return the same request for other lines and another grid, which are not checked again."""
+        other = copy.copy(self)
+        other._set("lines", lines)
+        other._set("grid", grid)
+        return other
 
     def _set(self, name: str, value: object) -> None:
         """Replace an argument by its checked value."""

@@ -169,6 +169,7 @@ def compress(
         look_direction=echoes.look_direction,
         georeference=echoes.georeference,
         bank_numbers=echoes.bank_numbers,
+        sound_speed=echoes.sound_speed,
     )
 
 

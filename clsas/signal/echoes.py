@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.core import reprs, validate
 from clsas.core.georeference import Georeference
 from clsas.core.lines import checked_channels
+from clsas.core.sound_speed import SoundSpeed
 from clsas.sonar.system import Pulse
 
 
@@ -50,6 +51,8 @@ class Echoes:
         Where the coordinates lie on Earth.
     bank_numbers : array_like of int, [channels], optional
         Receiver bank of each channel, as for `RangeLines`.
+    sound_speed : SoundSpeed, optional
+        Sound speed over depth, as for `RangeLines`.
 
     Raises
     ------
@@ -84,6 +87,7 @@ class Echoes:
     look_direction: NDArray[np.float64] | None = None
     georeference: Georeference | None = None
     bank_numbers: NDArray[np.int64] | None = None
+    sound_speed: SoundSpeed | None = None
 
     if TYPE_CHECKING:  # the constructor converts array_like arguments
 
@@ -101,6 +105,7 @@ class Echoes:
             look_direction: ArrayLike | None = None,
             georeference: Georeference | None = None,
             bank_numbers: ArrayLike | None = None,
+            sound_speed: SoundSpeed | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:

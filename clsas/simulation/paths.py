@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from clsas.core import validate
 from clsas.core.geometry import legs_m
+from clsas.core.sound_speed import SoundSpeed
 from clsas.core.threads import in_threads
 from clsas.simulation.patterns import ElementPatterns
+from clsas.simulation.refraction import BlockDelays
 from clsas.simulation.scenes import Observer, PointTargets, Scene, Seabed
 from clsas.sonar.track import Channels
 
@@ -40,11 +42,14 @@ class PointBlock(NamedTuple):
     amplitudes : float or complex [points]
     error : float
         Relative error that the sum over these points may have.
+    refraction : BlockDelays or None
+        Delays along rays in a profile of the sound speed; None without one.
     """
 
     points_m: NDArray[np.float64]
     amplitudes: NDArray
     error: float
+    refraction: BlockDelays | None = None
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,8 @@ class Paths:
         None if every element is omnidirectional.
     receivers : int
         Number of channels of a ping.
+    sound_speed : SoundSpeed or None
+        Profile along whose rays sound travels; None for a constant speed.
     """
 
     parts: tuple[PointTargets | Seabed, ...]
@@ -71,6 +78,7 @@ class Paths:
     spreading: bool = False
     patterns: ElementPatterns | None = None
     receivers: int = 1
+    sound_speed: SoundSpeed | None = None
 
     @property
     def channels(self) -> int:
@@ -132,9 +140,30 @@ class Paths:
                 for first in range(0, len(positions), size):
                     block = slice(first, first + size)
                     offsets = np.ascontiguousarray((positions[block] - origin_m).T)
-                    yield PointBlock((axes @ offsets).T, amplitudes[block], part.error)
+                    points_m = (axes @ offsets).T
+                    refraction = None
+                    if self.sound_speed is not None:
+                        z_m = positions[block, 2]
+                        self.sound_speed.check_reaches(z_m, "the scene's points")
+                        refraction = BlockDelays(self.sound_speed, points_m, z_m)
+                    yield PointBlock(points_m, amplitudes[block], part.error, refraction)
 
         return [local(channel) for channel in group], blocks()
+
+    def delays_s(
+        self, channel: int, elements: Channels, block: PointBlock
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the delays of a block of points for a channel, and the lengths of straight paths.
+
+        The lengths from transmitter to points and from points to receiver are in metres.
+        """
+        out, back = legs_m(block.points_m, *elements, self.sound_speed_m_s)
+        if block.refraction is None:
+            return (out + back) / self.sound_speed_m_s, out, back
+        tx, rx, velocity = self.elements(channel)
+        climb_m_s = 0.0 if velocity is None else float(velocity[2])
+        delay = block.refraction.delays_s(elements, float(tx[2]), float(rx[2]), climb_m_s)
+        return delay, out, back
 
     def delay_limits_s(self, workers: int | None) -> NDArray:
         """Return the shortest and the longest delay of every channel, float64 [2, channels]."""
@@ -160,7 +189,11 @@ class Paths:
         found = np.array(
             [ends for group in in_threads(limits, self.groups, workers) for ends in group]
         )
-        return np.maximum(found.T, 0.0) / self.sound_speed_m_s
+        lengths = np.maximum(found.T, 0.0)
+        if self.sound_speed is None:
+            return lengths / self.sound_speed_m_s
+        fastest, slowest = self.sound_speed.speed_m_s.max(), self.sound_speed.speed_m_s.min()
+        return lengths / np.array([[fastest], [slowest]])
 
 
 def scene_parts(scene: Scene) -> tuple[PointTargets | Seabed, ...]:

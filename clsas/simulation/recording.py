@@ -27,7 +27,6 @@ from scipy import fft
 
 from clsas.core import validate
 from clsas.core.fourier import EDGE_PRODUCT, smooth_edge
-from clsas.core.geometry import legs_m
 from clsas.core.threads import in_threads
 from clsas.simulation.paths import Paths, PointBlock
 from clsas.simulation.patterns import interpolation_matrix
@@ -146,8 +145,7 @@ def _add(
     """Add the transfer functions of a block of points to those of one channel, [modes]."""
     modes, patterns = len(total), paths.patterns
     points, amplitudes = block.points_m, block.amplitudes
-    out, back = legs_m(points, *elements, paths.sound_speed_m_s)
-    delay = (out + back) / paths.sound_speed_m_s
+    delay, out, back = paths.delays_s(channel, elements, block)
     kept = (delay >= windows.kept_s[0][channel]) & (delay <= windows.kept_s[1][channel])
     if not kept.any():
         return

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import validate
 from clsas.core.lines import RangeLines
+from clsas.core.sound_speed import SoundSpeed
 from clsas.signal.compression import Window, compress
 from clsas.signal.compression import check_options as check_compression
 from clsas.signal.echoes import Echoes
@@ -36,6 +37,7 @@ def simulate(
     range_m: tuple[float, float] | None = None,
     snr_db: float | None = None,
     seed: int = 0,
+    sound_speed: SoundSpeed | None = None,
     workers: int | None = None,
     progress: Progress = None,
 ) -> Echoes:
@@ -78,6 +80,9 @@ def simulate(
         noise per sample, before compression.
     seed : int
         Seed of the noise, at least 0.
+    sound_speed : SoundSpeed, optional
+        Sound speed over depth. Sound then travels along exact rays. The sonar's speed only converts
+        `range_m` to times, as it does for imagers. See Notes.
     workers : int, optional
         Number of threads; by default as many as there are cores.
     progress : callable, optional
@@ -92,8 +97,9 @@ def simulate(
     Raises
     ------
     TypeError, ValueError
-        If an argument has the wrong type or is outside its limits, `pointing` is given for
-        omnidirectional elements, a point lies on an element while spreading or patterns are
+        If an argument has the wrong type or is outside its limits, `sound_speed` does not reach an
+        element or a point, a point lies in a shadow zone, `pointing` is given for omnidirectional
+        elements, a point lies on an element while spreading or patterns are
         applied, `snr_db` is given but there is no echo, or the echoes, or the patterns of very long
         elements, do not fit into memory.
 
@@ -113,6 +119,9 @@ def simulate(
     between their transmitter and the mean of their receivers. For an element at a distance e from
     that middle, the edge of a shadow is displaced by e d/r, where r is the range of the object that
     casts the shadow and d the distance of the edge behind it.
+
+    With `sound_speed`, delays are those of exact rays. Element patterns, spreading and shadows of a
+    seabed are those of straight paths.
 
     References
     ----------
@@ -136,7 +145,7 @@ def simulate(
     check_options(
         pointing=pointing, spreading=spreading, motion_in_flight=motion_in_flight,
         element_pattern=element_pattern, phase_centres=phase_centres,
-        range_m=range_m, snr_db=snr_db, seed=seed,
+        range_m=range_m, snr_db=snr_db, seed=seed, sound_speed=sound_speed,
     )  # fmt: skip
     check_size(sonar, track, range_m)
     parts = scene_parts(scene)
@@ -152,7 +161,8 @@ def simulate(
     if phase_centres:
         middle_m = (geometry.tx_m + geometry.rx_m) / 2
         geometry = geometry._replace(tx_m=middle_m, rx_m=middle_m)
-    paths = Paths(parts, geometry, sound, spreading, patterns, sonar.receivers)
+    _check_heights(sound_speed, geometry)
+    paths = Paths(parts, geometry, sound, spreading, patterns, sonar.receivers, sound_speed)
     ringing = RINGING / rate
     if range_m is None:
         nearest, farthest = paths.delay_limits_s(workers)
@@ -184,6 +194,7 @@ def simulate(
     return Echoes(
         samples, start, rate, pulse.carrier_hz, geometry.tx_m, geometry.rx_m, sound, pulse,
         geometry.rx_velocity_m_s, look, track.georeference, sonar.channel_banks(track.pings),
+        sound_speed,
     )  # fmt: skip
 
 
@@ -197,9 +208,11 @@ def check_options(
     range_m: ArrayLike | None = None,
     snr_db: float | None = None,
     seed: int = 0,
+    sound_speed: SoundSpeed | None = None,
 ) -> None:
     """Raise TypeError or ValueError for options that `simulate` refuses for every survey."""
     validate.instance("pointing", pointing, Pointing, type(None))
+    validate.instance("sound_speed", sound_speed, SoundSpeed, type(None))
     validate.flag("spreading", spreading)
     validate.flag("motion_in_flight", motion_in_flight)
     validate.flag("element_pattern", element_pattern)
@@ -239,6 +252,7 @@ def simulate_lines(
     first_range_m: ArrayLike | None = None,
     length: int | None = None,
     rx_velocity_m_s: ArrayLike | None = None,
+    sound_speed: SoundSpeed | None = None,
     workers: int | None = None,
     progress: Progress = None,
 ) -> RangeLines:
@@ -264,6 +278,9 @@ def simulate_lines(
     rx_velocity_m_s : array_like, [channels, 3] or [3], optional
         Velocity of the receivers while the sound travels, metres per second. None means
         stop-and-hop.
+    sound_speed : SoundSpeed, optional
+        Sound speed over depth. Sound then travels along exact rays, and `sound_speed_m_s` only
+        converts delays to ranges.
     workers, progress
         As for `simulate`.
 
@@ -274,8 +291,9 @@ def simulate_lines(
     Raises
     ------
     TypeError, ValueError
-        If an argument has the wrong type or is outside its limits, shapes disagree, or the lines
-        do not fit into memory.
+        If an argument has the wrong type or is outside its limits, shapes disagree, the lines do
+        not fit into memory, `sound_speed` does not reach an antenna or a point, or a point lies in
+        a shadow zone.
 
     Warns
     -----
@@ -315,7 +333,10 @@ def simulate_lines(
     sound = validate.number(
         "sound_speed_m_s", sound_speed_m_s, "m/s", above=0.0, most=validate.MOST_M_S
     )
-    paths = Paths(parts, _channels(tx_m, rx_m, rx_velocity_m_s), sound)
+    validate.instance("sound_speed", sound_speed, SoundSpeed, type(None))
+    antennas = _channels(tx_m, rx_m, rx_velocity_m_s)
+    _check_heights(sound_speed, antennas)
+    paths = Paths(parts, antennas, sound, sound_speed=sound_speed)
     if (first_range_m is None) != (length is None):
         raise ValueError("first_range_m and length must be given together or not at all")
     # The receiver's filter needs a guard band. If there is none, record at twice the rate.
@@ -353,7 +374,7 @@ def simulate_lines(
     geometry = paths.geometry
     echoes = Echoes(
         samples, start, rate, carrier, geometry.tx_m, geometry.rx_m, sound, None,
-        geometry.rx_velocity_m_s,
+        geometry.rx_velocity_m_s, sound_speed=sound_speed,
     )  # fmt: skip
     lines = compress(echoes, window=window, oversampling=oversampling, bandwidth_hz=band)
     return replace(
@@ -361,6 +382,13 @@ def simulate_lines(
         samples=lines.samples[:, RINGING : RINGING + length],
         first_range_m=sound / 2 * nearest,
     )
+
+
+def _check_heights(sound_speed: SoundSpeed | None, geometry: Channels) -> None:
+    """Raise ValueError if a profile does not reach all antennas."""
+    if sound_speed is not None:
+        sound_speed.check_reaches(geometry.tx_m[:, 2], "tx_m")
+        sound_speed.check_reaches(geometry.rx_m[:, 2], "rx_m")
 
 
 def _channels(tx_m: ArrayLike, rx_m: ArrayLike, rx_velocity_m_s: ArrayLike | None) -> Channels:

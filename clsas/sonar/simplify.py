@@ -29,7 +29,8 @@ from clsas.sonar.visibility import sines
 MOTION = "motion during flight"
 APART = "transmitter and receiver apart"
 RELIEF = "relief of the grid"
-EFFECTS = (MOTION, APART, RELIEF)
+REFRACTION = "refraction"
+EFFECTS = (MOTION, APART, RELIEF, REFRACTION)
 
 SHARE = 1 / 20
 """Share of the allowed error power that all omitted effects together may add."""

@@ -1,0 +1,342 @@
+"""Rays in water whose sound speed varies with depth: travel times between two positions.
+
+In a layer in which the speed c is linear in depth, a ray is an arc of a circle. Its horizontal
+slowness p = cos(angle)/c is the same in all layers (Snell's law). With w = sqrt(1 - p^2 c^2), the
+sine of its angle, and the speeds a and b at the ends of a piece of thickness h,
+
+    X = p h (a + b)/(w_a + w_b)                                    (horizontal distance)
+    t = S atanh(g S)/(g S),   g = (b - a)/h,                       (travel time)
+    S = h (a + b)(1 + w_a w_b)/((w_a + w_b)(a^2 + b^2 - p^2 a^2 b^2)).
+
+These are the usual formulas of arcs [1]_, rearranged so that no difference of nearly equal
+numbers remains, and that g = 0 is no exception. With C the largest speed on the way and
+v = 1/(p C)^2 - 1, X falls as v grows, and 1/X^2 is almost linear in v: a few steps of Newton's
+method find the ray. Its time, taken as sum(t) + p (D - X) for the distance D, is stationary in p
+(Fermat), so that it is accurate to rounding.
+
+.. [1] Jensen, Kuperman, Porter, Schmidt, "Computational Ocean Acoustics", 2nd edition, Springer,
+   2011, section 3.3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.core.sound_speed import SoundSpeed
+
+_STEPS = 60  # of Newton's method, at most; 3 to 8 are usual
+_CLOSE = 1e-14  # relative error of the distance at which a ray counts as found
+_VERTICAL = 1e-9  # least horizontal distance over height, for which a time differs by 1e-18
+_TURNS = 32  # depths per layer at which turning rays are tried before they are refined
+_HALVINGS = 50  # of the interval between two of them
+_AT_ONCE = 1 << 15  # rays that are computed together; bounds memory
+_TURNING_AT_ONCE = 1 << 9
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Direct rays between pairs of positions; all arrays have one shape.
+
+    Attributes
+    ----------
+    time_s : float64
+        Travel time; infinite where there is no ray.
+    slowness_s_m : float64
+        Horizontal slowness: the change of the travel time per metre of horizontal distance.
+    one_slope_s_m, other_slope_s_m : float64
+        Change of the travel time per metre that one (the other) end moves up.
+    exists : bool
+        False in shadow zones.
+    """
+
+    time_s: NDArray[np.float64]
+    slowness_s_m: NDArray[np.float64]
+    one_slope_s_m: NDArray[np.float64]
+    other_slope_s_m: NDArray[np.float64]
+    exists: NDArray[np.bool_]
+
+
+def rays(
+    profile: SoundSpeed, horizontal_m: ArrayLike, one_z_m: ArrayLike, other_z_m: ArrayLike
+) -> Rays:
+    """Return the direct rays between pairs of positions.
+
+    Parameters
+    ----------
+    profile : SoundSpeed
+    horizontal_m : array_like of float
+        Horizontal distances of the two positions, metres.
+    one_z_m, other_z_m : array_like of float
+        Heights of the two positions, metres; all three arguments broadcast.
+
+    Returns
+    -------
+    Rays
+
+    Raises
+    ------
+    ValueError
+        If a height is outside the profile.
+
+    Notes
+    -----
+    A direct ray neither passes below the deeper of its ends, where the seabed is, nor meets the
+    surface. Where no ray rises or falls all the way, one that first rises above both ends and turns
+    is taken; if there are several, the first to arrive.
+    """
+    distance, one, other = np.broadcast_arrays(
+        *(np.asarray(each, np.float64) for each in (horizontal_m, one_z_m, other_z_m))
+    )
+    for z in (one, other):
+        if z.size:
+            profile.check_reaches(z)
+    found = np.empty((5, distance.size))
+    flat = [np.ravel(each) for each in (distance, one, other)]
+    for first in range(0, distance.size, _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        found[:, some] = _some_rays(profile, *(each[some] for each in flat))
+    time, slowness, of_one, of_other, exists = found.reshape(5, *distance.shape)
+    return Rays(time, slowness, of_one, of_other, exists > 0)
+
+
+def farthest_m(profile: SoundSpeed, one_z_m: float, other_z_m: float) -> float:
+    """Return the horizontal distance up to which direct rays connect two heights, metres.
+
+    It is infinite if there is no shadow zone within 100 km, and accurate to a centimetre.
+    """
+    lit, dark = 0.0, 1e5
+    if rays(profile, dark, one_z_m, other_z_m).exists:
+        return float("inf")
+    while dark - lit > 0.01:
+        middle = (lit + dark) / 2
+        if rays(profile, middle, one_z_m, other_z_m).exists:
+            lit = middle
+        else:
+            dark = middle
+    return lit
+
+
+def shadow(profile: SoundSpeed, horizontal_m: float, one_z_m: float, other_z_m: float) -> str:
+    """Return the explanation that no direct ray connects two positions."""
+    reach = farthest_m(profile, one_z_m, other_z_m)
+    depths = (profile.surface_z_m - np.array([one_z_m, other_z_m])).round(2)
+    return (
+        f"no direct ray connects depths of {depths[0]:g} m and {depths[1]:g} m over "
+        f"{horizontal_m:.1f} m: the sound speed bends rays away beyond {reach:.1f} m, a shadow "
+        "zone. Use only nearer ranges, or check sound_speed"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """Pieces of the way from one depth down to another, [layers, rays].
+
+    Attributes
+    ----------
+    thickness, above, below : float64 [layers, rays]
+        Thickness of every piece, and the speeds at its upper and lower end.
+    fastest : float64 [rays]
+        Largest speed on the way.
+    """
+
+    thickness: NDArray[np.float64]
+    above: NDArray[np.float64]
+    below: NDArray[np.float64]
+    fastest: NDArray[np.float64]
+
+    @classmethod
+    def between(
+        cls, profile: SoundSpeed, upper: NDArray[np.float64], lower: NDArray[np.float64]
+    ) -> _Way:
+        """Return the way between depths, `upper` above `lower`, [rays] each."""
+        edges, speeds = profile.depth_m[:, None], profile.speed_m_s[:, None]
+        steepness = np.diff(speeds, axis=0) / np.diff(edges, axis=0)
+        start = np.clip(upper, edges[:-1], edges[1:])
+        stop = np.clip(lower, edges[:-1], edges[1:])
+        thickness = np.maximum(stop - start, 0.0)
+        above = speeds[:-1] + steepness * (start - edges[:-1])
+        below = speeds[:-1] + steepness * (stop - edges[:-1])
+        crossed = thickness > 0
+        at_top = np.interp(upper, profile.depth_m, profile.speed_m_s)
+        above, below = (np.where(crossed, each, at_top) for each in (above, below))
+        fastest = np.maximum(above.max(axis=0), below.max(axis=0))
+        return cls(thickness, above, below, fastest)
+
+    @cached_property
+    def _excess(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """1 - (c/C)^2 at the upper and lower ends, with C the largest speed."""
+        top = self.fastest
+        above, below = ((top - c) * (top + c) / top**2 for c in (self.above, self.below))
+        return above, below
+
+    def distance(self, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the horizontal distance for v = 1/(p C)^2 - 1, and its derivative, [rays]."""
+        above, below = (np.sqrt(v + excess) for excess in self._excess)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pieces = self.thickness * (self.above + self.below) / self.fastest / (above + below)
+            pieces = np.where(self.thickness > 0, pieces, 0.0)
+            slopes = np.where(self.thickness > 0, -pieces / (2 * above * below), 0.0)
+        return pieces.sum(axis=0), slopes.sum(axis=0)
+
+    def time(self, v: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the travel time of the ray with v = 1/(p C)^2 - 1, [rays]."""
+        above, below = (np.sqrt((v + excess) / (1 + v)) for excess in self._excess)
+        a, b, slowness2 = self.above, self.below, 1 / (self.fastest**2 * (1 + v))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = (a + b) * (1 + above * below) / (above + below)
+            scale /= a**2 + b**2 - slowness2 * a**2 * b**2
+            turned = scale * (b - a)  # g S
+            turned = np.where(self.thickness > 0, turned, 0.0)
+            factor = np.where(turned != 0, np.arctanh(turned) / turned, 1.0)
+            pieces = np.where(self.thickness > 0, self.thickness * scale * factor, 0.0)
+        return pieces.sum(axis=0)
+
+
+def _some_rays(
+    profile: SoundSpeed,
+    distance: NDArray[np.float64],
+    one_z: NDArray[np.float64],
+    other_z: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return time, slowness, slopes at both ends, and 1 where there is a ray, [5, rays]."""
+    one, other = profile.surface_z_m - one_z, profile.surface_z_m - other_z
+    limits = profile.depth_m[0], profile.depth_m[-1]
+    upper, lower = (np.clip(pick(one, other), *limits) for pick in (np.minimum, np.maximum))
+    way = _Way.between(profile, upper, lower)
+    height = way.thickness.sum(axis=0)
+    distance = np.maximum(distance, _VERTICAL * height)
+    v = _found_v(way, height, distance)
+    at_ends = [np.interp(depth, profile.depth_m, profile.speed_m_s) for depth in (upper, lower)]
+    with np.errstate(invalid="ignore"):
+        slowness = 1 / (way.fastest * np.sqrt(1 + v))
+        time = way.time(v) + slowness * (distance - way.distance(v)[0])
+    level = height == 0
+    if level.any():
+        straight = level & _constant_at(profile, upper)
+        slowness[straight] = 1 / at_ends[0][straight]
+        time[straight] = (distance * slowness)[straight]
+        v[straight] = 0.0
+        same = level & (distance == 0)
+        time[same], v[same] = 0.0, 0.0
+        slowness[same] = 0.0
+    turns = np.zeros(len(v), bool)
+    missing = np.flatnonzero(np.isnan(v))
+    for first in range(0, len(missing), _TURNING_AT_ONCE):
+        some = missing[first : first + _TURNING_AT_ONCE]
+        slowness[some], time[some] = _turning(profile, distance[some], upper[some], lower[some])
+        turns[some] = np.isfinite(time[some])
+    exists = ~np.isnan(v) | turns
+    with np.errstate(invalid="ignore"):
+        steep = [np.sqrt(np.maximum(1 / c**2 - slowness**2, 0.0)) for c in at_ends]
+    at_upper, at_lower = np.where(turns, -steep[0], steep[0]), -steep[1]
+    slopes = [
+        np.where(one <= other, at_upper, at_lower), np.where(one <= other, at_lower, at_upper),
+    ]  # fmt: skip
+    found = np.stack([time, slowness, *slopes, exists.astype(np.float64)])
+    found[0, ~exists] = np.inf
+    found[1:4, ~exists] = 0.0
+    return found
+
+
+def _found_v(
+    way: _Way, height: NDArray[np.float64], distance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return v of the rays that do not turn and cover some distances; NaN where there is none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        limit, _ = way.distance(np.zeros_like(distance))
+        limit = np.where(np.isnan(limit), np.inf, limit)
+        found = np.where((distance <= limit) & (height > 0), (height / distance) ** 2, np.nan)
+    left = np.flatnonzero(~np.isnan(found))
+    low, high = np.zeros(len(found)), found.copy()
+    for _ in range(_STEPS):
+        if not left.size:
+            break
+        part = _Way(way.thickness[:, left], way.above[:, left], way.below[:, left],
+                    way.fastest[left])  # fmt: skip
+        v, wanted = found[left], distance[left]
+        reached, slope = part.distance(v)
+        high[left] = np.where(reached <= wanted, np.minimum(high[left], v), high[left])
+        low[left] = np.where(reached >= wanted, np.maximum(low[left], v), low[left])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = (reached**3 / wanted**2 - reached) / (-2 * slope)
+        newer = v + step
+        outside = ~((newer >= low[left]) & (newer <= high[left]))
+        newer = np.where(outside, (low[left] + high[left]) / 2, newer)
+        done = np.abs(reached - wanted) <= _CLOSE * wanted
+        found[left] = np.where(done, v, newer)
+        left = left[~done & (newer != v)]
+    return found
+
+
+def _constant_at(profile: SoundSpeed, depth: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return whether depths lie in a layer of constant speed, or on its edge."""
+    flat = np.flatnonzero(np.diff(profile.speed_m_s) == 0)
+    starts, stops = profile.depth_m[flat], profile.depth_m[flat + 1]
+    return ((depth[:, None] >= starts) & (depth[:, None] <= stops)).any(axis=1)
+
+
+def _turning(
+    profile: SoundSpeed,
+    distance: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    lower: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return slowness and time of rays that rise above both ends; infinite times without one.
+
+    A ray turns at the depth where the speed is 1/p, if it is slower everywhere below.
+    """
+    best_time, best_slowness = np.full(len(distance), np.inf), np.zeros(len(distance))
+    edges, speeds = profile.depth_m, profile.speed_m_s
+    fraction = np.linspace(0, 1, _TURNS + 1)[:, None]
+    for layer in np.flatnonzero(np.diff(speeds) < 0):
+        top, bottom = edges[layer], np.minimum(edges[layer + 1], upper)
+        reach = np.maximum(bottom - top, 0.0)
+
+        def turned(
+            share: NDArray[np.float64], some: NDArray[np.int64], reach=reach, bottom=bottom
+        ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+            """Return distance, time and slowness for turns at some share of the layer."""
+            # The distance has a square root at the start of the layer, hence the square.
+            depth = bottom[some] - reach[some] * share**2
+            speed = np.interp(depth, edges, speeds)
+            parts = [_Way.between(profile, depth, end[some]) for end in (upper, lower)]
+            allowed = np.all([part.fastest <= speed for part in parts], axis=0) & (share > 0)
+            parts = [_Way(p.thickness, p.above, p.below, np.maximum(p.fastest, speed))
+                     for p in parts]  # fmt: skip
+            nothing = np.zeros(len(depth))
+            covered = sum(part.distance(nothing)[0] for part in parts)
+            time = sum(part.time(nothing) for part in parts)
+            slowness = 1 / speed
+            time = time + slowness * (distance[some] - covered)
+            return np.where(allowed, covered, np.nan), time, slowness
+
+        everything = np.flatnonzero(reach > 0)
+        if not everything.size:
+            continue
+        covered = np.stack([turned(np.full(len(everything), s[0]), everything)[0]
+                            for s in fraction])  # fmt: skip
+        beyond = covered - distance[everything]
+        # At the start of the layer above the upper end the turning ray is the direct one.
+        starts = (edges[layer + 1] >= upper)[everything]
+        direct = _Way.between(profile, upper[everything], lower[everything])
+        limit = direct.distance(np.zeros(len(everything)))[0]
+        shallow = np.interp(upper[everything], edges, speeds) >= direct.fastest
+        beyond[0] = np.where(starts & shallow, limit - distance[everything], np.nan)
+        with np.errstate(invalid="ignore"):
+            crossed = beyond[:-1] * beyond[1:] <= 0
+        for step, ray in zip(*np.nonzero(crossed), strict=True):
+            some = everything[ray : ray + 1]
+            low, high = fraction[step], fraction[step + 1]
+            sign = np.sign(beyond[step + 1, ray]) or 1.0
+            for _ in range(_HALVINGS):
+                middle = (low + high) / 2
+                is_beyond = sign * (turned(middle, some)[0] - distance[some]) > 0
+                low, high = np.where(is_beyond, low, middle), np.where(is_beyond, middle, high)
+            _, time, slowness = turned(high, some)
+            if time[0] < best_time[some[0]]:
+                best_time[some], best_slowness[some] = time, slowness
+    return best_slowness, best_time

@@ -1,0 +1,82 @@
+"""Reading of sound-speed profiles from CSV files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+
+import numpy as np
+
+from clsas.core import reading, validate
+from clsas.core.sound_speed import SoundSpeed
+from clsas.files.mistakes import suggestion
+from clsas.files.tables import located
+
+_MEASURED = ("depth_m", "speed_m_s")
+_DERIVED = ("depth_m", "temperature_c", "salinity")
+
+
+def read_sound_speed(path: str | os.PathLike, *, surface_z_m: float = 0.0) -> SoundSpeed:
+    """Return the sound-speed profile in a CSV file.
+
+    The file has a line of column names and one line per depth, in ascending order. The columns are
+    either depth_m and speed_m_s, or depth_m, temperature_c and salinity, from which Mackenzie's
+    formula gives the speed (`SoundSpeed.from_temperature`). They may be in any order.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    surface_z_m : float
+        Height z of the surface, metres, as for `SoundSpeed`.
+
+    Raises
+    ------
+    ValueError
+        If a column is unknown, missing or repeated, a value is not a finite number, or the values
+        are not those of a profile (`SoundSpeed`).
+    OSError
+        If the file cannot be read.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> profile = clsas.read_sound_speed("cast.csv", surface_z_m=20.0)  # doctest: +SKIP
+    """
+    text = reading.read_bytes(path).decode("utf-8-sig")
+    reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+    try:
+        names = [name.strip() for name in next(reader, [])]
+        rows = [(reader.line_num, row) for row in reader if row]
+    except csv.Error as error:
+        raise ValueError(f"{path}: line {reader.line_num} is not CSV: {error}") from None
+    known = dict.fromkeys((*_MEASURED, *_DERIVED))
+    for name in names:
+        if name not in known:
+            raise ValueError(
+                f"{path}: unknown column {validate.shown(name)}{suggestion(name, known)}"
+            )
+    if sorted(names) not in (sorted(_MEASURED), sorted(_DERIVED)):
+        raise ValueError(
+            f"{path} must have the columns {', '.join(_MEASURED)} or {', '.join(_DERIVED)}, got "
+            f"{', '.join(names)}"
+        )
+    if not rows:
+        raise ValueError(f"{path} must have depths below the names of the columns")
+    values = np.empty((len(rows), len(names)))
+    for index, (line, row) in enumerate(rows):
+        try:
+            values[index] = [float(value) for value in row]
+        except ValueError:
+            got = validate.shown(",".join(row))
+            raise ValueError(
+                f"{path}: line {line} must be {len(names)} numbers, got {got}"
+            ) from None
+    column = dict(zip(names, values.T, strict=True))
+    with located(f"{path}:"):
+        if "speed_m_s" in column:
+            return SoundSpeed(column["depth_m"], column["speed_m_s"], surface_z_m)
+        return SoundSpeed.from_temperature(
+            *(column[name] for name in _DERIVED), surface_z_m=surface_z_m
+        )

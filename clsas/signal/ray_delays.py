@@ -1,0 +1,199 @@
+"""Two-way delays along exact rays, of pairs of channels and points and of a sample of a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.geometry import pairwise_range_m
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines, some_channels
+from clsas.core.rays import rays, shadow
+from clsas.core.sound_speed import SoundSpeed
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.visibility import sines
+
+POINTS = 9
+"""Number of sample pixels along either side of a grid; points without rows have its square."""
+
+FLIGHT_STEPS = 4
+"""Iterations for a moving receiver. Each multiplies the error by v/c, which is below 0.05."""
+
+_CHANNELS = 48  # sample channels, beside the first, the last, and those at extreme heights
+_BEYOND_BEAM = 0.05  # sine by which a sample pixel may lie outside the beam
+
+
+def at_speed(lines: RangeLines, sound_speed_m_s: float) -> RangeLines:
+    """Return the same lines over ranges of another speed of sound, without a profile."""
+    scale = sound_speed_m_s / lines.sound_speed_m_s
+    return replace(
+        lines,
+        first_range_m=lines.first_range_m * scale,
+        range_step_m=lines.range_step_m * scale,
+        sound_speed_m_s=sound_speed_m_s,
+        sound_speed=None,
+    )
+
+
+def delays_s(
+    lines: RangeLines, channels: NDArray[np.int64], points_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the two-way delays along exact rays of pairs of channels and points, [n], seconds.
+
+    Raises
+    ------
+    ValueError
+        If no direct ray connects a pair.
+    """
+    profile = lines.sound_speed
+    assert profile is not None
+    tx_m, rx_m = lines.tx_m[channels], lines.rx_m[channels]
+    out = one_way_s(profile, points_m, tx_m)
+    if lines.rx_velocity_m_s is None:
+        monostatic = np.array_equal(tx_m, rx_m)
+        return 2 * out if monostatic else out + one_way_s(profile, points_m, rx_m)
+    velocity, delay = lines.rx_velocity_m_s[channels], 2 * out
+    for _ in range(FLIGHT_STEPS):
+        delay = out + one_way_s(profile, points_m, rx_m + velocity * delay[:, None])
+    return delay
+
+
+def one_way_s(
+    profile: SoundSpeed, points_m: NDArray[np.float64], antennas_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the travel times between pairs of points and antennas, [n], seconds.
+
+    Raises
+    ------
+    ValueError
+        If no direct ray connects a pair.
+    """
+    offset = points_m - antennas_m
+    distance = np.hypot(offset[:, 0], offset[:, 1])
+    found = rays(profile, distance, antennas_m[:, 2], points_m[:, 2])
+    if not found.exists.all():
+        dark = np.flatnonzero(~found.exists)
+        nearest = dark[distance[dark].argmin()]
+        place = distance[nearest], antennas_m[nearest, 2], points_m[nearest, 2]
+        raise ValueError(f"sound_speed: {shadow(profile, *map(float, place))}")
+    return found.time_s
+
+
+@dataclass(frozen=True, eq=False)
+class RaySample:
+    """Sample pixels and channels with their exact ranges, [points, channels].
+
+    Attributes
+    ----------
+    lines : RangeLines
+        Lines of the sample channels, with the profile.
+    channels : int64 [channels]
+    points_m : float64 [points, 3]
+    visible : bool
+        False for pixels outside the beam or beyond the ends of a line.
+    delay_s : float64
+        Two-way delays along exact rays; 0 where not visible.
+    """
+
+    lines: RangeLines
+    channels: NDArray[np.int64]
+    points_m: NDArray[np.float64]
+    visible: NDArray[np.bool_]
+    delay_s: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, lines: RangeLines, grid: Grid, beam: BeamWindow | None) -> RaySample:
+        """Return a sample of lines and grid."""
+        extreme = [f(each[:, 2]) for each in (lines.tx_m, lines.rx_m)
+                   for f in (np.argmin, np.argmax)]  # fmt: skip
+        some = np.union1d(
+            some_channels(lines.channels, _CHANNELS), [0, lines.channels - 1, *extreme]
+        ).astype(np.int64)
+        part, points_m = lines.select(some), sample_points_m(grid)
+        assert part.sound_speed is not None
+        straight_m = pairwise_range_m(
+            points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
+        )
+        # Sound is faster or slower than the nominal speed, and pixels lie around the sample.
+        ratio = part.sound_speed_m_s / part.sound_speed.speed_m_s
+        slack_m = np.ptp(points_m, axis=0).max() / max(POINTS - 1, 1)
+        visible = straight_m * ratio.max() + slack_m >= part.first_range_m
+        visible &= straight_m * ratio.min() - slack_m <= part.last_range_m
+        if beam is not None:
+            sine = sines(points_m, part.phase_centres_m, beam.directions(lines)[some]).T
+            around = _BEYOND_BEAM + slack_m / np.maximum(straight_m, 1e-30)
+            visible &= (sine > beam.limits[0] - around) & (sine < beam.limits[1] + around)
+        delay_s = np.zeros(visible.shape)
+        point, channel = np.nonzero(visible)
+        delay_s[visible] = delays_s(part, channel, points_m[point])
+        return cls(part, some, points_m, visible, delay_s)
+
+    @property
+    def distances_m(self) -> NDArray[np.float64]:
+        """Horizontal distances of the points from the phase centres."""
+        offset = self.points_m[:, None, :2] - self.lines.phase_centres_m[:, :2]
+        return np.hypot(offset[..., 0], offset[..., 1])
+
+    @property
+    def middle_m(self) -> NDArray[np.float64]:
+        """Middle of the visible distances, [1]."""
+        distance = self.distances_m[self.visible]
+        return np.array([max((distance.min() + distance.max()) / 2, 1e-3)])
+
+    @property
+    def centre_m(self) -> NDArray[np.float64]:
+        """Middle of the pixels that are visible, x and y."""
+        seen_m = self.points_m[self.visible.any(axis=1), :2]
+        return (seen_m.min(axis=0) + seen_m.max(axis=0)) / 2
+
+    def middles_m(self, lines: RangeLines) -> NDArray[np.float64]:
+        """Return the distance of every channel from the middle of the grid, [channels]."""
+        distance = self.distances_m[self.visible]
+        offset_m = lines.phase_centres_m[:, :2] - self.centre_m
+        return np.clip(np.hypot(*offset_m.T), max(distance.min(), 1e-3), distance.max())
+
+    def mean_speed_m_s(self) -> float:
+        """Return the speed with which straight rays fit the delays best, by least squares."""
+        lines, speed = self.lines, self.lines.sound_speed_m_s
+        for _ in range(2):  # the positions of moving receivers depend a little on the speed
+            range_m = pairwise_range_m(
+                self.points_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, speed
+            )[self.visible]
+            delay = self.delay_s[self.visible]
+            speed = float(2 * (range_m @ delay) / (delay @ delay))
+        return speed
+
+    def error(self, lines: RangeLines, range_m: NDArray[np.float64]) -> float:
+        """Return the mean squared phase error of the worst pixel if its ranges are others.
+
+        Parameters
+        ----------
+        lines : RangeLines
+            Lines in which the ranges apply.
+        range_m : float64 [points, channels]
+
+        Returns
+        -------
+        float
+            Mean over the channels that see the pixel, rad^2: its relative error power.
+        """
+        square = np.where(
+            self.visible, (2 * range_m / lines.sound_speed_m_s - self.delay_s) ** 2, 0.0
+        )
+        seen = np.maximum(np.count_nonzero(self.visible, axis=1), 1)
+        highest_hz = lines.carrier_hz + lines.sound_speed_m_s / (2 * lines.range_step_m)
+        return float((2 * np.pi * highest_hz) ** 2 * (square.sum(axis=1) / seen).max())
+
+
+def sample_points_m(grid: Grid) -> NDArray[np.float64]:
+    """Return sample pixels all over a grid, [n, 3], metres."""
+    return grid.spread(POINTS if len(grid.shape) == 2 else POINTS**2)
+
+
+def straight_m(lines: RangeLines, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the ranges along straight rays, [points, channels], metres."""
+    return pairwise_range_m(
+        points_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
+    )

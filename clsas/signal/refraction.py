@@ -1,0 +1,181 @@
+"""Homogeneous water in place of a profile: lines and grids that any imager images correctly.
+
+The two-way delay of a pixel depends on its horizontal distance D from the antennas and on three
+heights. For one channel above a level seabed, it is therefore a function of D alone, and so is the
+range in homogeneous water. `homogeneous` makes use of this:
+
+- An *apparent antenna* takes the place of every antenna. It lies straight above or below it, on the
+  tangent of the ray at the seabed, so that echoes come from the right direction. The speed is that
+  at the seabed.
+- The range axis of every line is changed by a smooth function, so that the delay is right at every
+  distance. At the middle of the grid this is a shift. The samples are interpolated once.
+- On a grid that is not level, pixels get *apparent positions*, a few millimetres to centimetres
+  beside their own.
+
+On level grids the remaining error is that of the bistatic geometry, usually far below -80 dB.
+Where straight rays of the mean speed are accurate enough, they are used, and samples stay as they
+are. Every error is computed from exact rays, at sample pixels and channels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import validate
+from clsas.core.decibels import in_db, power
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.signal.apparent_antennas import Change
+from clsas.signal.apparent_pixels import apparent_grid
+from clsas.signal.ray_delays import RaySample, at_speed, sample_points_m, straight_m
+from clsas.sonar.beam import BeamWindow
+from clsas.sonar.simplify import REFRACTION, SHARE
+
+_LEVEL_M = 1e-6  # relief of a grid that counts as level
+
+
+@dataclass(frozen=True, eq=False)
+class StraightRays:
+    """Straight rays of the mean speed, and their errors at the visible pixels of a sample.
+
+    Attributes
+    ----------
+    sound_speed_m_s : float
+        Mean speed: that with which they fit the delays along exact rays best.
+    error : float
+        Squared phase error of the worst pixel, rad^2.
+    away_s : float64 [pairs]
+        Errors of the delays.
+    """
+
+    sound_speed_m_s: float
+    error: float
+    away_s: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, sample: RaySample) -> StraightRays:
+        """Return the straight rays that fit a sample best."""
+        lines = at_speed(sample.lines, sample.mean_speed_m_s())
+        range_m = straight_m(lines, sample.points_m)
+        away_s = (2 * range_m / lines.sound_speed_m_s - sample.delay_s)[sample.visible]
+        return cls(lines.sound_speed_m_s, sample.error(lines, range_m), away_s)
+
+    @property
+    def rms_s(self) -> float:
+        """Rms error of the delays, seconds."""
+        return float(np.sqrt(np.mean(self.away_s**2)))
+
+    @property
+    def most_s(self) -> float:
+        """Largest error of the delays, seconds."""
+        return float(np.abs(self.away_s).max())
+
+    def image_error(self, frequency_hz: float) -> float:
+        """Return the relative error power of an image at one frequency."""
+        return float(np.mean(4 * np.sin(np.pi * frequency_hz * self.away_s) ** 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Homogeneous:
+    """Homogeneous water that takes the place of a profile for one geometry.
+
+    Attributes
+    ----------
+    grid : Grid
+        Pixels, at apparent positions if they do not lie on a level plane.
+    sound_speed_m_s : float
+        Speed of the homogeneous water; 0 if the lines have no profile.
+    change : Change or None
+        Apparent antennas and the changes of range axes; None for straight rays of the mean speed.
+    error : float
+        Upper bound of the relative error power of images.
+    straight : StraightRays or None
+        Straight rays of the mean speed and their errors; None without a profile.
+    """
+
+    grid: Grid
+    sound_speed_m_s: float = 0.0
+    change: Change | None = None
+    error: float = 0.0
+    straight: StraightRays | None = None
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """`REFRACTION` if straight rays are accurate enough."""
+        return (REFRACTION,) if self.sound_speed_m_s and self.change is None else ()
+
+    def lines(self, lines: RangeLines) -> RangeLines:
+        """Return lines of the geometry in homogeneous water, unchanged without a profile."""
+        if lines.sound_speed is None:
+            return lines
+        if self.change is None:
+            return at_speed(lines, self.sound_speed_m_s)
+        return self.change.lines(lines, self.sound_speed_m_s)
+
+
+def homogeneous(
+    lines: RangeLines, grid: Grid, beam: BeamWindow | None, allowed_db: float | None
+) -> Homogeneous:
+    """Return the homogeneous water in which to image lines with a profile.
+
+    Parameters
+    ----------
+    lines : RangeLines
+    grid : Grid
+    beam : BeamWindow or None
+    allowed_db : float or None
+        Allowed relative rms error of the image, dB. With None, or if straight rays are not within
+        a small share of its power, there are apparent antennas.
+
+    Raises
+    ------
+    ValueError
+        If the profile does not reach an antenna or a pixel, or a pixel lies in a shadow zone of a
+        channel that should receive from it.
+
+    Warns
+    -----
+    ClsasWarning
+        If refraction alone causes more than half of the allowed error power.
+
+    Notes
+    -----
+    The error is that of the worst sample pixel, at the highest frequency of the sampled band.
+    """
+    profile = lines.sound_speed
+    if profile is None:
+        return Homogeneous(grid)
+    low, high = grid.bounds_m
+    profile.check_reaches(np.array([low[2], high[2]]), "the grid's pixels")
+    sample = RaySample.of(lines, grid, beam)
+    if not sample.visible.any():
+        middle = profile.mean_m_s(float(lines.tx_m[0, 2]), float((low[2] + high[2]) / 2))
+        return Homogeneous(grid, middle)
+    straight = StraightRays.of(sample)
+    mean_m_s, mean_error = straight.sound_speed_m_s, straight.error
+    allowed = 0.0 if allowed_db is None else power(allowed_db)
+    if mean_error <= SHARE * allowed:
+        return Homogeneous(grid, mean_m_s, None, mean_error, straight)
+    change = Change.of(lines, sample, allowed_db, sample.middle_m)
+    best = Homogeneous(grid, change.sound_speed_m_s, change, change.error(sample), straight)
+    if best.error > SHARE * allowed and not _is_level(grid):
+        change = Change.of(lines, sample, allowed_db, sample.middles_m(lines))
+        moved = apparent_grid(grid, lines, sample, change)
+        error = change.error(sample, sample_points_m(moved))
+        if error < best.error:
+            best = replace(best, grid=moved, change=change, error=error)
+    best = replace(best, error=best.error + power(change.accuracy_db))
+    if allowed and best.error > allowed / 2:
+        validate.warn(
+            f"refraction leaves an error of up to {in_db(best.error):.0f} dB, and "
+            f"{allowed_db:.3g} dB are requested: form the image in parts, as clsas.mosaic does"
+        )
+    return best
+
+
+def _is_level(grid: Grid) -> bool:
+    low, high = grid.bounds_m
+    return bool(high[2] - low[2] <= _LEVEL_M)

@@ -1,0 +1,175 @@
+"""Images in water whose sound speed varies with depth, against sums along independent rays."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from bent import travel_times
+from factorizing import EXACT_IS_SLOW
+
+import clsas
+from clsas import Grid, RangeLines, SoundSpeed
+from clsas.sonar.simplify import REFRACTION
+from clsas.trials import oracle
+
+NOMINAL = 1500.0  # m/s, by which times become ranges
+CHANNELS, POINTS, PIXELS = 120, 150, (24, 24)
+
+
+@dataclass(frozen=True)
+class Case:
+    carrier_hz: float
+    range_m: float
+    depths_m: tuple[float, ...]
+    speeds_m_s: tuple[float, ...]
+    aperture_m: float
+    swath_m: float = 5.0
+    sonar_m: float = 10.0  # depth
+    seabed_m: float = 22.0
+    relief_m: float = 0.0
+
+
+def gradient(per_s, bottom_m=70.0):
+    return {"depths_m": (0.0, bottom_m), "speeds_m_s": (1480.0, 1480.0 + per_s * bottom_m)}
+
+
+THERMOCLINE = {"depths_m": (0.0, 14.0, 17.0, 60.0), "speeds_m_s": (1505.0, 1505.0, 1495.0, 1495.5)}
+CASES = {
+    "thermocline": Case(100e3, 60, **THERMOCLINE, aperture_m=12),
+    "gradient": Case(100e3, 60, **gradient(0.5), aperture_m=12),
+    "steep gradient": Case(300e3, 60, **gradient(1.0), aperture_m=5, swath_m=2),
+    "falling gradient": Case(100e3, 150, **gradient(-1.0), aperture_m=25, swath_m=20),
+    "low frequency": Case(
+        60e3, 300, **gradient(-1.0), aperture_m=60, swath_m=30, sonar_m=5, seabed_m=45
+    ),
+    "far thermocline": Case(200e3, 120, **THERMOCLINE, aperture_m=10, swath_m=4),
+    "relief": Case(100e3, 60, **gradient(0.5), aperture_m=12, relief_m=0.5),
+    "far relief": Case(60e3, 150, **gradient(-0.3), aperture_m=40, relief_m=1.0),
+}
+QUICK = "thermocline"
+
+
+@cache
+def made(name):
+    """Lines, grid, and the ideal image, all from rays that share nothing with the library."""
+    case = CASES[name]
+    random = np.random.default_rng(7)
+    middle_m = np.sqrt(case.range_m**2 - (case.seabed_m - case.sonar_m) ** 2)
+    x = np.linspace(-0.5, 0.5, CHANNELS) * case.aperture_m
+    x += random.uniform(-0.3, 0.3, CHANNELS) * case.aperture_m / CHANNELS
+    antennas = np.stack([x, 0 * x, 0 * x - case.sonar_m], axis=1)
+    far = middle_m + case.swath_m
+    grid = Grid.plane(
+        (-1.0, 1.0, PIXELS[1]),
+        (middle_m - case.swath_m / 2, middle_m + case.swath_m / 2, PIXELS[0]),
+        -case.seabed_m,
+    )
+    levels = np.array([0.0]) if not case.relief_m else np.linspace(-1, 1, 5) * case.relief_m
+    of_pixels = random.integers(len(levels), size=PIXELS)
+    if case.relief_m:
+        grid = grid.with_height(levels[of_pixels])
+    places = random.uniform([-1, -case.swath_m / 2], [1, case.swath_m / 2], (POINTS, 2))
+    places[:, 1] += middle_m
+    of_points = random.integers(len(levels), size=POINTS)
+
+    def ranges(positions_m, of_level):
+        found = np.empty((CHANNELS, len(positions_m)))
+        for index, level in enumerate(levels):
+            times = travel_times(
+                case.depths_m, case.speeds_m_s, case.sonar_m, case.seabed_m - level,
+                np.hypot(far, 1 + case.aperture_m / 2),
+            )  # fmt: skip
+            here = of_level == index
+            offset = positions_m[None, here, :2] - antennas[:, None, :2]
+            found[:, here] = NOMINAL * times(np.hypot(offset[..., 0], offset[..., 1]))
+        return found
+
+    per_m = 2 * case.carrier_hz / NOMINAL
+    band = oracle.Band(per_m, 0.15 * per_m, 0.015 * per_m)
+    amplitudes = random.normal(size=(POINTS, 2)) @ [1, 1j]
+    echoes = [oracle.Echo(ranges(places, of_points), amplitudes, [band])]
+    step_m = 1 / (0.32 * per_m)
+    pixels_m = ranges(grid.positions_m().reshape(-1, 3), of_pixels.ravel())
+    ends = (
+        min(pixels_m.min(), echoes[0].range_m.min()),
+        max(pixels_m.max(), echoes[0].range_m.max()),
+    )
+    first_m = ends[0] - 80 * step_m
+    length = int((ends[1] - first_m) / step_m) + 80
+    lines = RangeLines(
+        oracle.samples(echoes, first_m, step_m, length, per_m), first_m, step_m, antennas, antennas,
+        case.carrier_hz, NOMINAL, sound_speed=SoundSpeed(case.depths_m, case.speeds_m_s),
+    )  # fmt: skip
+    return lines, grid, oracle.image(echoes, pixels_m)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n == QUICK else pytest.mark.slow) for n in CASES]
+)
+def test_images_are_those_of_exact_rays(name):
+    lines, grid, ideal = made(name)
+    exact = clsas.backproject(lines, grid, accuracy_db=-62)
+    assert exact.grid is grid
+    assert oracle.error_db(exact.pixels, ideal) < -50
+    plan = clsas.plan(lines, grid, tolerance_db=-55, costs=EXACT_IS_SLOW)
+    image = clsas.factorize(lines, grid, plan)
+    assert oracle.error_db(image.pixels, ideal) < -50
+    assert REFRACTION not in plan.left_out
+
+
+def test_a_constant_speed_would_not_do():
+    lines, grid, ideal = made(QUICK)
+    profile = lines.sound_speed
+    for speed in (NOMINAL, profile.mean_m_s(-10, -22)):
+        scale = speed / NOMINAL
+        straight = replace(
+            lines, sound_speed=None, sound_speed_m_s=speed,
+            first_range_m=scale * lines.first_range_m, range_step_m=scale * lines.range_step_m,
+        )  # fmt: skip
+        image = clsas.backproject(straight, grid)
+        assert oracle.error_db(image.pixels, ideal) > -20
+
+
+@pytest.mark.parametrize("tolerance_db", [-20, -30])
+def test_the_mean_speed_is_enough_where_rays_hardly_bend(tolerance_db):
+    """Positions count as well: the error is that of the delays, not only of the focus."""
+    lines, grid, _ = made(QUICK)
+    profile = SoundSpeed([0, 40], [1500, 1500.5])
+    plan = clsas.plan(replace(lines, sound_speed=profile), grid, tolerance_db=tolerance_db)
+    assert REFRACTION in plan.left_out
+    assert plan.errors.left_out > 0
+
+
+def test_an_imager_takes_other_samples():
+    lines, grid, ideal = made(QUICK)
+    for request in ({"tolerance_db": -55}, {"accuracy_db": -62}):
+        with clsas.Imager(lines, grid, **request) as imager:
+            image = imager(replace(lines, samples=0.5j * lines.samples))
+            assert oracle.error_db(image.pixels, 0.5j * ideal) < -50
+            with pytest.raises(ValueError, match="lines must have the antennas"):
+                imager(replace(lines, sound_speed=None))
+
+
+def test_a_plan_belongs_to_the_profile():
+    lines, grid, _ = made(QUICK)
+    plan = clsas.plan(lines, grid, tolerance_db=-40)
+    plan.check(lines, grid)
+    with pytest.raises(ValueError, match="lines must have the geometry"):
+        plan.check(replace(lines, sound_speed=SoundSpeed([0, 40], [1500, 1501])), grid)
+    stored = clsas.Plan.from_json(plan.to_json())
+    image = clsas.factorize(lines, grid, stored)
+    assert clsas.relative_error_db(image, clsas.factorize(lines, grid, plan)) < -90
+
+
+def test_a_wavenumber_image_has_the_same_water():
+    lines, grid, ideal = made(QUICK)
+    straight = clsas.backproject(replace(lines, sound_speed=None), grid)
+    image = clsas.wavenumber(lines, grid)
+    # Too few channels for a spectrum along the track; yet the water must not add to that.
+    others = clsas.wavenumber(replace(lines, sound_speed=None), grid)
+    method_db = oracle.error_db(others.pixels, straight.pixels)
+    assert oracle.error_db(image.pixels, ideal) < method_db + 3
+    sloping = Grid.oriented([0, 58, -22], [0, 0.1, 0.02], [0.1, 0, 0], (8, 8))
+    with pytest.raises(ValueError, match="grid must be level"):
+        clsas.wavenumber(lines, sloping)
