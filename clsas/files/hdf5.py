@@ -24,9 +24,9 @@ from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
+from clsas.core.sound_speed import SoundSpeed
 from clsas.interferometry.interferogram import Interferogram
 from clsas.interferometry.result import Heights
-from clsas.core.sound_speed import SoundSpeed
 from clsas.signal.echoes import Echoes
 from clsas.sonar.system import Pulse
 
