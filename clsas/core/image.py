@@ -54,7 +54,7 @@ class Image:
     >>> image = clsas.Image(np.array([[1, 0.1j], [0, 0.01]]), grid)
     >>> image
     Image(2 x 2 complex pixels, x 0 to 1 m, y 40 to 41 m, z 0 m)
-    >>> image.db()
+    >>> image.db().round(2)
     array([[  0., -20.],
            [-inf, -40.]], dtype=float32)
     """

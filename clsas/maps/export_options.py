@@ -80,7 +80,7 @@ class ExportOptions:
     def _used(self, suffix: str) -> tuple[set[str], str]:
         """Return the options that have an effect on a format, and what the format is called."""
         if not suffix:
-            return {"dynamic_range_db", "colour_map"}, "a folder"
+            return {"dynamic_range_db", "colour_map"}, "a folder, as path is without a suffix"
         if suffix in PICTURES:
             return _COLOURS | {"north_arrow", "scale_bar"}, suffix
         if suffix in netcdf.SUFFIXES:

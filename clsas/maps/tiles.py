@@ -34,7 +34,7 @@ _FAINTEST = np.float32(1e-30)  # power that stays above 0 in float32, but below 
 
 
 @dataclass(frozen=True)
-class Levels:
+class Quantization:
     """How amplitudes become the levels of tiles.
 
     Attributes
@@ -75,15 +75,40 @@ class _Tile:
     missing: int  # pixels that have not been added yet
 
 
-def scales_of(shape: tuple[int, int]) -> range:
-    """Return the scales of a pyramid, coarsest first.
+def factors_of(shape: tuple[int, int], steps_m: tuple[float, float]) -> dict[int, tuple[int, int]]:
+    """Return pixels of the image along the rows and columns of a tile's pixel, by scale.
 
-    They are numbered as the levels of Deep Zoom: scale 0 would be a single pixel, and each has
-    twice as many pixels as the one before along either side. The coarsest scale here is the largest
-    that fits into one tile.
+    Scales are ascending, and the finest has the number of its level in Deep Zoom: the base 2
+    logarithm of the longer side, rounded up. The coarsest scale is the largest that fits into one
+    tile. From scale to scale both factors double, unless pixels are at least sqrt(2) times longer
+    along one side: then only the other factor does, since rows of 1 m are not to be averaged where
+    columns of 1 mm are too fine for a screen.
+
+    Parameters
+    ----------
+    shape : (rows, columns)
+        Shape of the image.
+    steps_m : (float, float)
+        Distance of its rows and of its columns.
     """
-    finest = math.ceil(math.log2(max(shape)))
-    return range(finest - max(0, math.ceil(math.log2(max(shape) / SIDE))), finest + 1)
+    scale, factors = math.ceil(math.log2(max(shape))), (1, 1)
+    found = {scale: factors}
+    while max(counts := shape_of(shape, factors)) > SIDE:
+        sides_m = [factor * step for factor, step in zip(factors, steps_m, strict=True)]
+        rows_finer, columns_finer = (
+            count > SIDE and math.sqrt(2) * side_m < other_m
+            for count, side_m, other_m in zip(counts, sides_m, sides_m[::-1], strict=True)
+        )
+        factors = factors[0] << (not columns_finer), factors[1] << (not rows_finer)
+        scale -= 1
+        found[scale] = factors
+    return dict(sorted(found.items()))
+
+
+def shape_of(shape: tuple[int, int], factors: tuple[int, int]) -> tuple[int, int]:
+    """Return the rows and columns of a scale with some factors."""
+    rows, columns = (math.ceil(n / factor) for n, factor in zip(shape, factors, strict=True))
+    return rows, columns
 
 
 @dataclass(eq=False)
@@ -94,28 +119,31 @@ class Pyramid:
     ----------
     shape : (rows, columns)
         Shape of the image.
-    levels : Levels
+    quantization : Quantization
     folder : Path
         Folder of the tiles: SCALE/COLUMN_ROW.js.
     name : str
         Name of the image, by which its tiles call the page.
+    factors : dict
+        Scales and their factors, as `factors_of` returns them.
     """
 
     shape: tuple[int, int]
-    levels: Levels
+    quantization: Quantization
     folder: Path
     name: str
+    factors: dict[int, tuple[int, int]]
     _pending: dict[tuple[int, int, int], _Tile] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Create the folders."""
-        for scale in scales_of(self.shape):
+        for scale in self.factors:
             (self.folder / str(scale)).mkdir(parents=True)
 
     def add(self, rows: slice, columns: slice, pixels: NDArray[np.complex64]) -> None:
         """Add the pixels of a window to the tiles of all scales. Windows must not overlap."""
-        power = self.levels.power(pixels)
-        self._add(scales_of(self.shape)[-1], rows.start, columns.start, power)
+        power = self.quantization.power(pixels)
+        self._add(max(self.factors), rows.start, columns.start, power)
 
     def _add(self, scale: int, top: int, left: int, power: NDArray[np.float32]) -> None:
         """Add power at a place of a scale, and what it completes to coarser scales."""
@@ -140,10 +168,11 @@ class Pyramid:
     def _tile(self, scale: int, row: int, column: int) -> _Tile:
         key = scale, row, column
         if key not in self._pending:
-            factor = 1 << (scales_of(self.shape)[-1] - scale)
             height, width = (
-                min(math.ceil(n / factor) - index * SIDE, SIDE)
-                for n, index in zip(self.shape, (row, column), strict=True)
+                min(n - index * SIDE, SIDE)
+                for n, index in zip(
+                    shape_of(self.shape, self.factors[scale]), (row, column), strict=True
+                )
             )
             self._pending[key] = _Tile(np.empty((height, width), np.float32), height * width)
         return self._pending[key]
@@ -152,18 +181,27 @@ class Pyramid:
         """Write a tile, and add its means to the next coarser scale."""
         power = self._pending.pop((scale, row, column)).power
         path = self.folder / str(scale) / f"{column}_{row}.js"
-        packed = base64.b64encode(_packed(self.levels.encode(power))).decode()
+        packed = base64.b64encode(_packed(self.quantization.encode(power))).decode()
         path.write_text(f'clsasTile("{self.name}/{scale}/{column}_{row}","{packed}");\n')
-        if scale > scales_of(self.shape)[0]:
-            self._add(scale - 1, row * SIDE // 2, column * SIDE // 2, halved(power))
+        if scale > min(self.factors):
+            coarser, own = self.factors[scale - 1], self.factors[scale]
+            down, across = coarser[0] // own[0], coarser[1] // own[1]
+            top, left = row * SIDE // down, column * SIDE // across
+            self._add(scale - 1, top, left, reduced(power, down, across))
 
 
-def halved(power: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the means of 2 x 2 pixels, or of those that exist at the end of odd sides."""
-    rows, columns = (n % 2 for n in power.shape)
+def reduced(power: NDArray[np.float32], down: int, across: int) -> NDArray[np.float32]:
+    """Return the means of `down` x `across` pixels, which are 1 or 2.
+
+    At the end of odd sides they are the means of those that exist.
+    """
+    rows, columns = (-n % by for n, by in zip(power.shape, (down, across), strict=True))
     even = np.pad(power, ((0, rows), (0, columns)), mode="edge") if rows or columns else power
-    total = even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]
-    return np.multiply(total, np.float32(0.25))
+    parts = [even[i::down, j::across] for j in range(across) for i in range(down)]
+    total = parts[0]
+    for part in parts[1:]:
+        total = total + part
+    return np.multiply(total, np.float32(1 / len(parts)))
 
 
 def _packed(levels: NDArray[np.uint8]) -> bytes:

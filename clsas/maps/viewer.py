@@ -23,7 +23,7 @@ from clsas.core.image import Image
 from clsas.core.version import __version__
 from clsas.maps.frames import Frame, fitted_degrees, geographic_of, steps_of
 from clsas.maps.sources import Source
-from clsas.maps.tiles import BRIGHTEST, SIDE, STEP_DB, Levels, Pyramid, scales_of
+from clsas.maps.tiles import BRIGHTEST, SIDE, STEP_DB, Pyramid, Quantization, factors_of
 from clsas.mosaics.store import Store
 from clsas.plot.colours import COLOUR_MAP
 from clsas.plot.colours import colour_map as colours_of
@@ -119,10 +119,12 @@ def write(
 
     report = _Progress(2 * sum(prod(reader.counts) for reader in readers), progress)
     reference = max(_largest(reader, report) for reader in readers) or 1.0
-    levels = Levels(reference, max(STEP_DB, range_db / (BRIGHTEST - 1)))
+    quantization = Quantization(reference, max(STEP_DB, range_db / (BRIGHTEST - 1)))
     scene = {"names": names, "range_db": range_db, "colours": tables}
     known = next((grid for grid in grids if grid.georeference is not None), grids[0])
-    scene |= _described(readers[0].shape, known, levels)
+    sides_m = tuple(float(np.linalg.norm(step)) for step in steps_of(known))
+    factors = factors_of(readers[0].shape, (sides_m[0], sides_m[1]))
+    scene |= _described(readers[0].shape, known, quantization, factors)
     scene |= {"patches": _patches(readers[0])}
     with replacing_folder(folder) as made:
         for name in _FILES:
@@ -130,7 +132,8 @@ def write(
         # Escaped to ASCII, in which no text can end the script.
         (made / _SCENE).write_text(f"{_START}{json.dumps(scene, allow_nan=False)};\n")
         for index, reader in enumerate(readers):
-            pyramid = Pyramid(reader.shape, levels, made / "tiles" / str(index), str(index))
+            tiles = made / "tiles" / str(index)
+            pyramid = Pyramid(reader.shape, quantization, tiles, str(index), factors)
             for rows, columns in report.through(reader):
                 pyramid.add(rows, columns, reader.read(rows, columns))
         for name, reader in zip(("source", "against"), readers, strict=False):
@@ -248,16 +251,22 @@ def _check_grids(grids: Sequence[Grid]) -> None:
         )
 
 
-def _described(shape: tuple[int, int], grid: Grid, levels: Levels) -> dict[str, Any]:
+def _described(
+    shape: tuple[int, int],
+    grid: Grid,
+    quantization: Quantization,
+    factors: dict[int, tuple[int, int]],
+) -> dict[str, Any]:
     """Return what the page needs to know of a grid and of the tiles."""
-    scales, to_geographic = scales_of(shape), geographic_of(grid)
+    to_geographic = geographic_of(grid)
     return {
         "version": __version__,
         "shape": shape,
         "side": SIDE,
-        "scales": [scales[0], scales[-1]],
-        "reference": levels.reference,
-        "step_db": levels.step_db,
+        "scales": [min(factors), max(factors)],
+        "factors": list(factors.values()),
+        "reference": quantization.reference,
+        "step_db": quantization.step_db,
         "frame": Frame.of(grid).describe(grid),
         "geographic": None if to_geographic is None else fitted_degrees(grid, to_geographic),
     }

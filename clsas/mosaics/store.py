@@ -7,9 +7,8 @@ the disk.
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -38,14 +37,10 @@ from clsas.mosaics.documents import (
 )
 from clsas.mosaics.levels import (
     LEVELS,
-    PixelArray,
-    mosaic_arrays,
-    patch_arrays,
     stored_levels,
 )
 from clsas.mosaics.metadata import GROUP, has_height
 from clsas.mosaics.overview import Reading, reduced, step_of
-from clsas.mosaics.patch_files import PatchFiles
 from clsas.mosaics.provenance import OtherInputsError, differences
 from clsas.mosaics.pyramid import levels
 from clsas.mosaics.record import (
@@ -54,11 +49,11 @@ from clsas.mosaics.record import (
     describe_arrays,
     describe_damage,
 )
+from clsas.mosaics.stored_arrays import REPAIR, StoredArrays, zarr_arrays
 
 if TYPE_CHECKING:
     import zarr
 
-_REPAIR = "; run clsas mosaic with the same inputs to repair it"
 _OVERVIEW = 1024  # pixels along the longer side, which fills a screen
 
 
@@ -91,7 +86,7 @@ class Store:
         ImportError
             If Zarr is not installed.
         """
-        _arrays()
+        zarr_arrays()
         return cls(validate.path("path", path).resolve())
 
     @classmethod
@@ -121,13 +116,10 @@ class Store:
         rows, columns = read_document(self.path)["patch_shape"]
         return rows, columns
 
-    @cached_property
+    @property
     def pixels(self) -> zarr.Array:
         """Pixels on disk, complex64 [rows, columns]. Zarr verifies their checksums on reading."""
-        try:
-            return _arrays().open_array(self.path, read_document(self.path), "pixels")
-        except DamageError as error:
-            raise ValueError(f"{self.path} is damaged: pixels: {error}{_REPAIR}") from error
+        return self._arrays.pixels
 
     @property
     def levels(self) -> tuple[int, ...]:
@@ -136,9 +128,9 @@ class Store:
         Empty for a mosaic that fits on a screen, or one of an early version to which `add_levels`
         has not added any. Levels that mix patches are missing until a run has finished all patches.
         """
-        arrays = list(self._files.arrays)
-        if self._mosaic_arrays and self._is_complete():
-            arrays = [*arrays, *self._mosaic_arrays]
+        arrays = list(self._arrays.files.arrays)
+        if self._arrays.of_mosaic and self._is_complete():
+            arrays = [*arrays, *self._arrays.of_mosaic]
         return tuple(sorted({array.factor for array in arrays} - {1}))
 
     @property
@@ -165,7 +157,7 @@ class Store:
                 f"{self.path} is a mosaic of arbitrary points, whose grid is not stored"
             )
         if found:
-            raise ValueError(f"{self.path} is damaged: {describe_arrays(found)}{_REPAIR}")
+            raise ValueError(f"{self.path} is damaged: {describe_arrays(found)}{REPAIR}")
         if grid_digest(grid) != read_document(self.path)["inputs"].get("grid"):
             raise ValueError(f"{self.path} is damaged: its grid differs from what was written")
         return grid
@@ -212,7 +204,7 @@ class Store:
         OSError
             If the store cannot be written.
         """
-        arrays = _arrays()
+        arrays = zarr_arrays()
         validate.instance("grid", grid, Grid)
         check_inputs(inputs, grid.shape)
         patch_shape = validate.sides("patch_shape", patch_shape)
@@ -259,9 +251,9 @@ class Store:
         """
         found = {}
         _ = self.pixels  # raises if their metadata are damaged
-        for index in self._files.indices():
+        for index in self._arrays.files.indices():
             try:
-                record = self._files.record(index)
+                record = self._arrays.files.record(index)
             except DamageError:
                 continue
             if record is not None:
@@ -288,7 +280,8 @@ class Store:
         """
         validate.progress(progress)
         _ = self.pixels  # raises if their metadata are damaged
-        return self._patch_damage(self._files.arrays, progress)
+        files = self._arrays.files
+        return self._arrays.damage(files.arrays, files.indices(), progress)
 
     def write(
         self,
@@ -322,10 +315,10 @@ class Store:
         row, column = (
             validate.count(name, index, least=0, most=most - 1)
             for name, index, most in zip(
-                ("row", "column"), (row, column), self._files.shape, strict=True
+                ("row", "column"), (row, column), self._arrays.files.shape, strict=True
             )
         )
-        own = self._files.pixels.window((row, column))
+        own = self._arrays.files.pixels.window((row, column))
         for name, given, part, count in zip(
             ("rows", "columns"), (rows, columns), own, self.pixels.shape, strict=True
         ):
@@ -337,20 +330,20 @@ class Store:
         shape = tuple(part.stop - part.start for part in own)
         pixels = validate.array("pixels", pixels, np.complex64, shape)
         validate.instance("record", record, Record)
-        folder = self._files.folder((row, column))
+        folder = self._arrays.files.folder((row, column))
         check_own(self.path, folder)
         # Remove the old record first, so that it never stands beside pixels of the new patch.
         if (folder / "zarr.json").exists():
             (folder / "zarr.json").unlink()
             sync_folder(folder)
         attributes = read_document(self.path)
-        first, *others = self._files.arrays
-        _arrays().write_values(self.path, attributes, first.name, (rows, columns), pixels)
+        first, *others = self._arrays.files.arrays
+        zarr_arrays().write_values(self.path, attributes, first.name, (rows, columns), pixels)
         found = levels(pixels, stored_levels(attributes).of_patches)
         for array in others:
             window, values = array.window((row, column)), found[array.factor].values_of(array)
-            _arrays().write_values(self.path, attributes, array.name, window, values)
-        write_attributes(folder, record.attributes(self._files.checksums((row, column))))
+            zarr_arrays().write_values(self.path, attributes, array.name, window, values)
+        write_attributes(folder, record.attributes(self._arrays.files.checksums((row, column))))
 
     def complete_levels(self, progress: Callable[[int, int], object] | None = None) -> bool:
         """Compute the levels that mix patches, unless they already are those of the patches.
@@ -375,7 +368,7 @@ class Store:
             If the store cannot be read or written.
         """
         validate.progress(progress)
-        if not self._mosaic_arrays or self._is_complete():
+        if not self._arrays.of_mosaic or self._is_complete():
             return False
         digest = self._digest()
         _completing().complete(self.path, read_document(self.path), digest, self.read, progress)
@@ -407,13 +400,13 @@ class Store:
         """
         validate.progress(progress)
         if stored_levels(read_document(self.path)).coarsest is None:
-            _arrays().add_levels(self.path)
-            for name in ("_files", "_mosaic_arrays"):
-                self.__dict__.pop(name, None)
+            zarr_arrays().add_levels(self.path)
+            self.__dict__.pop("_arrays", None)
         self._forget_damaged_levels()
         added = self.complete_levels(progress)
-        if found := self._patch_damage(self._files.arrays[1:]):  # without the pixels
-            raise ValueError(f"{self.path} is damaged: {describe_damage(found)}{_REPAIR}")
+        files = self._arrays.files
+        if found := self._arrays.damage(files.arrays[1:], files.indices()):  # without the pixels
+            raise ValueError(f"{self.path} is damaged: {describe_damage(found)}{REPAIR}")
         return added
 
     def read(
@@ -428,7 +421,7 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        return self._read(self._files.pixels, rows, columns)
+        return self._arrays.read(self._arrays.files.pixels, rows, columns)
 
     def read_level(
         self,
@@ -468,47 +461,8 @@ class Store:
             raise ValueError(
                 f"factor must be that of a level of {self.path} ({known}), got {factor}"
             )
-        array = self._array(f"{factor}x/{'pixels' if coherent else 'amplitude'}")
-        return self._read(array, rows, columns)
-
-    def _array(self, name: str) -> PixelArray:
-        arrays = [*self._files.arrays, *self._mosaic_arrays]
-        return next(array for array in arrays if array.name == name)
-
-    def _read(self, array: PixelArray, rows: slice, columns: slice) -> NDArray:
-        validate.selection("rows", rows, ascending=True)
-        validate.selection("columns", columns, ascending=True)
-        stored = self._opened(array)
-        requested = (
-            len(range(n)[part]) for n, part in zip(stored.shape, (rows, columns), strict=True)
-        )
-        validate.memory("the mosaic", stored.dtype.itemsize * math.prod(requested))
-        patches = list(array.touched(rows, columns)) if array in self._files.arrays else []
-        try:
-            _arrays().check_metadata(self.path, read_document(self.path))
-            for index in patches:
-                self._files.record(index, [array])
-            values = np.asarray(stored[rows, columns])
-        except ValueError as error:
-            found = self._patch_damage([array], indices=patches)
-            reason = describe_damage(found) if found else f"{array.name}: {error}"
-            if not found and array.name == "pixels":
-                reason = str(error)
-            raise ValueError(f"{self.path} is damaged: {reason}{_REPAIR}") from error
-        if not np.isfinite(values).all():
-            raise ValueError(
-                f"{self.path} must have finite numbers, but its {array.name} contain NaN or "
-                "infinity, which clsas does not write"
-            )
-        return values
-
-    def _opened(self, array: PixelArray) -> zarr.Array:
-        if array.name == "pixels":
-            return self.pixels
-        try:
-            return _arrays().open_array(self.path, read_document(self.path), array.name)
-        except DamageError as error:
-            raise ValueError(f"{self.path} is damaged: {array.name}: {error}{_REPAIR}") from error
+        array = self._arrays.named(f"{factor}x/{'pixels' if coherent else 'amplitude'}")
+        return self._arrays.read(array, rows, columns)
 
     def image(self, rows: slice = slice(None), columns: slice = slice(None)) -> Image:
         """Return the pixels of a window, by default all, as an image.
@@ -566,57 +520,36 @@ class Store:
             if all(each.start % factor == 0 for each in parts)
         ]
         step, factor = step_of(part.shape, most, usable)
-        array = self._array(f"{factor}x/amplitude" if factor > 1 else "pixels")
+        array = self._arrays.named(f"{factor}x/amplitude" if factor > 1 else "pixels")
 
         def read(*within: slice) -> NDArray[np.complex64] | NDArray[np.float32]:
             chosen = (whole[each] for whole, each in zip(parts, within, strict=True))
-            return self._read(
+            return self._arrays.read(
                 array,
                 *(slice(e.start // factor, -(-e.stop // factor), e.step) for e in chosen),
             )
 
-        rows_at_once, columns_at_once = (factor * side for side in self._files.pixels.patch_shape)
+        rows_at_once, columns_at_once = (
+            factor * side for side in self._arrays.files.pixels.patch_shape
+        )
         return reduced(part, Reading(read, factor, (rows_at_once, columns_at_once)), step)
 
     def _compared(self) -> tuple[Grid | None, dict[str, str]]:
         attributes = read_document(self.path)
-        return _arrays().compared(self.path, attributes, has_height(self.path, attributes))
+        return zarr_arrays().compared(self.path, attributes, has_height(self.path, attributes))
 
     @cached_property
-    def _files(self) -> PatchFiles:
-        """The files that are written with each patch."""
-        return PatchFiles(self.path, tuple(patch_arrays(read_document(self.path))))
-
-    @cached_property
-    def _mosaic_arrays(self) -> list[PixelArray]:
-        """The levels that mix patches."""
-        return mosaic_arrays(read_document(self.path))
+    def _arrays(self) -> StoredArrays:
+        """Pixels and levels on disk."""
+        return StoredArrays(self.path)
 
     def _digest(self) -> str:
         """Return a digest of the pixels of the finished patches."""
-        return _completing().digest_of_patches(self._files.recorded())
+        return _completing().digest_of_patches(self._arrays.files.recorded())
 
     def _is_complete(self) -> bool:
         """Return whether the levels that mix patches are those of the present patches."""
         return _completing().is_current(self.path, read_document(self.path), self._digest())
-
-    def _patch_damage(
-        self,
-        arrays: Sequence[PixelArray],
-        progress: Callable[[int, int], object] | None = None,
-        indices: Sequence[PatchIndex] | None = None,
-    ) -> dict[PatchIndex, str]:
-        """Read parts of arrays that belong to patches, by default all; return what is damaged."""
-        indices = self._files.indices() if indices is None else indices
-        found = {}
-        for done, index in enumerate(indices, 1):
-            try:
-                self._files.verify(index, self._opened, arrays)
-            except DamageError as error:
-                found[index] = str(error)
-            if progress is not None:
-                progress(done, len(indices))
-        return found
 
     def _forget_damaged_levels(self) -> dict[str, str]:
         """Return the damaged levels that mix patches, and remove the record of all of them.
@@ -632,13 +565,6 @@ class Store:
         if not (self.path / LEVELS / "zarr.json").exists() or not self._is_complete():
             return {}
         return _completing().damage(self.path, read_document(self.path))
-
-
-def _arrays() -> ModuleType:
-    """Return the module that needs Zarr."""
-    with needed("stores of mosaics"):
-        from clsas.mosaics import arrays
-    return arrays
 
 
 def _completing() -> ModuleType:

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 import clsas
 from clsas.cli import main
+from clsas.mosaics.stored_arrays import StoredArrays
 
 pytest.importorskip("matplotlib")
 
@@ -203,14 +204,14 @@ def test_a_mosaic_and_a_part_of_it(store, figures):
 @pytest.mark.slow
 def test_a_mosaic_is_read_patch_by_patch(store, monkeypatch):
     """So one larger than memory is drawn as well."""
-    read, sizes = clsas.Store._read, []
+    read, sizes = StoredArrays.read, []
 
     def recorded(self, *window):
         found = read(self, *window)
         sizes.append(found.size)
         return found
 
-    monkeypatch.setattr(clsas.Store, "_read", recorded)
+    monkeypatch.setattr(StoredArrays, "read", recorded)
     run(store)
     assert sum(sizes) == PLANE.size
     assert max(sizes) <= 14 * 21  # pixels of a patch

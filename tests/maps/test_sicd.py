@@ -117,6 +117,19 @@ def test_pixels_and_places_come_back(place, turn, tmp_path):
     assert root["SCPCOA"]["GrazeAng"] == pytest.approx(np.degrees(np.arctan2(3000, 4000)), abs=0.05)
 
 
+def test_gdal_reads_the_same_pixels(tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    place = local(217.0)
+    clsas.export(image_of(place), tmp_path / "a.nitf", lines=lines_of(place))
+    with rasterio.open(tmp_path / "a.nitf") as file:
+        real, imaginary = file.read()
+        corners = [(point.x, point.y) for point in file.gcps[0]]  # to a second of arc
+    np.testing.assert_array_equal(real + 1j * imaginary, image_of(place).pixels[::-1])
+    positions_m = image_of(place).grid.positions_m()[::-1]
+    expected = place.to_geographic(positions_m[[0, 0, -1, -1], [0, -1, -1, 0]])
+    np.testing.assert_allclose(corners, expected[:, 1::-1], atol=0.51 / 3600)
+
+
 def image_as(image, turn):
     """Pixels of a turned image in the order of the file."""
     return image.pixels.T[::-1] if turn == "transposed" else image.pixels

@@ -17,7 +17,7 @@ import clsas
 from clsas.cli import main
 from clsas.maps import tiles, viewer
 from clsas.maps.frames import Frame, fitted_degrees
-from clsas.maps.tiles import Levels, Pyramid, scales_of
+from clsas.maps.tiles import Pyramid, Quantization, factors_of, shape_of
 
 SHAPE = (700, 1300)
 PLANE = clsas.Grid.plane((-13, 12.98, 1300), (40, 53.98, 700))
@@ -47,10 +47,9 @@ def scene_of(folder):
     return json.loads(re.fullmatch(r"window\.clsasScene = (.*);\n", text)[1])
 
 
-def levels_at(folder, shape, scale, image=0):
+def levels_at(folder, shape, scale, image=0, steps_m=(1.0, 1.0)):
     """All levels at one scale of a pyramid, assembled from its tiles."""
-    factor = 2 ** (scales_of(shape)[-1] - scale)
-    rows, columns = (-(-n // factor) for n in shape)
+    rows, columns = shape_of(shape, factors_of(shape, steps_m)[scale])
     found = np.zeros((rows, columns), np.uint8)
     names = {path.name for path in (folder / str(image) / str(scale)).iterdir()}
     for row in range(0, rows, tiles.SIDE):
@@ -88,12 +87,14 @@ def test_coarse_tiles_are_means_of_power(image, written):
     assert np.abs(found[some] - expected).max() <= 0.51
 
 
+@pytest.mark.parametrize("steps_m", [(1.0, 1.0), (1.0, 0.2)])
 @pytest.mark.parametrize("shape", [(1, 1), (1, 1500), (513, 511), (1025, 530)])
-def test_tiles_do_not_depend_on_windows(tmp_path, shape):
+def test_tiles_do_not_depend_on_windows(tmp_path, shape, steps_m):
     pixels = speckle(shape)
     rng = np.random.default_rng(1)
     for name, height, width in (("whole", *shape), ("windows", 401, 300)):
-        pyramid = Pyramid(shape, Levels(float(np.abs(pixels).max()) or 1.0), tmp_path / name, "0")
+        quantization = Quantization(float(np.abs(pixels).max()) or 1.0)
+        pyramid = Pyramid(shape, quantization, tmp_path / name, "0", factors_of(shape, steps_m))
         windows = [
             (slice(top, min(top + height, shape[0])), slice(left, min(left + width, shape[1])))
             for top in range(0, shape[0], height)
@@ -110,10 +111,26 @@ def test_tiles_do_not_depend_on_windows(tmp_path, shape):
     assert whole
 
 
+@pytest.mark.parametrize(
+    ("shape", "steps_m", "expected"),
+    [
+        ((300, 200), (1.0, 1e-3), {9: (1, 1)}),
+        ((2000, 700), (0.1, 0.1), {9: (4, 4), 10: (2, 2), 11: (1, 1)}),
+        ((2000, 700), (0.12, 0.1), {9: (4, 4), 10: (2, 2), 11: (1, 1)}),
+        # Rows of 1 m stay apart until columns of 1 mm fit into a tile.
+        ((100, 4000), (1.0, 1e-3), {9: (1, 8), 10: (1, 4), 11: (1, 2), 12: (1, 1)}),
+        ((4000, 100), (1e-3, 1.0), {9: (8, 1), 10: (4, 1), 11: (2, 1), 12: (1, 1)}),
+        ((600, 4000), (1.0, 0.3), {9: (2, 8), 10: (1, 4), 11: (1, 2), 12: (1, 1)}),
+    ],
+)
+def test_the_longer_side_of_pixels_is_reduced_last(shape, steps_m, expected):
+    assert factors_of(shape, steps_m) == expected
+
+
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 3e38 + 3e38j])
 def test_levels_of_any_scale(scale):
     pixels = (np.array([[1, 0.1, 1e-9, 0]]) * scale).astype(np.complex64)
-    levels = Levels(abs(complex(pixels[0, 0])))
+    levels = Quantization(abs(complex(pixels[0, 0])))
     assert levels.encode(levels.power(pixels)).tolist() == [[255, 205, 1, 0]]
 
 
@@ -353,7 +370,9 @@ class TestStore:
         assert seen == [(done, 12) for done in range(1, 13)]
         monkeypatch.undo()
         pixels = opened.read()
-        found = levels_at(tmp_path / "web" / "tiles", GRID.shape, scales_of(GRID.shape)[-1])
+        found = levels_at(
+            tmp_path / "web" / "tiles", GRID.shape, max(factors_of(GRID.shape, (1.0, 1.0)))
+        )
         expected = tiles.BRIGHTEST + clsas.Image(pixels, GRID).db() / 0.4
         assert np.abs(found - np.maximum(expected, 1)).max() <= 0.51
         patches = scene_of(tmp_path / "web")["patches"]

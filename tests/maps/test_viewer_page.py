@@ -322,3 +322,19 @@ def test_an_incomplete_copy_says_what_is_missing(browser, folder, tmp_path):
     browser.call("Page.navigate", url=(tmp_path / "index.html").as_uri())
     browser.wait_until("document.readyState === 'complete'")  # later scripts fail for want of it
     assert "copy the whole folder" in browser.text("#trouble")
+
+
+def test_rows_stay_apart_where_columns_are_far_closer(browser, tmp_path):
+    """Rows of 1 m with columns of 1 mm: seen as a whole, pixels are 10 dots high."""
+    rows, columns = 30, 20_000
+    grid = clsas.Grid.plane((0, 19.999, columns), (0, 29, rows))
+    pixels = np.full((rows, columns), 1e-3, np.complex64)
+    pixels[::2] = 1.0
+    viewer.write(clsas.Image(pixels, grid), tmp_path / "web", colour_map="gray")
+    browser.errors.clear()
+    browser.open(tmp_path / "web" / "index.html")
+    for row in (10, 11, 12):
+        x, y = browser.js(f"toScreen(...toPlane({columns // 2}, {row})).map(Math.round)")
+        gray_level = colour(browser, x, y)[0]  # rows are smoothed a little, with their columns
+        assert gray_level > 240 if row % 2 == 0 else gray_level < 15
+    assert browser.errors == []

@@ -23,6 +23,7 @@ from clsas.mosaics.documents import read_document
 from clsas.mosaics.levels import Levels, aligned_side, chunk_side, levels_of
 from clsas.mosaics.patches import Layout
 from clsas.mosaics.record import Record
+from clsas.mosaics.stored_arrays import StoredArrays
 
 GRID = Grid.plane((-4, 4.3, 84), (30, 36.9, 70))
 RECORD = Record(channels=1, survey_channels=1, has_pixels=True)
@@ -231,8 +232,8 @@ def test_the_overview_reads_the_level_that_makes_up_its_pixels(tmp_path, monkeyp
         read.append(array.name)
         return unrecorded(self, array, *window)
 
-    unrecorded = clsas.Store._read
-    monkeypatch.setattr(clsas.Store, "_read", recorded)
+    unrecorded = StoredArrays.read
+    monkeypatch.setattr(StoredArrays, "read", recorded)
     for most, image in plain.items():
         read.clear()
         ours = store.overview(most)

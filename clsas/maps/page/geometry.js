@@ -23,6 +23,8 @@ if (!window.DecompressionStream) trouble("This browser is too old: any from 2023
 const [ROWS, COLUMNS] = scene.shape;
 const [COARSEST, FINEST] = scene.scales; // numbered as levels of Deep Zoom
 const SIDE = scene.side;
+// Rows and columns of the image that a pixel of a level covers.
+const factorsOf = (level) => scene.factors[level - COARSEST];
 const BRIGHTEST = 255; // level of 0 dB; 0 where nothing was received
 const LOWEST_DB = -Math.floor((BRIGHTEST - 1) * scene.step_db);
 
@@ -34,6 +36,8 @@ const [cu, cv] = frame.screen_column_step;
 const [ru, rv] = frame.screen_row_step;
 const determinant = cu * rv - ru * cv;
 const pixelM = Math.sqrt(Math.abs(determinant));
+const sidesM = [Math.hypot(ru, rv), Math.hypot(cu, cv)]; // of a pixel, along rows and columns
+const finestM = Math.min(...sidesM);
 const AXES = ["x", "y", "z"];
 
 const toPlane = (column, row) => [u0 + column * cu + row * ru, v0 + column * cv + row * rv];
@@ -65,7 +69,7 @@ const alongSide = frame.axes.map((direction) => {
   return axis === undefined ? null : { name: AXES[axis], sign: Math.sign(direction[axis]) };
 });
 
-const decimals = Math.max(0, Math.ceil(-Math.log10(pixelM)) + 1);
+const decimals = Math.max(0, Math.ceil(-Math.log10(finestM)) + 1);
 const inMetres = (value) => value.toFixed(decimals).replace(/^-(0(\.0*)?)$/, "$1");
 
 function chebyshev(at, count) {

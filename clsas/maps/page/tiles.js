@@ -12,8 +12,8 @@ const missing = new Set(); // names of tiles that could not be loaded
 let wanted = [], loading = 0, palette = null, paletteVersion = 0;
 
 const levelShape = (level) => {
-  const factor = 2 ** (FINEST - level);
-  return [Math.ceil(ROWS / factor), Math.ceil(COLUMNS / factor)];
+  const [down, across] = factorsOf(level);
+  return [Math.ceil(ROWS / down), Math.ceil(COLUMNS / across)];
 };
 
 window.clsasTile = async (name, text) => {
@@ -111,19 +111,22 @@ function painted(tile) {
   return tile.canvas;
 }
 
-// The level whose pixels are just as fine as those of the screen.
+// The coarsest level whose pixels are as fine as those of the screen, along the sides that it reduces.
 function levelInView() {
-  const perPixel = pixelM * view.scale * size.ratio; // pixels of the screen per pixel of the image
-  const coarser = Math.floor(Math.log2(1.25 / perPixel));
-  return Math.min(Math.max(FINEST - coarser, COARSEST), FINEST);
+  const onScreen = view.scale * size.ratio; // pixels per metre
+  const isFine = (factor, axis) => factor === 1 || factor * sidesM[axis] * onScreen <= 1.25;
+  let level = COARSEST;
+  while (level < FINEST && !factorsOf(level).every(isFine)) level += 1;
+  return level;
 }
 
 // Columns and rows of a level that are in view: first, and one past the last.
 function windowInView(level) {
-  const factor = 2 ** (FINEST - level);
+  const [down, across] = factorsOf(level);
   const [rows, columns] = levelShape(level);
   const seen = [[0, 0], [size.width, 0], [0, size.height], [size.width, size.height]]
-    .map(([x, y]) => toPixel(...fromScreen(x, y)).map((at) => (at + 0.5) / factor));
+    .map(([x, y]) => toPixel(...fromScreen(x, y)))
+    .map(([column, row]) => [(column + 0.5) / across, (row + 0.5) / down]);
   const clamp = (value, most) => Math.min(Math.max(value, 0), most);
   return [0, 1].map((axis) => {
     const most = axis ? rows : columns;
@@ -163,15 +166,15 @@ function drawImage(image) {
     if (tile) paper.drawImage(painted(tile), x, y);
     else drawCoarser(paper, image, level, column, row, x, y);
   }
-  const factor = 2 ** (FINEST - level);
+  const [down, across] = factorsOf(level);
   const scale = view.scale * size.ratio;
-  const [u, v] = toPlane(left * factor - 0.5, top * factor - 0.5);
+  const [u, v] = toPlane(left * across - 0.5, top * down - 0.5);
   const [x, y] = toScreen(u, v);
   draw.save();
   draw.transform(
-    cu * factor * scale, -cv * factor * scale, ru * factor * scale, -rv * factor * scale,
+    cu * across * scale, -cv * across * scale, ru * down * scale, -rv * down * scale,
     x * size.ratio, y * size.ratio);
-  draw.imageSmoothingEnabled = pixelM * factor * scale < 3;
+  draw.imageSmoothingEnabled = Math.min(sidesM[0] * down, sidesM[1] * across) * scale < 3;
   draw.imageSmoothingQuality = "medium";
   draw.drawImage(sheet, 0, 0, width, height, 0, 0, width, height);
   draw.restore();
@@ -180,14 +183,17 @@ function drawImage(image) {
 // Until a tile is loaded, draw the part of a coarser one that covers it.
 function drawCoarser(paper, image, level, column, row, x, y) {
   for (let coarser = level - 1; coarser >= COARSEST; coarser -= 1) {
-    const times = 2 ** (level - coarser);
-    const [c, r] = [Math.floor(column / times), Math.floor(row / times)];
+    const [timesDown, timesAcross] = factorsOf(coarser).map(
+      (factor, axis) => factor / factorsOf(level)[axis]);
+    const [c, r] = [Math.floor(column / timesAcross), Math.floor(row / timesDown)];
     const tile = tileAt(image, coarser, c, r, false);
     if (!tile) continue;
-    const part = SIDE / times;
-    const [sx, sy] = [(column % times) * part, (row % times) * part];
-    const [w, h] = [Math.min(part, tile.width - sx), Math.min(part, tile.height - sy)];
-    if (w > 0 && h > 0) paper.drawImage(painted(tile), sx, sy, w, h, x, y, w * times, h * times);
+    const [width, height] = [SIDE / timesAcross, SIDE / timesDown];
+    const [sx, sy] = [(column % timesAcross) * width, (row % timesDown) * height];
+    const [w, h] = [Math.min(width, tile.width - sx), Math.min(height, tile.height - sy)];
+    if (w > 0 && h > 0) {
+      paper.drawImage(painted(tile), sx, sy, w, h, x, y, w * timesAcross, h * timesDown);
+    }
     return;
   }
 }
@@ -196,8 +202,8 @@ function drawCoarser(paper, image, level, column, row, x, y) {
 // and undefined if no tile is loaded.
 function levelAt(image, column, row) {
   for (let level = levelInView(); level >= COARSEST; level -= 1) {
-    const factor = 2 ** (FINEST - level);
-    const [c, r] = [Math.floor(column / factor), Math.floor(row / factor)];
+    const [down, across] = factorsOf(level);
+    const [c, r] = [Math.floor(column / across), Math.floor(row / down)];
     const tile = tileAt(image, level, Math.floor(c / SIDE), Math.floor(r / SIDE), false);
     if (!tile) continue;
     const value = tile.levels[(r % SIDE) * tile.width + (c % SIDE)];
@@ -209,6 +215,7 @@ function levelAt(image, column, row) {
 // Whether the tile of a pixel, in the level that is drawn, could not be loaded.
 function isMissing(image, column, row) {
   const level = levelInView();
-  const [c, r] = [column, row].map((index) => Math.floor(index / 2 ** (FINEST - level) / SIDE));
+  const [down, across] = factorsOf(level);
+  const [c, r] = [Math.floor(column / across / SIDE), Math.floor(row / down / SIDE)];
   return missing.has(`${image}/${level}/${c}_${r}`);
 }

@@ -43,7 +43,7 @@ function fit() {
 
 function zoom(factor, x = size.width / 2, y = size.height / 2) {
   const [u, v] = fromScreen(x, y);
-  const most = 64 / pixelM;
+  const most = 64 / finestM;
   view.scale = Math.min(Math.max(view.scale * factor, fitScale() / 4), Math.max(most, fitScale()));
   const [nu, nv] = fromScreen(x, y);
   view.u += u - nu;

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,15 +35,26 @@ def maps(folder: Path) -> dict[str, Call]:
         "georeference": place,
         "plan": s.plan,
         "lines": s.lines,
+        "beam": None,
         "progress": nothing,
     }
     unset = dict.fromkeys(
         (
             "kind", "dynamic_range_db", "reference", "colour_map", "pixel_m", "plan", "lines",
-            "progress", "north_arrow", "scale_bar",
+            "beam", "progress", "north_arrow", "scale_bar",
         ),
         optional,
     )  # fmt: skip
+    phase_centres_m = s.lines.phase_centres_m
+    light_m_s = 299_792_458.0
+    radar = replace(
+        s.lines,
+        tx_m=phase_centres_m,
+        rx_m=phase_centres_m,
+        carrier_hz=s.lines.carrier_hz * light_m_s / s.lines.sound_speed_m_s,
+        sound_speed_m_s=light_m_s,
+        rx_velocity_m_s=None,
+    )
     pictured = ("source", "dynamic_range_db", "reference", "colour_map", "georeference")
     picture = {name: exported[name] for name in pictured}
     return {
@@ -107,6 +119,19 @@ def maps(folder: Path) -> dict[str, Call]:
                 "scale_bar": False,
             },
             kinds={"colour_map": "text"},
+            accepts=unset | {"source": ("an Image",)},
+        ),
+        "export:sicd": Call(
+            clsas.export,
+            {
+                "source": folder / "image.h5",
+                "path": folder / "map.nitf",
+                "georeference": place,
+                "plan": s.plan,
+                "lines": radar,
+                "beam": clsas.BeamWindow(60.0),
+                "progress": nothing,
+            },
             accepts=unset | {"source": ("an Image",)},
         ),
         "export:picture": Call(
