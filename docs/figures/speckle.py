@@ -39,7 +39,7 @@ for axes, name, image in zip(
         image.db(reference=reference), cmap="gray", vmin=-25, vmax=10, origin="lower",
         extent=(-2, 2, 25, 32),
     )  # fmt: skip
-    axes.set(title=f"{name}: contrast {contrast:.2f}", xlabel="Along-track (m)")
+    axes.set(title=f"{name}\ncontrast {contrast:.2f}", xlabel="Along-track (m)")
     axes.title.set_fontsize(10)
 panels[0].set_ylabel("Across-track (m)")
 figure.colorbar(drawn, ax=panels, label="Amplitude (dB re sand)", shrink=0.85)
