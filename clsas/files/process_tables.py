@@ -89,6 +89,7 @@ class ProcessTable(Table):
     lines: str | None = None
     output: str | None = None
     steps: list[str] | None = None
+    bank: int | None = None
     calibrate: _Calibrate | None = None
     navigate: _Navigate | None = None
     focus: _Focus | None = None
@@ -102,6 +103,8 @@ class ProcessTable(Table):
                     if not path:
                         raise ValueError(f"{name} must be a path, got an empty one")
                     options[name] = folder / path
+            if self.bank is not None:
+                options["bank"] = validate.count("bank", self.bank, least=0)
         for name in CORRECTIONS:
             if (table := getattr(self, name)) is not None:
                 options[name] = table.build()

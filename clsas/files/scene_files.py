@@ -51,8 +51,9 @@ class SceneFile:
         Paths that `clsas mosaic` reads (`lines`) and writes (`store`), and its `patches` and
         `memory_mib`.
     process : dict
-        Paths that `clsas process` reads (`lines`) and writes (`output`), its `steps`, and the
-        keyword arguments of the steps `calibrate`, `navigate` and `focus`.
+        Paths that `clsas process` reads (`lines`) and writes (`output`), its `steps`, the receiver
+        `bank` that it images, and the keyword arguments of the steps `calibrate`, `navigate` and
+        `focus`.
     files : dict
         Paths of the files that the scene refers to, by key: "track.file", "grid.height_file",
         "sound_speed.file", "mosaic.lines", "process.lines".

@@ -12,12 +12,13 @@ from scipy.ndimage import distance_transform_edt
 from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
+from clsas.plot import colours
 from clsas.plot.canvas import axis_label, drawable, length_unit, new_figure, plain_ticks
-from clsas.plot.colours import colour_map
 from clsas.plot.levels import edges
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
 _MOST_PIXELS = 1500  # pixels drawn along an axis; pictures have fewer dots
@@ -101,7 +102,7 @@ def interferogram(interferogram: Interferogram, *, title: str = "") -> Figure:
     return figure
 
 
-def heights(heights: Heights, *, colours: str = "viridis", title: str = "") -> Figure:
+def heights(heights: Heights, *, colour_map: str | Colormap = "viridis", title: str = "") -> Figure:
     """Draw heights as coloured relief with shading, and their standard deviation beside it.
 
     The light comes from the upper left. Slopes are exaggerated so that 95 % of them seem gentler
@@ -112,8 +113,8 @@ def heights(heights: Heights, *, colours: str = "viridis", title: str = "") -> F
     heights : Heights
         Heights and standard deviations (metres) on the grid of an image, and a mask, which is True
         where there is a height.
-    colours : str
-        Colour map of the heights: a name as for `image`.
+    colour_map : str or matplotlib.colors.Colormap
+        Colours of the heights, as for `image`.
     title : str
         Title of the figure.
 
@@ -132,7 +133,7 @@ def heights(heights: Heights, *, colours: str = "viridis", title: str = "") -> F
         raise ValueError("heights must have at least one pixel that is not masked")
     height_m, sd_m = (_values(*given, name, grid, known) for name in ("height_m", "sd_m"))
     title = drawable("title", title)
-    chosen = colour_map(colours)
+    chosen = colours.colour_map(colour_map)
     figure, (left, right) = _panels(grid, title)
     low_m, high_m = float(height_m[known].min()), float(height_m[known].max())
     # Drawn for the colour bar only: the relief covers it.
@@ -155,7 +156,7 @@ def heights(heights: Heights, *, colours: str = "viridis", title: str = "") -> F
 
 
 def _relief(
-    height_m: NDArray, known: NDArray, steps_m: tuple[float, float], colours: Any, norm: Any
+    height_m: NDArray, known: NDArray, steps_m: tuple[float, float], chosen: Any, norm: Any
 ) -> NDArray[np.float64]:
     """Return colours [rows, columns, 3] of heights with hillshade; grey where none is known.
 
@@ -182,7 +183,7 @@ def _relief(
     # Level ground keeps its colour.
     dark = _DARKEST + (1 - _DARKEST) * np.clip(facing / light[2], 0, 1)
     white = _WHITEST * np.clip((facing - light[2]) / (1 - light[2]), 0, 1)
-    shaded: NDArray[np.float64] = colours(norm(height_m))[..., :3] * dark[..., None]
+    shaded: NDArray[np.float64] = chosen(norm(height_m))[..., :3] * dark[..., None]
     shaded += (1 - shaded) * white[..., None]
     shaded[~known] = _MASKED
     return shaded
@@ -258,13 +259,13 @@ def _thinned(values: NDArray) -> NDArray:
 
 
 def _drawn(
-    axes: Axes, grid: Grid, values: NDArray, colours: Any, most: float, least: float | None = None
+    axes: Axes, grid: Grid, values: NDArray, chosen: Any, most: float, least: float | None = None
 ) -> Any:
     """Draw values over metres or millimetres, in colours from `least` (or -most) to `most`."""
     factor, unit = _unit(grid)
     extent = _extent(grid, factor)
     drawn = axes.imshow(
-        _thinned(values), cmap=colours, vmin=-most if least is None else least, vmax=most,
+        _thinned(values), cmap=chosen, vmin=-most if least is None else least, vmax=most,
         origin="lower", extent=extent, interpolation="nearest",
     )  # fmt: skip
     axes.set(xlim=sorted(extent[:2]), ylim=sorted(extent[2:]))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from clsas import plot
+from clsas.core import banks
 from clsas.core.atomic import replacing, staging
 from clsas.core.digests import grid_digest
 from clsas.core.extras import install_command, is_installed
@@ -79,6 +80,16 @@ class Job:
         """Return the scene's options of a step."""
         return dict(self.scene.process.get(step, {}))
 
+    def of_bank(self, lines: RangeLines) -> RangeLines:
+        """Return the lines of the receiver bank that is imaged: the scene's, or else the first."""
+        chosen = self.scene.process.get("bank")
+        if chosen is None:
+            return lines.bank(banks.present(lines.bank_numbers)[0])
+        try:
+            return lines.bank(chosen)
+        except ValueError as error:
+            raise ValueError(f"[process] {str(error).replace('number', 'bank', 1)}") from None
+
     def draw(self, name: str, draw: Callable[[], Any]) -> list[str]:
         """Write a picture and return a list of its name; the list is empty without matplotlib."""
         if not is_installed("matplotlib"):
@@ -118,6 +129,8 @@ def options_of(step: str, scene: SceneFile) -> dict[str, Any]:
         options["element_length_m"] = None if scene.sonar is None else scene.sonar.element_length_m
     if step in ("image", "mosaic"):
         options["request"] = request_of(scene)
+        if "bank" in scene.process:
+            options["bank"] = scene.process["bank"]
     if step == "mosaic":
         options |= scene.mosaic
     return options
@@ -178,7 +191,7 @@ def focused(job: Job) -> Outcome:
 def imaged(job: Job) -> Outcome:
     """Form the image and, if the lines were corrected, also the image without corrections."""
     (grid,) = job.scene.need("grid")
-    given, lines = job.given(), job.lines
+    given, lines = job.of_bank(job.given()), job.of_bank(job.lines)
     corrected = bool(job.corrections)
     shares = (0, 2), (1, 2)
     if not corrected:
@@ -208,7 +221,7 @@ def joined(job: Job) -> Outcome:
         raise ValueError("taps and upsampling have no effect in a mosaic")
     memory_mib = scene.mosaic.get("memory_mib")
     begin = partial(
-        mosaic, job.lines, grid, job.store, **request, beam=scene.image.get("beam"),
+        mosaic, job.of_bank(job.lines), grid, job.store, **request, beam=scene.image.get("beam"),
         patches=scene.mosaic.get("patches"), memory_bytes=memory_mib and memory_mib << 20,
         device=job.device,
     )  # fmt: skip

@@ -304,6 +304,10 @@ def channels(sonar: Sonar, track: Track, *, motion_in_flight: bool = False) -> C
     TypeError, ValueError
         If an argument has the wrong type, or the channels do not fit into memory.
 
+    See Also
+    --------
+    Sonar.channel_banks : Receiver banks of these channels.
+
     Examples
     --------
     >>> import clsas

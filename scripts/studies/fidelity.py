@@ -17,6 +17,7 @@ COLUMNS = (
     "scene",
     "tolerance dB",
     "error of the images dB",
+    "correlation of both",
     "phase error mrad",
     "99.9 % below mrad",
     "mean mrad",
@@ -86,6 +87,15 @@ def interferogram(pixels: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return mean, np.abs(mean) / np.sqrt(np.maximum(powers[0] * powers[1], 1e-300))
 
 
+def correlation(images: list[np.ndarray], exact: list[np.ndarray]) -> float:
+    """Return the correlation of the errors of both images, relative to the phases of the pixels."""
+    one, other = (
+        (image - ideal) * np.exp(-1j * np.angle(ideal))
+        for image, ideal in zip(images, exact, strict=True)
+    )
+    return float(np.vdot(one, other).real / (np.linalg.norm(one) * np.linalg.norm(other)))
+
+
 def looks(pixels: np.ndarray) -> float:
     """Return the number of independent looks in a window, from the correlation of the pixels."""
     power = np.abs(np.fft.fft2(pixels, [2 * n for n in pixels.shape])) ** 2
@@ -146,6 +156,7 @@ def rows(device: str, scenes: tuple[str, ...] = tuple(SCENES)) -> Iterator[list[
                 name,
                 f"{tolerance_db}",
                 f"{20 * np.log10(error):.1f}",
+                f"{correlation(images, exact):.2f}",
                 f"{1e3 * deviation:.3g}",
                 f"{1e3 * np.quantile(np.abs(phase), 0.999):.3g}",
                 f"{1e3 * np.mean(phase):.2g}",

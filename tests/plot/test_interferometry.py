@@ -149,4 +149,4 @@ def test_wrong_results_are_refused():
     with pytest.raises(ValueError, match="at least one pixel that is not masked"):
         plot.heights(replace(hill(), mask=np.zeros(GRID.shape, bool)))
     with pytest.raises(ValueError, match="colour_map must be"):
-        plot.heights(hill(), colours="rainbows")
+        plot.heights(hill(), colour_map="rainbows")

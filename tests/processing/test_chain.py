@@ -614,3 +614,29 @@ def test_the_command_refuses_a_grid_that_no_line_reaches(plain):
     allowed = CliRunner().invoke(main, ["process", str(plain), "--allow-unreached"])
     assert allowed.exit_code == 0, allowed.output
     assert not clsas.load(plain.with_suffix("") / "image.h5").pixels.any()
+
+
+def test_one_of_two_banks_is_imaged(plain):
+    """The first one, or the one that the scene names; corrections keep the lines of both."""
+    path = plain.parent / "lines.h5"
+    lines = clsas.load(path)
+    path.unlink()  # a link to the recording of all tests
+    banks = np.tile([0, 1], lines.channels // 2)
+    apart_m = np.multiply.outer(banks, [0.0, 0.0, 0.2])
+    two = replace(lines, rx_m=lines.rx_m + apart_m, bank_numbers=banks)
+    clsas.save(path, two)
+    grid = clsas.files.scene_files.read_scene(plain).grid
+
+    def imaged():
+        clsas.process(plain)  # a warning of two banks in one image would be an error
+        return clsas.load(plain.with_suffix("") / "image.h5").pixels
+
+    def exact(number):
+        return clsas.backproject(two.bank(number), grid, accuracy_db=-60)
+
+    assert clsas.relative_error_db(imaged(), exact(0)) < -35
+    plain.write_text(plain.read_text().replace("[process]\n", "[process]\nbank = 1\n"))
+    assert clsas.relative_error_db(imaged(), exact(1)) < -35
+    plain.write_text(plain.read_text().replace("bank = 1", "bank = 2"))
+    with pytest.raises(ValueError, match=r"\[process\] bank must be one of the banks 0, 1, got 2"):
+        clsas.process(plain)

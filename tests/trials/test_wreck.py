@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import clsas
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.sonar.beam import BeamWindow
@@ -80,3 +81,15 @@ def test_benchmark(monkeypatch):
         ratio = result[name]["median"] / result["seconds"]["median"]
         assert ratio > 0
         assert result[speedup] == pytest.approx(ratio)
+
+
+def test_the_scene_of_two_banks_keeps_every_limit():
+    """Each bank alone, with the baseline that the scene states."""
+    scene = wreck.scene("wreck_two_banks")
+    sonar, track, grid = scene.need("sonar", "track", "grid")
+    assert sonar.banks == 2
+    beam, range_m = scene.image["beam"], scene.simulate["range_m"]
+    found = clsas.limits(sonar, track, grid, beam=beam, range_m=range_m)
+    assert found.exceeded == ()
+    assert found["baseline_m"].value == pytest.approx(20 * sonar.wavelength_m)
+    assert found["ambiguity_near_m"].value < 3.5 < found["ambiguity_far_m"].value

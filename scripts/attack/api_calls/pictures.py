@@ -62,8 +62,8 @@ def pictures(folder: Path) -> dict[str, Call]:
         ),
         "plot.heights": Call(
             plot.heights,
-            {"heights": relief, "colours": "gray", **title},
-            kinds=text | {"colours": "text"},
+            {"heights": relief, "colour_map": "gray", **title},
+            kinds=text | {"colour_map": "text"},
         ),
         "plot.image_html": Call(plot.image_html, {"image": image}),
         "plot.before_and_after": Call(
