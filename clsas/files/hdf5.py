@@ -235,7 +235,7 @@ def _read(group: h5py.Group, budget: validate.Budget, **instead: Any) -> Any:
             values[field.name] = instead[field.name]
         elif field.name in group.attrs:
             values[field.name] = _attribute(group, field.name)
-        elif (item := find_item(group, field.name)) is not None:
+        elif (item := find_item(group, field.name, _kinds_of_values(field.type))) is not None:
             is_group = isinstance(item, h5py.Group)
             # Check the kind before reading, since a group may contain a link to itself.
             if is_group and _kind_of_field(field.type) != _attribute(item, "kind"):
@@ -254,8 +254,17 @@ def _kind_of_field(annotation: object) -> str | None:
     return next((name for name, kind in _KINDS.items() if kind.__name__ in classes), None)
 
 
-def find_item(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
+def _kinds_of_values(annotation: object) -> str:
+    """Return the kinds of values that an array in a field may have."""
+    return "b" if "bool" in str(annotation) else "iufc"
+
+
+def find_item(
+    group: h5py.Group, name: str, kinds: str = "iufc"
+) -> h5py.Group | h5py.Dataset | None:
     """Return a group or dataset of the file, or None if none has that name.
+
+    The type of a dataset must be one of NumPy's `kinds`.
 
     Links are refused, so that a file cannot determine which other files are read.
     """
@@ -270,8 +279,9 @@ def find_item(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
             raise FileFormatError(
                 f"must contain {name} itself, got a dataset stored in other files"
             )
-        if item.dtype.kind not in "iufc":
-            raise FileFormatError(f"must contain {name} as numbers, got {item.dtype}")
+        if item.dtype.kind not in kinds:
+            wanted = "bools" if kinds == "b" else "numbers"
+            raise FileFormatError(f"must contain {name} as {wanted}, got {item.dtype}")
     elif not isinstance(item, h5py.Group):
         raise FileFormatError(f"must contain {name} as a dataset, got a named datatype")
     return item

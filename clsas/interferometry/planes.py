@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from clsas.interferometry.coherence import Moments, Window
 
-_RIDGE = 1e-2  # of the variance of rows and columns; keeps windows with little power solvable
+_RIDGE = 1e-4  # of the variance of rows and columns; keeps windows with little power solvable
 _LEAST_DETERMINANT = 1e-3  # relative to that of an evenly filled window
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -79,22 +79,21 @@ class Heights:
         validate.instance("image", self.image, Image)
         put("window_m", validate.positive("window_m", self.window_m, "m"))
         shape = self.image.shape
-        mask = np.asarray(self.mask)
-        if mask.dtype != np.bool_ or mask.shape != shape:
-            raise ValueError(
-                f"mask must be bools of shape {shape}, got {mask.dtype} of shape {mask.shape}"
-            )
+        mask = _as_array(self.mask)
+        if mask is None or not _is_plain(mask, "b", shape):
+            raise TypeError(f"mask must be bools of shape {shape}, got {validate.shown(self.mask)}")
         put("mask", _read_only(mask))
         for name in ("coherence", "looks", "m_per_rad"):
             put(name, validate.array(name, getattr(self, name), np.float64, shape))
         for name in ("height_m", "sd_m"):
-            given = np.asarray(getattr(self, name))
-            if given.shape == shape and given.dtype.kind == "f":
-                validate.array(f"{name} within the mask", given[mask], np.float64, None)
-                given = np.where(mask, given, np.nan)
-                put(name, _read_only(given.astype(np.float64)))
-            else:  # raises
-                validate.array(name, given, np.float64, shape)
+            values: Any = getattr(self, name)
+            if isinstance(values, np.ndarray) and _is_plain(
+                values, "f", shape
+            ):  # NaN is allowed outside the mask
+                validate.array(f"{name} within the mask", values[mask], np.float64, None)
+            else:
+                values = validate.array(name, values, np.float64, shape)
+            put(name, _read_only(np.where(mask, values, np.nan).astype(np.float64)))
 
     def __repr__(self) -> str:
         """Return the shape, the valid share, the span of heights and the median deviation."""
@@ -113,6 +112,21 @@ class Heights:
     def georeference(self) -> Georeference | None:
         """Georeference of the grid; None if unknown."""
         return self.image.georeference
+
+
+def _as_array(values: object) -> NDArray | None:
+    """Return values as an array, or None if they are not regular."""
+    try:
+        return np.asanyarray(values)
+    except ValueError:
+        return None
+
+
+def _is_plain(values: NDArray | None, kind: str, shape: tuple[int, ...]) -> bool:
+    """Return whether values are an array without masked values, of a kind and a shape."""
+    if values is None or np.ma.isMaskedArray(values):
+        return False
+    return values.dtype.kind == kind and values.shape == shape
 
 
 def _read_only(values: NDArray) -> NDArray:

@@ -16,6 +16,8 @@ from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.files import hdf5 as io
 from clsas.files.hdf5 import FileFormatError, load, read_geometry, read_samples, save
+from clsas.interferometry.interferogram import Interferogram
+from clsas.interferometry.result import Heights
 from clsas.signal.echoes import Echoes
 from clsas.sonar.system import Pulse
 
@@ -49,6 +51,16 @@ def objects():
         "placed lines": RangeLines(samples, 1, 0.1, tx_m, rx_m, 0, 1500, georeference=LOCAL),
         "image": Image(complex_noise(random, 3, 5), PLANE),
         "image of points": Image(complex_noise(random, 7), Grid.points(noise(7, 3))),
+        "interferogram": Interferogram(*np.abs(noise(4, 3, 5)), PLANE, 0.1),
+        "heights": Heights(
+            noise(3, 5),
+            np.abs(noise(3, 5)),
+            noise(3, 5),
+            noise(3, 5) > 0,
+            *noise(2, 3, 5),
+            Image(complex_noise(random, 3, 5), PLANE.with_height(noise(3, 5))),
+            0.1,
+        ),
         "lines": RangeLines(samples, noise(4), 1 / 3, tx_m, rx_m, 1e6 / 3, 1500.1),
         "moving lines": RangeLines(samples, 40, 0.1, tx_m, rx_m, 0, 1500, noise(4, 3)),
         "looking lines": RangeLines(

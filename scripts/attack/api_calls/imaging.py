@@ -11,7 +11,7 @@ import numpy as np
 import scipy.io
 
 import clsas
-from api_calls.scene import EMPTY, LARGE, Call, nothing, scene
+from api_calls.scene import EMPTY, LARGE, Call, fields, nothing, scene
 from clsas.planning.costs import Costs
 
 
@@ -303,6 +303,16 @@ def navigation(folder: Path) -> dict[str, Call]:
     overlapping = clsas.compress(
         clsas.simulate(array, track, clsas.PointTargets(at, np.exp(2j * np.pi * rng.random(150))))
     )
+    tx_m = np.outer(np.linspace(-1, 1, 40), [1, 0, 0]) + [0, 0, 5]
+    seabed_m = np.stack([rng.uniform(-1, 1, 5000), rng.uniform(14.2, 16, 5000), np.zeros(5000)], 1)
+    amplitudes = rng.standard_normal((5000, 2)) @ [1, 1j]
+    lower, upper = (
+        clsas.simulate_lines(
+            tx_m, tx_m + [0, 0, up_m], clsas.PointTargets(seabed_m, amplitudes),
+            carrier_hz=100e3, bandwidth_hz=20e3,
+        )
+        for up_m in (0.0, 0.2)
+    )  # fmt: skip
     return {
         "micronavigate": Call(
             clsas.micronavigate,
@@ -332,6 +342,35 @@ def navigation(folder: Path) -> dict[str, Call]:
                 ),
                 optional,
             ),
+        ),
+        "interferogram": Call(clsas.interferogram, {"a": s.image, "b": s.image, "window_m": 0.5}),
+        "Interferogram": Call(
+            clsas.Interferogram, fields(clsas.interferogram(s.image, s.image, 0.5))
+        ),
+        "heights": Call(
+            clsas.heights,
+            {
+                "a": lower,
+                "b": upper,
+                "grid": s.grid,
+                "search_m": (-0.3, 0.4),
+                "window_m": 0.3,
+                "tolerance_db": -30.0,
+                "least_coherence": 0.5,
+                "beam": None,
+                "device": 0,
+                "progress": nothing,
+            },
+            kinds={"device": "device"},
+            names={"a": ("b",), "b": ("a",)},
+            accepts=dict.fromkeys(("window_m", "progress"), optional)
+            | {"beam": ("None", "a BeamWindow")},
+            may_be_nan=True,
+        ),
+        "Heights": Call(
+            clsas.Heights,
+            fields(clsas.heights(lower, upper, s.grid, search_m=(-0.3, 0.4), window_m=0.3)),
+            may_be_nan=True,
         ),
         "autofocus": Call(
             clsas.autofocus,

@@ -1,0 +1,103 @@
+"""Sensitivities against the ranges themselves, along curves of equal range found by a solver."""
+
+import numpy as np
+import pytest
+from reliefs import GRID, flat_banks
+from scipy.optimize import least_squares
+
+from clsas.core.geometry import bistatic_range_m
+from clsas.interferometry.baseline import Baseline, sight_lattice
+from clsas.interferometry.refinement import sensitivity
+from clsas.interferometry.sweep import Curves
+from clsas.sonar.beam import BeamWindow
+
+CYCLES_PER_M = 2 * 100e3 / 1500.0
+
+
+def ranges_m(lines, points_m):
+    """Mean range of all channels, and the mean of its slope along x."""
+
+    def mean(at_m):
+        return bistatic_range_m(at_m[:, None], lines.tx_m, lines.rx_m).mean(axis=1)
+
+    step = np.array([1e-4, 0, 0])
+    return mean(points_m), (mean(points_m + step) - mean(points_m - step)) / 2e-4
+
+
+def raised(lines_a, lines_b, point_m, height_m):
+    """The place at a height with the mean range and the mean Doppler of a point."""
+
+    def of(at_m):
+        a, b = (ranges_m(each, at_m[None]) for each in (lines_a, lines_b))
+        return np.array([(a[0] + b[0])[0], 10 * (a[1] + b[1])[0]]) / 2
+
+    wanted = of(point_m)
+    xy = least_squares(
+        lambda xy: of(np.array([*xy, height_m])) - wanted, point_m[:2], xtol=1e-14, ftol=1e-14
+    ).x
+    return np.array([*xy, height_m])
+
+
+@pytest.fixture(scope="module")
+def baseline():
+    return Baseline.of(*flat_banks(), None, CYCLES_PER_M)
+
+
+def test_phase_changes_along_curves_of_equal_range(baseline):
+    a, b = flat_banks()
+    for point_m in np.array([[0.0, 32.0, 0.0], [0.7, 31.0, 0.5]]):
+        above_m = raised(a, b, point_m, point_m[2] + 0.05)
+        sight = baseline.sight(point_m[None])
+        assert (above_m - point_m)[:2] / 0.05 == pytest.approx(sight.tangent[0], abs=2e-3)
+        apart_m = [ranges_m(a, each[None])[0] - ranges_m(b, each[None])[0] for each in
+                   (point_m, above_m)]  # fmt: skip
+        change_rad = 2 * np.pi * CYCLES_PER_M * (apart_m[1] - apart_m[0])[0]
+        assert sight.rad_m[0] == pytest.approx(change_rad / 0.05, rel=5e-3)
+
+
+def test_curves_keep_the_range(baseline):
+    a, b = flat_banks()
+    offset_m = np.linspace(-2, 2, 13)
+    curves = Curves.over(baseline, GRID, offset_m)
+    assert curves.grid.shape[0] > GRID.shape[0] + 2 * 2 * 0.35 / 0.02
+    start_m = curves.grid.positions_m()[::40, ::30].reshape(-1, 3)
+    for index in (0, 6, 12):
+        points_m = curves.points_m(index)[::40, ::30].reshape(-1, 3)
+        assert points_m[:, 2] == pytest.approx(offset_m[index])
+        mean_m = [(ranges_m(a, each)[0] + ranges_m(b, each)[0]) / 2 for each in (start_m, points_m)]
+        assert np.abs(mean_m[1] - mean_m[0]).max() < 1e-3  # 1/25 of the range resolution
+
+
+def test_curves_through_pixels_pass_through_them(baseline):
+    offset_m = np.linspace(-1, 1, 7)
+    curves = Curves.over(baseline, GRID, offset_m)
+    for index in (0, 5):
+        rows, columns = curves.through(index, GRID.shape)
+        places_m = curves.points_m(index)
+        near = np.rint(rows).astype(int), np.rint(columns).astype(int)
+        between = np.stack([rows, columns], axis=-1) - np.stack(near, axis=-1)
+        found_m = places_m[near][..., :2] + between[..., ::-1] * 0.02
+        assert found_m == pytest.approx(GRID.positions_m()[..., :2], abs=3e-4)
+
+
+def test_slopes_change_the_sensitivity(baseline):
+    sights = sight_lattice(baseline, GRID, (-1, 1))
+    level, facing = sensitivity(GRID, np.zeros(GRID.shape), np.zeros((2, *GRID.shape)), sights)
+    assert facing == pytest.approx(1)
+    slope_m = np.zeros((2, *GRID.shape))
+    slope_m[0] = 0.5 * 0.02
+    steep, facing = sensitivity(GRID, np.zeros(GRID.shape), slope_m, sights)
+    # The depression at 32 m and an altitude of 12.06 m has a tangent of 0.377.
+    assert facing[60, 40] == pytest.approx(1 - 0.5 * 0.377, abs=0.01)
+    assert steep == pytest.approx(level / facing)
+
+
+def test_a_beam_selects_the_channels_that_count():
+    a, b = flat_banks()
+    point_m = np.array([[0.8, 32.0, 0.0]])
+    wide, narrow = (
+        Baseline.of(a, b, beam, CYCLES_PER_M).sight(point_m) for beam in (None, BeamWindow(6.0))
+    )
+    # Within a narrow beam the line of sight is broadside, and the curve rises across the track.
+    assert abs(narrow.tangent[0, 0]) < 0.3 * abs(wide.tangent[0, 0])
+    assert narrow.rad_m == pytest.approx(wide.rad_m, rel=0.03)

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+from clsas.interferometry.coherence import Window
+from clsas.interferometry.refinement import filled
+from clsas.interferometry.sweep import STEPS_PER_CYCLE, likeliest
+
+
+def volume(cycles, magnitude_at, shape=(20, 24), heights=31, random=None, noise=0.0):
+    """Coherence at heights, for scatterers some cycles above the middle of the search."""
+    height = (np.arange(heights) - heights // 2) / STEPS_PER_CYCLE
+    apart = height[:, None, None] - np.broadcast_to(cycles, shape)
+    coherence = magnitude_at(np.abs(apart)) * np.exp(2j * np.pi * apart)
+    if random is not None:
+        coherence = coherence + noise * (random.standard_normal((heights, *shape, 2)) @ [1, 1j])
+    return coherence.astype(np.complex64)
+
+
+def envelope(apart):
+    return 0.9 * np.sinc(0.3 * apart)
+
+
+def found_cycles(coherence, coarse):
+    return (likeliest(coherence, coarse) - len(coherence) // 2) / STEPS_PER_CYCLE
+
+
+@pytest.mark.parametrize("cycles", [-1.9, -0.25, 0.0, 1.3])
+def test_the_most_coherent_cycle_wins(cycles):
+    found = found_cycles(volume(cycles, envelope), Window(5, 5))
+    assert found == pytest.approx(cycles, abs=0.6 / STEPS_PER_CYCLE)
+
+
+def test_large_windows_decide_between_cycles_in_noise():
+    random = np.random.default_rng(1)
+    noisy = volume(0.2, envelope, random=random, noise=0.12)
+    small, large = (
+        np.mean(np.abs(found_cycles(noisy, window) - 0.2) > 0.5)
+        for window in (Window(1, 1), Window(9, 9))
+    )
+    assert small > 0.1
+    assert large == 0
+
+
+def test_relief_within_a_large_window_keeps_its_heights():
+    slope = np.linspace(-0.8, 0.8, 20)[:, None]
+    found = found_cycles(volume(slope, envelope), Window(9, 9))
+    assert found == pytest.approx(np.broadcast_to(slope, found.shape), abs=0.6 / STEPS_PER_CYCLE)
+
+
+def test_steps_of_one_and_a_half_cycles():
+    step = np.where(np.arange(24) < 12, -0.7, 0.8)
+    found = found_cycles(volume(step, envelope), Window(9, 9))
+    assert found == pytest.approx(np.broadcast_to(step, found.shape), abs=0.6 / STEPS_PER_CYCLE)
+
+
+def test_unknown_pixels_take_the_nearest_value():
+    values = np.array([[1.0, np.nan, np.nan], [5.0, np.nan, 7.0]])
+    found = filled(values, np.isfinite(values))
+    assert found[0, 1] in (1, 5)
+    assert found[0, 2] == 7
+    assert found[1].tolist() in ([5, 5, 7], [5, 7, 7])
+    assert not filled(values, np.zeros(values.shape, bool)).any()
