@@ -62,7 +62,7 @@ class SoundSpeed:
     >>> profile
     SoundSpeed(4 depths, 0 to 40 m, 1490 to 1500 m/s)
     >>> print(profile.at(-11.5), f"{profile.mean_m_s(-5, -25):.2f}")
-    1495.0 1493.32
+    1495.0 1493.29
     """
 
     depth_m: NDArray[np.float64]
