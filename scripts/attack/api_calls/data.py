@@ -18,7 +18,15 @@ def data(folder: Path) -> dict[str, Call]:
     part = slice(2, 10, 2)
     points = clsas.Grid.points(grid.positions_m().reshape(-1, 3))
     axis = (0.0, 1.0, 5)
-    unset = {"rx_velocity_m_s": ("None",), "look_direction": ("None",), "georeference": ("None",)}
+    optional = ("rx_velocity_m_s", "look_direction", "georeference", "sound_speed")
+    unset = dict.fromkeys(optional, ("None",))
+    profile = clsas.SoundSpeed([0.0, 40.0], [1500.0, 1490.0], 20.0)
+    cast = {
+        "depth_m": np.array([0.0, 10.0, 50.0]),
+        "temperature_c": np.array([15.0, 14.0, 9.0]),
+        "salinity": np.full(3, 35.0),
+        "surface_z_m": 20.0,
+    }
     place = {"georeference": clsas.Georeference.local(60.39, 5.32, heading_deg=217.0)}
     return {
         "Grid": Call(
@@ -62,7 +70,8 @@ def data(folder: Path) -> dict[str, Call]:
         "RangeLines": Call(
             clsas.RangeLines,
             fields(lines)
-            | {"rx_velocity_m_s": np.ones((40, 3)), "look_direction": np.ones((40, 3)), **place},
+            | {"rx_velocity_m_s": np.ones((40, 3)), "look_direction": np.ones((40, 3)), **place}
+            | {"sound_speed": profile},
             accepts=unset | {"samples": ("an Image",)},
         ),
         "RangeLines.select": Call(lines.select, {"channels": np.array([1, 5, 30])}),
@@ -95,9 +104,24 @@ def data(folder: Path) -> dict[str, Call]:
         "Echoes": Call(
             clsas.Echoes,
             fields(s.echoes)
-            | {"rx_velocity_m_s": np.ones((40, 3)), "look_direction": np.ones((40, 3)), **place},
+            | {"rx_velocity_m_s": np.ones((40, 3)), "look_direction": np.ones((40, 3)), **place}
+            | {"sound_speed": profile},
             accepts=unset | {"pulse": ("None",), "samples": ("an Image",)},
         ),
+        "SoundSpeed": Call(
+            clsas.SoundSpeed,
+            {
+                "depth_m": np.array([0.0, 10.0, 50.0]),
+                "speed_m_s": np.array([1500.0, 1499.0, 1490.0]),
+                "surface_z_m": 20.0,
+            },
+        ),
+        "SoundSpeed.from_temperature": Call(clsas.SoundSpeed.from_temperature, cast),
+        "SoundSpeed.from_teos10": Call(
+            clsas.SoundSpeed.from_teos10, {**cast, "longitude_deg": 5.3, "latitude_deg": 60.4}
+        ),
+        "SoundSpeed.at": Call(profile.at, {"z_m": np.array([0.0, 5.0])}, accepts={"z_m": EMPTY}),
+        "SoundSpeed.mean_m_s": Call(profile.mean_m_s, {"one_z_m": 18.0, "other_z_m": -5.0}),
         "Replica": Call(
             clsas.Replica, {"samples": np.exp(1j * np.arange(40.0)), "sample_rate_hz": 4e4}
         ),
