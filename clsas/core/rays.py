@@ -275,7 +275,7 @@ def _constant_at(profile: SoundSpeed, depth: NDArray[np.float64]) -> NDArray[np.
     """Return whether depths lie in a layer of constant speed, or on its edge."""
     flat = np.flatnonzero(np.diff(profile.speed_m_s) == 0)
     starts, stops = profile.depth_m[flat], profile.depth_m[flat + 1]
-    return ((depth[:, None] >= starts) & (depth[:, None] <= stops)).any(axis=1)
+    return np.any((depth[:, None] >= starts) & (depth[:, None] <= stops), axis=1)
 
 
 def _turning(

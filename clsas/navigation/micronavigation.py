@@ -276,8 +276,8 @@ def micronavigate(
     result = _result(lines, array, swath, found, accuracy)
     if given is lines:
         return result
-    positions = {"tx_m": result.lines.tx_m, "rx_m": result.lines.rx_m}
-    return replace(result, lines=replace(given, **positions))
+    corrected = replace(given, tx_m=result.lines.tx_m, rx_m=result.lines.rx_m)
+    return replace(result, lines=corrected)
 
 
 def _result(
