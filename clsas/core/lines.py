@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import banks, conditioning, pings, reprs, validate
 from clsas.core.georeference import Georeference
-from clsas.core.sound_speed import SoundSpeed
+from clsas.core.sound_speed import SoundSpeed, check_reaches
 
 _PER_CHANNEL = (
     "first_range_m",
@@ -460,7 +460,7 @@ def checked_channels(received: Any, start: str) -> dict[str, Any]:
         checked["look_direction"] = _unit_vectors("look_direction", checked["look_direction"])
     if received.sound_speed is not None:
         for name in ("tx_m", "rx_m"):
-            received.sound_speed.check_reaches(checked[name][:, 2], name)
+            check_reaches(received.sound_speed, checked[name][:, 2], name)
     return checked
 
 

@@ -10,7 +10,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from clsas.core.rays import rays
-from clsas.core.sound_speed import SoundSpeed
+from clsas.core.sound_speed import SoundSpeed, check_reaches
 
 _DISTANCES, _HEIGHTS = 8, 4  # entries of the first attempt at a table; each further doubles both
 _ATTEMPTS = 4
@@ -58,7 +58,7 @@ class RayTable:
         It is None if there are shadow zones between these limits, or if the times are not smooth
         enough for a table; `rays` must then be called itself.
         """
-        profile.check_reaches(np.array([antenna_z_m, *z_m]))
+        check_reaches(profile, np.array([antenna_z_m, *z_m]))
         low, high = z_m
         kinks = [*profile.z_m, antenna_z_m]
         edges = np.unique([low, *(z for z in kinks if low < z < high), high])

@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core.sound_speed import SoundSpeed
+from clsas.core.sound_speed import SoundSpeed, check_reaches
 
 _STEPS = 60  # of Newton's method, at most; 3 to 8 are usual
 _CLOSE = 1e-14  # relative error of the distance at which a ray counts as found
@@ -92,8 +92,7 @@ def rays(
         *(np.asarray(each, np.float64) for each in (horizontal_m, one_z_m, other_z_m))
     )
     for z in (one, other):
-        if z.size:
-            profile.check_reaches(z)
+        check_reaches(profile, z)
     found = np.empty((5, distance.size))
     flat = [np.ravel(each) for each in (distance, one, other)]
     for first in range(0, distance.size, _AT_ONCE):
@@ -276,7 +275,7 @@ def _constant_at(profile: SoundSpeed, depth: NDArray[np.float64]) -> NDArray[np.
     """Return whether depths lie in a layer of constant speed, or on its edge."""
     flat = np.flatnonzero(np.diff(profile.speed_m_s) == 0)
     starts, stops = profile.depth_m[flat], profile.depth_m[flat + 1]
-    return ((depth[:, None] >= starts) & (depth[:, None] <= stops)).any(axis=1)
+    return np.any((depth[:, None] >= starts) & (depth[:, None] <= stops), axis=1)
 
 
 def _turning(

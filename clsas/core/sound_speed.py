@@ -62,7 +62,7 @@ class SoundSpeed:
     >>> profile
     SoundSpeed(4 depths, 0 to 40 m, 1490 to 1500 m/s)
     >>> print(profile.at(-11.5), f"{profile.mean_m_s(-5, -25):.2f}")
-    1495.0 1493.32
+    1495.0 1493.29
     """
 
     depth_m: NDArray[np.float64]
@@ -239,11 +239,11 @@ class SoundSpeed:
 
         Raises
         ------
-        ValueError
-            If a height is outside the profile.
+        TypeError, ValueError
+            If the heights are not numbers, or one is outside the profile.
         """
-        z = np.asarray(z_m, np.float64)
-        self.check_reaches(z)
+        z = validate.array("z_m", z_m, np.float64, None)
+        check_reaches(self, z)
         return np.interp(self.surface_z_m - z, self.depth_m, self.speed_m_s)
 
     def mean_m_s(self, one_z_m: float, other_z_m: float) -> float:
@@ -254,10 +254,14 @@ class SoundSpeed:
 
         Raises
         ------
-        ValueError
-            If a height is outside the profile.
+        TypeError, ValueError
+            If a height is not a number, or is outside the profile.
         """
-        top, bottom = sorted((float(one_z_m), float(other_z_m)), reverse=True)
+        one = validate.number("one_z_m", one_z_m, "m")
+        other = validate.number("other_z_m", other_z_m, "m")
+        check_reaches(self, one, "one_z_m")
+        check_reaches(self, other, "other_z_m")
+        top, bottom = max(one, other), min(one, other)
         ends = np.array([top, bottom])
         speeds = self.at(ends)
         if top == bottom:
@@ -274,29 +278,33 @@ class SoundSpeed:
         )
         return float((top - bottom) / np.sum(np.diff(depth) / slower * share))
 
-    def check_reaches(self, z_m: ArrayLike, name: str = "z_m") -> None:
-        """Raise ValueError if heights of antennas or pixels lie outside the profile."""
-        z = np.asarray(z_m, np.float64)
-        depth = self.surface_z_m - np.array([z.max(), z.min()])
-        slack = 1e-9 * max(1.0, abs(self.surface_z_m), float(self.depth_m[-1]))
-        if depth[0] >= self.depth_m[0] - slack and depth[1] <= self.depth_m[-1] + slack:
-            return
-        raise ValueError(
-            f"sound_speed must include the depths of {name}, {depth[0]:g} to {depth[1]:g} m, got "
-            f"a profile from {self.depth_m[0]:g} to {self.depth_m[-1]:g} m (depth is surface_z_m = "
-            f"{self.surface_z_m:g} m minus z): extend the profile, or correct surface_z_m"
-        )
+
+def check_reaches(profile: SoundSpeed, z_m: ArrayLike, name: str = "z_m") -> None:
+    """Raise ValueError if heights of antennas or pixels lie outside a profile."""
+    z = np.asarray(z_m, np.float64)
+    if not z.size:
+        return
+    depth = profile.surface_z_m - np.array([z.max(), z.min()])
+    first, last = float(profile.depth_m[0]), float(profile.depth_m[-1])
+    slack = 1e-9 * max(1.0, abs(profile.surface_z_m), last)
+    if depth[0] >= first - slack and depth[1] <= last + slack:
+        return
+    raise ValueError(
+        f"sound_speed must include the depths of {name}, {depth[0]:g} to {depth[1]:g} m, got a "
+        f"profile from {first:g} to {last:g} m (depth is surface_z_m = {profile.surface_z_m:g} m "
+        "minus z): extend the profile, or correct surface_z_m"
+    )
 
 
 def _measured(*arguments: ArrayLike) -> tuple[NDArray[np.float64], ...]:
     """Return depths, temperatures and salinities as arrays of one length."""
     names = ("depth_m", "temperature_c", "salinity")
     depth = validate.array(names[0], arguments[0], np.float64, (None,))
-    others = (
-        validate.array(name, np.broadcast_to(given, depth.shape) if np.ndim(given) == 0 else given,
-                       np.float64, depth.shape)
-        for name, given in zip(names[1:], arguments[1:], strict=True)
-    )  # fmt: skip
+    others = []
+    for name, value in zip(names[1:], arguments[1:], strict=True):
+        given = validate.array(name, value, np.float64, None)
+        everywhere = np.broadcast_to(given, depth.shape) if given.ndim == 0 else given
+        others.append(validate.array(name, everywhere, np.float64, depth.shape))
     return depth, *others
 
 

@@ -45,8 +45,8 @@ class SceneFile:
         From the tables `targets` and `seabed`.
     simulate, compress, image : dict
         Keyword arguments for `clsas.simulate` (with the sound speed), for `clsas.compress`, and for
-        `clsas.plan` (one of `PLAN_KEYS`) or `clsas.backproject` (any of `EXACT_KEYS`); the latter may
-        include a `beam`.
+        `clsas.plan` (one of `PLAN_KEYS`) or `clsas.backproject` (any of `EXACT_KEYS`). The latter
+        may include a `beam`.
     mosaic : dict
         Paths that `clsas mosaic` reads (`lines`) and writes (`store`), and its `patches` and
         `memory_mib`.

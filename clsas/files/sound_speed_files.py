@@ -44,6 +44,7 @@ def read_sound_speed(path: str | os.PathLike, *, surface_z_m: float = 0.0) -> So
     >>> import clsas
     >>> profile = clsas.read_sound_speed("cast.csv", surface_z_m=20.0)  # doctest: +SKIP
     """
+    path = validate.path("path", path)
     text = reading.read_bytes(path).decode("utf-8-sig")
     reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
     try:
@@ -51,7 +52,7 @@ def read_sound_speed(path: str | os.PathLike, *, surface_z_m: float = 0.0) -> So
         rows = [(reader.line_num, row) for row in reader if row]
     except csv.Error as error:
         raise ValueError(f"{path}: line {reader.line_num} is not CSV: {error}") from None
-    known = dict.fromkeys((*_MEASURED, *_DERIVED))
+    known = tuple(dict.fromkeys((*_MEASURED, *_DERIVED)))
     for name in names:
         if name not in known:
             raise ValueError(

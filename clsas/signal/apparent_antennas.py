@@ -146,7 +146,7 @@ class Change:
             )
             slope = np.where(scaled < 0, slopes[:, :1], slopes[:, 1:])
             value = value + slope * (scaled - inside)
-        return value
+        return np.asarray(value, np.float64)
 
     def lines(self, lines: RangeLines, sound_speed_m_s: float) -> RangeLines:
         """Return lines of the geometry in homogeneous water, with samples over changed ranges."""

@@ -28,6 +28,7 @@ from clsas.core import validate
 from clsas.core.decibels import in_db, power
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
+from clsas.core.sound_speed import check_reaches
 from clsas.signal.apparent_antennas import Change
 from clsas.signal.apparent_pixels import apparent_grid
 from clsas.signal.ray_delays import RaySample, at_speed, sample_points_m, straight_m
@@ -149,7 +150,7 @@ def homogeneous(
     if profile is None:
         return Homogeneous(grid)
     low, high = grid.bounds_m
-    profile.check_reaches(np.array([low[2], high[2]]), "the grid's pixels")
+    check_reaches(profile, np.array([low[2], high[2]]), "the grid's pixels")
     sample = RaySample.of(lines, grid, beam)
     if not sample.visible.any():
         middle = profile.mean_m_s(float(lines.tx_m[0, 2]), float((low[2] + high[2]) / 2))

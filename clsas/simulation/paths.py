@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from clsas.core import validate
 from clsas.core.geometry import legs_m
-from clsas.core.sound_speed import SoundSpeed
+from clsas.core.sound_speed import SoundSpeed, check_reaches
 from clsas.core.threads import in_threads
 from clsas.simulation.patterns import ElementPatterns
 from clsas.simulation.refraction import BlockDelays
@@ -144,7 +144,7 @@ class Paths:
                     refraction = None
                     if self.sound_speed is not None:
                         z_m = positions[block, 2]
-                        self.sound_speed.check_reaches(z_m, "the scene's points")
+                        check_reaches(self.sound_speed, z_m, "the scene's points")
                         refraction = BlockDelays(self.sound_speed, points_m, z_m)
                     yield PointBlock(points_m, amplitudes[block], part.error, refraction)
 

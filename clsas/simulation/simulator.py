@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import validate
 from clsas.core.lines import RangeLines
-from clsas.core.sound_speed import SoundSpeed
+from clsas.core.sound_speed import SoundSpeed, check_reaches
 from clsas.signal.compression import Window, compress
 from clsas.signal.compression import check_options as check_compression
 from clsas.signal.echoes import Echoes
@@ -387,8 +387,8 @@ def simulate_lines(
 def _check_heights(sound_speed: SoundSpeed | None, geometry: Channels) -> None:
     """Raise ValueError if a profile does not reach all antennas."""
     if sound_speed is not None:
-        sound_speed.check_reaches(geometry.tx_m[:, 2], "tx_m")
-        sound_speed.check_reaches(geometry.rx_m[:, 2], "rx_m")
+        check_reaches(sound_speed, geometry.tx_m[:, 2], "tx_m")
+        check_reaches(sound_speed, geometry.rx_m[:, 2], "rx_m")
 
 
 def _channels(tx_m: ArrayLike, rx_m: ArrayLike, rx_velocity_m_s: ArrayLike | None) -> Channels:

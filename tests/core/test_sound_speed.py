@@ -3,6 +3,7 @@ import pytest
 from scipy.integrate import quad
 
 from clsas import SoundSpeed
+from clsas.core.sound_speed import check_reaches
 
 DEPTH = [0, 10, 13, 60]
 SPEED = [1500, 1501, 1491, 1492]
@@ -88,7 +89,7 @@ def test_nothing_is_extrapolated():
     with pytest.raises(ValueError, match=r"include the depths of z_m, 1 to 1 m, got .* 2 to 30 m"):
         profile.at(-1.0)
     with pytest.raises(ValueError, match="depths of tx_m, 31 to 31 m"):
-        profile.check_reaches(-31.0, "tx_m")
+        check_reaches(profile, -31.0, "tx_m")
 
 
 def test_equal_profiles_are_equal():

@@ -9,6 +9,7 @@ from cases import along_x, beside, lines_over
 from click.testing import CliRunner
 
 import clsas
+from clsas import SoundSpeed
 from clsas.cli import main
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
@@ -16,8 +17,9 @@ from clsas.exact.reference import ideal
 from clsas.files import scene_files as config
 from clsas.measures.assessment import assess, survey_lines
 from clsas.measures.effects import BEAM, ENDS, KEYS, PATTERN, SINGLE, SWAY, track_errors_m
+from clsas.signal.refraction import homogeneous
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.simplify import APART, MOTION, RELIEF
+from clsas.sonar.simplify import APART, MOTION, REFRACTION, RELIEF
 from clsas.sonar.system import line_array
 
 CHANNELS, CARRIER, STEP = 96, 300e3, 0.012
@@ -381,3 +383,25 @@ def test_every_key_is_one_of_scene_files():
             table_, setting = key.split("] ")
             described = config.parse_scene(f"{table_}]\n{setting}".encode(), name=name, folder=None)
             assert described.simulate
+
+
+@pytest.mark.parametrize(("gradient", "tolerance_db"), [(0.02, -40), (0.5, -40), (0.5, -20)])
+def test_refraction(gradient, tolerance_db):
+    """The error is that of straight rays with the speed that fits them best."""
+    profile = SoundSpeed([0, 40], [1500 - gradient, 1500 + 39 * gradient], surface_z_m=1.0)
+    lines = replace(lines_on(GRID, APERTURE), sound_speed=profile)
+    found = assess(lines, GRID, tolerance_db=tolerance_db)
+    effect = found[REFRACTION]
+    assert effect.modelled
+    straight = homogeneous(lines, GRID, None, 0.0).lines(lines)
+    assert straight.sound_speed_m_s == pytest.approx(profile.mean_m_s(0, -3), abs=0.01)
+    assert effect.error_db == pytest.approx(measured_db(lines, straight), abs=1.0)
+    assert effect.seconds > 0
+    assert effect.most_wavelengths >= effect.range_wavelengths
+    assert effect.left_out == (not effect.needed)
+    assert REFRACTION in found.describe()
+
+
+def test_lines_without_a_profile_have_no_refraction():
+    effect = assess(lines_on(GRID, APERTURE), GRID)[REFRACTION]
+    assert (effect.modelled, effect.error_db, effect.seconds) == (False, None, None)

@@ -24,7 +24,14 @@ def data(folder: Path) -> dict[str, Call]:
         "look_direction": np.ones((40, 3)),
         "bank_numbers": numbers,
     }
-    unset = dict.fromkeys((*of_channels, "georeference"), ("None",))
+    unset = dict.fromkeys((*of_channels, "georeference", "sound_speed"), ("None",))
+    profile = clsas.SoundSpeed([0.0, 40.0], [1500.0, 1490.0], 20.0)
+    cast = {
+        "depth_m": np.array([0.0, 10.0, 50.0]),
+        "temperature_c": np.array([15.0, 14.0, 9.0]),
+        "salinity": np.full(3, 35.0),
+        "surface_z_m": 20.0,
+    }
     place = {"georeference": clsas.Georeference.local(60.39, 5.32, heading_deg=217.0)}
     return {
         "Grid": Call(
@@ -67,7 +74,7 @@ def data(folder: Path) -> dict[str, Call]:
         "Grid.window": Call(grid.window, {"rows": part, "columns": slice(1, 3)}),
         "RangeLines": Call(
             clsas.RangeLines,
-            fields(lines) | of_channels | place,
+            fields(lines) | of_channels | place | {"sound_speed": profile},
             accepts=unset | {"samples": ("an Image",)},
         ),
         "RangeLines.bank": Call(
@@ -102,9 +109,23 @@ def data(folder: Path) -> dict[str, Call]:
         "Image.to_xarray": Call(image.to_xarray, {}),
         "Echoes": Call(
             clsas.Echoes,
-            fields(s.echoes) | of_channels | place,
+            fields(s.echoes) | of_channels | place | {"sound_speed": profile},
             accepts=unset | {"pulse": ("None",), "samples": ("an Image",)},
         ),
+        "SoundSpeed": Call(
+            clsas.SoundSpeed,
+            {
+                "depth_m": np.array([0.0, 10.0, 50.0]),
+                "speed_m_s": np.array([1500.0, 1499.0, 1490.0]),
+                "surface_z_m": 20.0,
+            },
+        ),
+        "SoundSpeed.from_temperature": Call(clsas.SoundSpeed.from_temperature, cast),
+        "SoundSpeed.from_teos10": Call(
+            clsas.SoundSpeed.from_teos10, {**cast, "longitude_deg": 5.3, "latitude_deg": 60.4}
+        ),
+        "SoundSpeed.at": Call(profile.at, {"z_m": np.array([0.0, 5.0])}, accepts={"z_m": EMPTY}),
+        "SoundSpeed.mean_m_s": Call(profile.mean_m_s, {"one_z_m": 18.0, "other_z_m": -5.0}),
         "Replica": Call(
             clsas.Replica, {"samples": np.exp(1j * np.arange(40.0)), "sample_rate_hz": 4e4}
         ),

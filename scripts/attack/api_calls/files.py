@@ -19,6 +19,7 @@ from clsas.planning.costs import Costs
 def files(folder: Path) -> dict[str, Call]:
     s = scene(folder)
     optional = ("None",)
+    (folder / "cast.csv").write_text("depth_m,speed_m_s\n0,1500\n40,1490\n")
     common = {"window": "hann", "oversampling": 2.0}
     store = clsas.mosaic(
         s.lines.select(slice(0, 20)),
@@ -54,6 +55,9 @@ def files(folder: Path) -> dict[str, Call]:
             clsas.read_cphd, {"path": folder / "lines.cphd", "channel": None, **common}
         ),
         "write_cphd": Call(clsas.write_cphd, {"path": folder / "out.cphd", "lines": s.lines}),
+        "read_sound_speed": Call(
+            clsas.read_sound_speed, {"path": folder / "cast.csv", "surface_z_m": 20.0}
+        ),
         "read_full_matrix": Call(
             clsas.read_full_matrix,
             {"path": folder / "capture.mat", "sound_speed_m_s": 6000.0, **common},

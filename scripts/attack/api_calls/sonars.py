@@ -21,6 +21,7 @@ def sonars(folder: Path) -> dict[str, Call]:
     observer = Observer(np.array([0.0, 0.0, 2.0]))
     pointing = clsas.Pointing.squint(0.1)
     optional = ("None",)
+    profile = clsas.SoundSpeed([0.0, 40.0], [1500.0, 1490.0], 20.0)
     place = clsas.Georeference.local(60.39, 5.32, heading_deg=217.0)
     unplaced = {"georeference": optional}
     sizes = ("tx_length_m", "rx_length_m", "tx_height_m", "rx_height_m")
@@ -167,11 +168,12 @@ def sonars(folder: Path) -> dict[str, Call]:
                 "range_m": (14.0, 16.5),
                 "snr_db": 20.0,
                 "seed": 1,
+                "sound_speed": profile,
                 "workers": 1,
                 "progress": nothing,
             },
             accepts=dict.fromkeys(
-                ("pointing", "range_m", "snr_db", "workers", "progress"), optional
+                ("pointing", "range_m", "snr_db", "sound_speed", "workers", "progress"), optional
             ),
         ),
         "simulate_lines": Call(
@@ -188,11 +190,20 @@ def sonars(folder: Path) -> dict[str, Call]:
                 "first_range_m": np.full(40, 14.0),
                 "length": 100,
                 "rx_velocity_m_s": np.ones((40, 3)),
+                "sound_speed": profile,
                 "workers": 1,
                 "progress": nothing,
             },
             accepts=dict.fromkeys(
-                ("first_range_m", "length", "rx_velocity_m_s", "workers", "progress"), optional
+                (
+                    "first_range_m",
+                    "length",
+                    "rx_velocity_m_s",
+                    "sound_speed",
+                    "workers",
+                    "progress",
+                ),
+                optional,
             ),
         ),
         "compress": Call(
@@ -217,7 +228,9 @@ def sonars(folder: Path) -> dict[str, Call]:
                 "phase_centres": False,
                 "window": "hann",
                 "oversampling": 2.0,
+                "sound_speed": profile,
             },
+            accepts={"sound_speed": optional},
         ),
         "limits": Call(
             clsas.limits,
