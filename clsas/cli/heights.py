@@ -11,7 +11,7 @@ import numpy as np
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, read_beam, read_grid
+from clsas.cli.inputs import load_lines, read_beam, read_grid
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, Parsed
 from clsas.core import validate
@@ -29,8 +29,8 @@ _SEARCH = Parsed("LOW:HIGH", _heights, "LOW:HIGH, two ascending heights in metre
 
 
 @click.command()
-@click.argument("first_file", metavar="A.H5", type=INPUT)
-@click.argument("second_file", metavar="B.H5", type=INPUT)
+@click.argument("first_file", metavar="LINES.H5", type=INPUT)
+@click.argument("second_file", metavar="[B.H5]", type=INPUT, required=False)
 @options.output("Heights")
 @options.grid
 @click.option(
@@ -67,7 +67,7 @@ _SEARCH = Parsed("LOW:HIGH", _heights, "LOW:HIGH, two ascending heights in metre
 @options.as_json
 def heights(
     first_file: Path,
-    second_file: Path,
+    second_file: Path | None,
     output: Path,
     scene: Path | None,
     search_m: tuple[float, float],
@@ -80,16 +80,28 @@ def heights(
 ) -> None:
     """Measure the heights of a seabed from two receiver banks.
 
-    A.H5 and B.H5 are the range lines of the same pings, from receivers at different heights. The
-    grid, from --scene or from --x, --y and --z, must be a plane. Heights are valid where the banks
-    are coherent, and not in shadow or layover; the others are NaN.
+    LINES.H5 holds the range lines of both banks, or those of one if B.H5 holds those of the other.
+    The grid, from --scene or from --x, --y and --z, must be a plane. Heights are valid where the
+    banks are coherent, and not in shadow or layover; the others are NaN.
 
     \b
-    Example:  clsas heights low.h5 high.h5 --x -2:2:201 --y 30:34:201 --search-m -1:1 -o heights.h5
+    Example:  clsas heights lines.h5 --x -2:2:201 --y 30:34:201 --search-m -1:1 -o heights.h5
     """
     described, grid = read_grid(scene, given)
     beam = read_beam(described, given)
-    first, second = (load(path, clsas.RangeLines) for path in (first_file, second_file))
+    if second_file is None:
+        lines = load_lines(first_file, None, described)
+        if lines.banks != 2:
+            raise ValueError(
+                f"{first_file} must hold range lines of 2 receiver banks, got {lines.banks}: give "
+                "the lines of the other bank as a second file"
+                if lines.banks == 1
+                else f"{first_file} must hold range lines of 2 receiver banks, got {lines.banks}: "
+                "take two of them by clsas convert --bank"
+            )
+        first, second = lines.bank(0), lines.bank(1)
+    else:
+        first, second = (load_lines(each, None, described) for each in (first_file, second_file))
     with progress_bar("measuring heights") as progress:
         found = clsas.heights(
             first, second, grid, search_m=search_m, window_m=window_m, tolerance_db=tolerance_db,

@@ -19,7 +19,15 @@ from clsas.plot.canvas import SUFFIXES as PICTURES
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Shown: TypeAlias = clsas.Image | clsas.RangeLines | clsas.Echoes | clsas.Plan | clsas.Store
+Shown: TypeAlias = (
+    clsas.Image
+    | clsas.RangeLines
+    | clsas.Echoes
+    | clsas.Plan
+    | clsas.Store
+    | clsas.Interferogram
+    | clsas.Heights
+)
 
 _ENDINGS = (*SUFFIXES, ".mat", ".json", ".zarr")  # that the picture's name does without
 _MOST_PIXELS = 1024  # of a mosaic, along its longer side; a picture has as many dots
@@ -65,12 +73,12 @@ def show(
     scale_bar: bool,
     as_json: bool,
 ) -> None:
-    """Draw an image, range lines, a plan, a recording or a mosaic.
+    """Draw an image, heights, range lines, a plan, a recording or a mosaic.
 
-    FILE is any file that clsas writes or reads: an image, range lines or echoes in HDF5; a
-    recording as CPHD, AirSAS or MATLAB; a plan that `clsas plan --json --filters` printed; or the
-    Zarr store of a mosaic, which is read patch by patch and may be larger than memory. Its contents
-    decide, not its name.
+    FILE is any file that clsas writes or reads: an image, an interferogram, heights, range lines or
+    echoes in HDF5; a recording as CPHD, AirSAS or MATLAB; a plan that `clsas plan --json --filters`
+    printed; or the Zarr store of a mosaic, which is read patch by patch and may be larger than
+    memory. Its contents decide, not its name.
 
     \b
     Example:  clsas show image.h5 --near 0,42.5 --extent-m 0.2 --db 40
@@ -138,10 +146,8 @@ def _read(path: Path) -> Shown:
             f"{path} is a scene, which has nothing to draw yet: clsas simulate {path} -o ECHOES.H5"
         )
     found = clsas.load(path)
-    if isinstance(found, clsas.Grid | clsas.Interferogram | clsas.Heights):
-        raise ValueError(
-            f"{path} must hold an image, range lines or echoes, got only a {type(found).__name__}"
-        )
+    if isinstance(found, clsas.Grid):
+        raise ValueError(f"{path} must hold an image, range lines or echoes, got only a Grid")
     return found
 
 
@@ -149,6 +155,10 @@ def _check_options(shown: Shown, given: set[str]) -> None:
     """Raise UsageError for options that have no effect on an object of this kind."""
     if isinstance(shown, clsas.Plan):
         refused, what = given, "a plan"
+    elif isinstance(shown, clsas.Interferogram):
+        refused, what = given, "an interferogram"
+    elif isinstance(shown, clsas.Heights):
+        refused, what = given - {"--colour-map"}, "heights"
     elif isinstance(shown, clsas.RangeLines | clsas.Echoes):
         refused, what = given & {"--near", "--extent-m", *_MARKS}, "range lines or echoes"
     elif isinstance(shown, clsas.Image) and shown.grid.points_m is not None:
@@ -175,6 +185,11 @@ def _drawn(
 
     if isinstance(shown, clsas.Plan):
         return plot.plan(shown, title=title), repr(shown)
+    if isinstance(shown, clsas.Interferogram):
+        return plot.interferogram(shown, title=title), repr(shown)
+    if isinstance(shown, clsas.Heights):
+        chosen = {name: levels[name] for name in levels if name == "colour_map"}
+        return plot.heights(shown, **chosen, title=title), repr(shown)
     if isinstance(shown, clsas.Store):
         shown = _overview(shown, near, extent_m)
     elif isinstance(shown, clsas.Image) and shown.grid.points_m is None:

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -50,9 +51,39 @@ def test_mistakes_are_reported(files, tmp_path):
     alone = run("heights", files[0], files[0], *GRID, "--search-m", "-1:1", *output, code=1)
     assert "apart across the line of sight" in alone.stderr
     assert not (tmp_path / "heights.h5").exists()
-    shown = tmp_path / "plane.h5"
-    clsas.save(shown, clsas.heights(
-        *flat_banks(), clsas.Grid.plane((-0.5, 0.5, 51), (31.5, 32.5, 51)), search_m=(-0.5, 0.5)
-    ))  # fmt: skip
-    refused = run("show", shown, "-o", tmp_path / "a.png", code=1)
-    assert "got only a Heights" in refused.stderr
+
+
+def test_one_file_may_hold_both_banks(tmp_path):
+    low, high = flat_banks()
+    both = replace(
+        low,
+        samples=np.concatenate([low.samples, high.samples]),
+        **{
+            name: np.concatenate([getattr(low, name), getattr(high, name)])
+            for name in ("first_range_m", "tx_m", "rx_m")
+        },
+        bank_numbers=np.repeat([0, 1], low.channels),
+    )
+    clsas.save(tmp_path / "lines.h5", both)
+    clsas.save(tmp_path / "low.h5", low)
+    output = tmp_path / "heights.h5"
+    given = (*GRID, "--search-m", "-0.5:0.5", "-o", output)
+    run("heights", tmp_path / "lines.h5", *given)
+    found = clsas.load(output)
+    assert np.nanmedian(np.abs(found.height_m)) < 3 * np.nanmedian(found.sd_m)
+    alone = run("heights", tmp_path / "low.h5", *given, code=1)
+    assert "must hold range lines of 2 receiver banks, got 1" in alone.stderr
+
+
+def test_heights_and_interferograms_are_drawn(files, tmp_path):
+    grid = clsas.Grid.plane((-0.5, 0.5, 51), (31.5, 32.5, 51))
+    images = [clsas.backproject(lines, grid) for lines in flat_banks()]
+    for name, found in {
+        "heights": clsas.heights(*flat_banks(), grid, search_m=(-0.5, 0.5)),
+        "fringes": clsas.interferogram(*images, window_m=0.2),
+    }.items():
+        clsas.save(tmp_path / f"{name}.h5", found)
+        run("show", tmp_path / f"{name}.h5")
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+        refused = run("show", tmp_path / f"{name}.h5", "--db", 40, code=2)
+        assert "cannot be used with" in refused.stderr
