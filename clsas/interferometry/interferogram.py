@@ -70,6 +70,8 @@ class Interferogram:
     def __post_init__(self) -> None:
         """Check every field and convert it."""
         validate.instance("grid", self.grid, Grid)
+        if self.grid.points_m is not None:
+            raise ValueError("grid must be a plane or a height map, got points")
         object.__setattr__(self, "window_m", validate.positive("window_m", self.window_m, "m"))
         for name in ("phase_rad", "coherence", "looks", "phase_sd_rad"):
             values = validate.array(name, getattr(self, name), np.float32, self.grid.shape)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,8 @@ from scipy.ndimage import distance_transform_edt
 
 from clsas.core import validate
 from clsas.core.grid import Grid
-from clsas.core.image import Image
+from clsas.interferometry.interferogram import Interferogram
+from clsas.interferometry.result import Heights
 from clsas.plot import colours
 from clsas.plot.canvas import axis_label, drawable, length_unit, new_figure, plain_ticks
 from clsas.plot.levels import edges
@@ -33,42 +34,6 @@ _WHITEST = 0.5  # share of white in the colours of slopes that face the light
 _HIGHEST = 0.98  # share of the deviations within the colours
 
 
-class Interferogram(Protocol):
-    """Phase and coherence of two images, as `interferogram` draws them."""
-
-    @property
-    def grid(self) -> Grid:
-        """Positions of the pixels."""
-
-    @property
-    def phase_rad(self) -> NDArray:
-        """Phase between both images, radians."""
-
-    @property
-    def coherence(self) -> NDArray:
-        """Coherence of both images, 0 to 1."""
-
-
-class Heights(Protocol):
-    """Heights on the grid of an image, as `heights` draws them."""
-
-    @property
-    def image(self) -> Image:
-        """Image on the relief."""
-
-    @property
-    def height_m(self) -> NDArray:
-        """Heights, metres."""
-
-    @property
-    def sd_m(self) -> NDArray:
-        """Standard deviations of the heights, metres."""
-
-    @property
-    def mask(self) -> NDArray:
-        """True where there is a height."""
-
-
 def interferogram(interferogram: Interferogram, *, title: str = "") -> Figure:
     """Draw the phase of an interferogram in cyclic colours, and its coherence beside it.
 
@@ -83,19 +48,17 @@ def interferogram(interferogram: Interferogram, *, title: str = "") -> Figure:
     ------
     ImportError
         If matplotlib is not installed.
-    TypeError, ValueError
-        If an argument has the wrong type, or the pixels are points or not finite.
+    TypeError
+        If an argument has the wrong type.
     """
-    given = "interferogram", interferogram
-    grid = _grid(*given, getattr(interferogram, "grid", None))
-    phase_rad = _values(*given, "phase_rad", grid)
-    coherence = _values(*given, "coherence", grid)
+    validate.instance("interferogram", interferogram, Interferogram)
+    grid = interferogram.grid
     title = drawable("title", title)
     figure, (left, right) = _panels(grid, title)
-    phase = _drawn(left, grid, np.angle(np.exp(1j * phase_rad)), "twilight_shifted", np.pi)
+    phase = _drawn(left, grid, interferogram.phase_rad, "twilight_shifted", np.pi)
     bar = figure.colorbar(phase, ax=left, label="Phase (rad)")
     bar.set_ticks([-np.pi, -np.pi / 2, 0, np.pi / 2, np.pi], labels=["-π", "-π/2", "0", "π/2", "π"])
-    shown = _drawn(right, grid, coherence, "gray", 1.0, least=0.0)
+    shown = _drawn(right, grid, interferogram.coherence, "gray", 1.0, least=0.0)
     figure.colorbar(shown, ax=right, label="Coherence")
     left.set_title("Phase")
     right.set_title("Coherence")
@@ -123,15 +86,13 @@ def heights(heights: Heights, *, colour_map: str | Colormap = "viridis", title: 
     ImportError
         If matplotlib is not installed.
     TypeError, ValueError
-        If an argument has the wrong type, the pixels are points, a height that is not masked is not
-        finite, or no pixel has a height.
+        If an argument has the wrong type, or no pixel has a height.
     """
-    given = "heights", heights
-    grid = _grid(*given, getattr(getattr(heights, "image", None), "grid", None))
-    known = _values(*given, "mask", grid).astype(bool)
+    validate.instance("heights", heights, Heights)
+    grid, known = heights.image.grid, heights.mask
     if not known.any():
         raise ValueError("heights must have at least one pixel that is not masked")
-    height_m, sd_m = (_values(*given, name, grid, known) for name in ("height_m", "sd_m"))
+    height_m, sd_m = (np.where(known, each, 0.0) for each in (heights.height_m, heights.sd_m))
     title = drawable("title", title)
     chosen = colours.colour_map(colour_map)
     figure, (left, right) = _panels(grid, title)
@@ -187,28 +148,6 @@ def _relief(
     shaded += (1 - shaded) * white[..., None]
     shaded[~known] = _MASKED
     return shaded
-
-
-def _grid(name: str, found: object, grid: object) -> Grid:
-    """Return the grid of a result; raise TypeError or ValueError if it cannot be drawn."""
-    if not isinstance(grid, Grid):
-        raise TypeError(f"{name} must be of type {name.capitalize()}, got {type(found).__name__}")
-    if grid.points_m is not None:
-        raise ValueError(f"{name} must be on a plane or height map to be drawn, got points")
-    return grid
-
-
-def _values(
-    name: str, found: object, field: str, grid: Grid, known: NDArray[np.bool_] | None = None
-) -> NDArray[np.float64]:
-    """Return a field of a result, float64 with the grid's shape; finite, or 0 where not known."""
-    values = getattr(found, field, None)
-    if values is None:
-        raise TypeError(f"{name} must have {field}, got {type(found).__name__}")
-    values = np.asarray(values, np.float64)
-    if known is not None and values.shape == known.shape:
-        values = np.where(known, values, 0.0)
-    return validate.array(f"{name}.{field}", values, np.float64, grid.shape)
 
 
 def _panels(grid: Grid, title: str) -> tuple[Figure, NDArray]:
