@@ -158,15 +158,9 @@ def _document(sicd: Any, raster: Raster, collection: Collection, tags: dict[str,
     )
     root = sicd.ElementWrapper(tree.getroot())
     place, centre_m = raster.georeference, raster.positions_m(raster.centre)
-    lowest_hz, highest_hz = (
-        float(each) * collection.lines.sound_speed_m_s / 2
-        for each in collection.cycles_per_m[[0, -1]]
-    )
     range_m = float(np.linalg.norm(collection.lines.phase_centres_m.mean(axis=0) - centre_m))
     time, axes = time_and_axes(collection, raster)
     track = collection.track(place, range_m)
-    corners = raster.corners_on_ground(track, float(time[0, 0]))
-    rows, columns = raster.shape
     root["CollectionInfo"] = {
         "CollectorName": "unknown",
         "CoreName": "clsas",
@@ -176,15 +170,8 @@ def _document(sicd: Any, raster: Raster, collection: Collection, tags: dict[str,
         "Parameter": [("CLSAS_TIMES", "placeholders: equal intervals from 1970-01-01")],
     }
     root["ImageCreation"] = {"Application": f"clsas {__version__}"}
-    root["ImageData"] = {
-        "PixelType": "RE32F_IM32F",
-        "NumRows": rows,
-        "NumCols": columns,
-        "FirstRow": 0,
-        "FirstCol": 0,
-        "FullImage": {"NumRows": rows, "NumCols": columns},
-        "SCPPixel": raster.centre,
-    }
+    root["ImageData"] = _image_data(raster)
+    corners = raster.corners_on_ground(track, float(time[0, 0]))
     root["GeoData"] = {
         "EarthModel": "WGS_84",
         "SCP": {"ECF": ecf_m(place, centre_m), "LLH": place.to_geographic(centre_m)},
@@ -205,6 +192,7 @@ def _document(sicd: Any, raster: Raster, collection: Collection, tags: dict[str,
         "CollectDuration": collection.duration_s,
     }
     root["Position"] = {"ARPPoly": track}
+    lowest_hz, highest_hz = collection.band_hz
     root["RadarCollection"] = {
         "TxFrequency": {"Min": lowest_hz, "Max": highest_hz},
         "TxPolarization": "UNKNOWN",
@@ -213,7 +201,29 @@ def _document(sicd: Any, raster: Raster, collection: Collection, tags: dict[str,
             "ChanParameters": [{"@index": 1, "TxRcvPolarization": "UNKNOWN"}],
         },
     }
-    root["ImageFormation"] = {
+    root["ImageFormation"] = _image_formation(collection, tags)
+    root["SCPCOA"] = sicd.compute_scp_coa(tree)
+    return tree
+
+
+def _image_data(raster: Raster) -> dict[str, Any]:
+    """Return the element of the pixels."""
+    rows, columns = raster.shape
+    return {
+        "PixelType": "RE32F_IM32F",
+        "NumRows": rows,
+        "NumCols": columns,
+        "FirstRow": 0,
+        "FirstCol": 0,
+        "FullImage": {"NumRows": rows, "NumCols": columns},
+        "SCPPixel": raster.centre,
+    }
+
+
+def _image_formation(collection: Collection, tags: dict[str, Any]) -> dict[str, Any]:
+    """Return the element of the processing, with the tags as its parameters."""
+    lowest_hz, highest_hz = collection.band_hz
+    return {
         "RcvChanProc": {"NumChanProc": 1, "ChanIndex": [1]},
         "TxRcvPolarizationProc": "UNKNOWN",
         "TStartProc": 0.0,
@@ -232,8 +242,6 @@ def _document(sicd: Any, raster: Raster, collection: Collection, tags: dict[str,
             }
         ],
     }
-    root["SCPCOA"] = sicd.compute_scp_coa(tree)
-    return tree
 
 
 def _axis(axis: Axis, unit: np.ndarray) -> dict[str, Any]:

@@ -108,6 +108,12 @@ class Collection:
         return cls(lines, beam, along, cycles, np.sqrt(power[order]))
 
     @property
+    def band_hz(self) -> tuple[float, float]:
+        """Lowest and highest frequency of the band that the lines occupy."""
+        lowest_hz, highest_hz = self.cycles_per_m[[0, -1]] * self.lines.sound_speed_m_s / 2
+        return float(lowest_hz), float(highest_hz)
+
+    @property
     def time_s(self) -> NDArray[np.float64]:
         """Time of every channel, in which pings have equal intervals, float64 [channels]."""
         return self.lines.ping_numbers * np.float64(_INTERVAL_S)
