@@ -13,9 +13,9 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import reprs, validate
+from clsas.core import validate
 from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
@@ -42,6 +42,8 @@ LEAST_COHERENCE = 0.5
 """Default of the smallest coherence with a valid height."""
 
 _LOOKS = 50.0  # in the default window: a deviation of 0.1 rad at a coherence of 0.7
+_TRIAL_PIXELS = 9  # side of the window that measures the density of samples; arbitrary
+_SWEPT_PIXELS = 5  # along the side of a window in the sweep, about as many as independent samples
 _CYCLE_SD = 3.3  # half a cycle, in deviations of the height that the magnitude shows: 0.1 % wrong
 _FALSE_ALARM = 1e-3  # share of incoherent windows that exceed the threshold of the sweep
 
@@ -200,20 +202,31 @@ def measure(
     relative_band = band_cycles_per_m / abs(cycles_per_m)
     ambiguity_m = check_geometry(baseline, grid, search_m, relative_band, least_coherence)
 
-    heights_m = _sweep_heights(search_m, ambiguity_m)
-    curves = Curves.over(baseline, grid, heights_m)
-    validate.memory("grid and search_m", 8 * len(heights_m) * curves.grid.size)
-    window, window_m, looks = _window(pair, grid, window_m)
+    images = pair.images(grid)
+    window_m = _default_window_m(images, grid) if window_m is None else window_m
+    window = Window.of(grid, window_m)
+    looks = effective_looks(images, window)
     check_looks(window_m, looks)
-    coarse = _coarse_window(looks, window, relative_band, least_coherence)
-    if len(heights_m) > STEPS_PER_CYCLE + 1:
-        _check_size(grid, coarse, ambiguity_m)
 
+    heights_m = _sweep_heights(search_m, ambiguity_m)
     total = len(heights_m) + PASSES
     report = progress or (lambda done, total: None)
-    found = sweep(pair, curves, window, coarse, lambda done: report(done, total))
-    threshold = max(least_coherence, float(noise_coherence(looks, _FALSE_ALARM / len(heights_m))))
-    relief = found.relief(grid.shape, found.coherence >= threshold, ambiguity_m)
+    every = max(min(window.sides) // _SWEPT_PIXELS, 1)
+    few = slice(None, None, every)
+    coarser = grid.window(few, few)
+    small = Window.of(coarser, window_m)
+    looks_of_few = effective_looks(tuple(each[few, few] for each in images), small)
+    large = _large_window(looks_of_few, small, relative_band, least_coherence)
+    if len(heights_m) > STEPS_PER_CYCLE + 3:
+        _check_size(coarser, large, ambiguity_m)
+    curves = Curves.over(baseline, coarser, heights_m)
+    validate.memory("grid and search_m", 32 * len(heights_m) * curves.grid.size)
+    found = sweep(pair, curves, small, large, lambda done: report(done, total))
+    alarm = noise_coherence(looks_of_few, _FALSE_ALARM / len(heights_m))
+    rows, columns = (np.arange(n) / every for n in grid.shape)
+    reliable = found.coherence >= max(least_coherence, float(alarm))
+    relief = found.relief(rows, columns, reliable, ambiguity_m)
+
     refined = refine(
         pair,
         grid,
@@ -239,31 +252,25 @@ def measure(
     )
 
 
-def _sweep_heights(search_m: tuple[float, float], ambiguity_m: float) -> np.ndarray:
+def _sweep_heights(search_m: tuple[float, float], ambiguity_m: float) -> NDArray[np.float64]:
     """Return heights a sixth of a cycle apart, one of them beyond either end of the search."""
     step_m = ambiguity_m / STEPS_PER_CYCLE
     count = math.ceil((search_m[1] - search_m[0]) / step_m) + 2
-    return sum(search_m) / 2 + step_m * (np.arange(count + 1) - count / 2)
+    middle_m = (search_m[0] + search_m[1]) / 2
+    return middle_m + step_m * (np.arange(count + 1.0) - count / 2)
 
 
-def _window(pair: Pair, grid: Grid, window_m: float | None) -> tuple[Window, float, float]:
-    """Return the window, its side in metres, and the number of looks in it."""
-    images = pair.images(grid)
-    if window_m is not None:
-        window = Window.of(grid, window_m)
-        return window, window_m, effective_looks(images, window)
-    _, *steps_m = grid.vectors_m
-    pixel_m = max(float(np.linalg.norm(step)) for step in steps_m)
-    side_m = min(n * float(np.linalg.norm(s)) for n, s in zip(grid.shape, steps_m, strict=True))
-    trial = Window.of(grid, min(9 * pixel_m, side_m))
-    density = effective_looks(images, trial) / trial.pixels
-    pixel_m2 = math.prod(float(np.linalg.norm(step)) for step in steps_m)
-    window_m = min(math.sqrt(_LOOKS * pixel_m2 / density), side_m)
-    window = Window.of(grid, window_m)
-    return window, window_m, density * window.pixels
+def _default_window_m(images: tuple[NDArray, NDArray], grid: Grid) -> float:
+    """Return the side of windows with about `_LOOKS` independent samples, metres."""
+    steps_m = [float(np.linalg.norm(step)) for step in grid.vectors_m[1:]]
+    most_m = min(n * step_m for n, step_m in zip(grid.shape, steps_m, strict=True))
+    trial = Window.of(grid, min(_TRIAL_PIXELS * max(steps_m), most_m))
+    pixel_m2 = math.prod(steps_m)
+    looks_per_m2 = effective_looks(images, trial) / (trial.pixels * pixel_m2)
+    return min(math.sqrt(_LOOKS / looks_per_m2), most_m)
 
 
-def _coarse_window(
+def _large_window(
     looks: float, window: Window, relative_band: float, least_coherence: float
 ) -> Window:
     """Return the window that decides between cycles of the phase.
@@ -277,13 +284,14 @@ def _coarse_window(
     return window.scaled(math.sqrt(max(needed / looks, 1)))
 
 
-def _check_size(grid: Grid, coarse: Window, ambiguity_m: float) -> None:
+def _check_size(grid: Grid, large: Window, ambiguity_m: float) -> None:
     """Warn if a grid is too small to tell the cycles of the phase apart."""
-    if coarse.rows > grid.shape[0] or coarse.columns > grid.shape[1]:
+    if large.rows > grid.shape[0] or large.columns > grid.shape[1]:
+        side_m = large.rows * float(np.linalg.norm(grid.vectors_m[1]))
         validate.warn(
-            f"the grid has {reprs.by(grid.shape)} pixels, and windows of {coarse.rows} x "
-            f"{coarse.columns} are needed to tell heights {ambiguity_m:.3g} m apart (the height of "
-            "ambiguity) where the coherence is low: make the grid larger, or search_m smaller"
+            f"grid is smaller than the windows of {side_m:.2g} m that tell heights apart which "
+            f"differ by the height of ambiguity, {ambiguity_m:.3g} m, where the coherence is low: "
+            "make the grid larger or search_m smaller"
         )
 
 
