@@ -45,7 +45,9 @@ _LOOKS = 50.0  # in the default window: a deviation of 0.1 rad at a coherence of
 _TRIAL_PIXELS = 9  # side of the window that measures the density of samples; arbitrary
 _SWEPT_PIXELS = 5  # along the side of a window in the sweep, about as many as independent samples
 _CYCLE_SD = 3.3  # half a cycle, in deviations of the height that the magnitude shows: 0.1 % wrong
-_FALSE_ALARM = 1e-3  # share of incoherent windows that exceed the threshold of the sweep
+# Share of the incoherent curves that the sweep takes for coherent. Each adds a surface at a random
+# height, which looks like layover. Passes on the relief use the threshold of the coherence itself.
+_FALSE_ALARM = 0.05
 
 
 def heights(
@@ -222,15 +224,14 @@ def measure(
     curves = Curves.over(baseline, coarser, heights_m)
     validate.memory("grid and search_m", 32 * len(heights_m) * curves.grid.size)
     found = sweep(pair, curves, small, large, lambda done: report(done, total))
-    alarm = noise_coherence(looks_of_few, _FALSE_ALARM / len(heights_m))
+    reliable = found.coherence >= noise_coherence(looks_of_few, _FALSE_ALARM / len(heights_m))
     rows, columns = (np.arange(n) / every for n in grid.shape)
-    reliable = found.coherence >= max(least_coherence, float(alarm))
     relief = found.relief(rows, columns, reliable, ambiguity_m)
 
     refined = refine(
         pair,
         grid,
-        np.where(relief.surfaces == 1, relief.offset_m, np.nan),
+        relief,
         sight_lattice(baseline, grid, search_m),
         window,
         looks,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from clsas.core.grid import Grid
 from clsas.core.image import Image
@@ -20,6 +20,7 @@ from clsas.interferometry.coherence import (
 )
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.planes import edge_growth, fit_planes
+from clsas.interferometry.sweep import Relief
 
 PASSES = 6
 """Most passes. Two or three are usual."""
@@ -72,7 +73,7 @@ class Refined:
 def refine(
     pair: Pair,
     grid: Grid,
-    offset_m: NDArray[np.float64],
+    relief: Relief,
     sights: Lattice,
     window: Window,
     looks: float,
@@ -87,8 +88,8 @@ def refine(
     pair : Pair
     grid : Grid
         The plane.
-    offset_m : float64 [rows, columns]
-        Heights above the plane, NaN where unknown.
+    relief : Relief
+        Heights that the sweep found.
     sights : Lattice
         K and the tangent of the curves, from `sight_lattice`.
     window : Window
@@ -102,12 +103,14 @@ def refine(
     progress : callable
         Called with the number of passes done.
     """
-    known = np.isfinite(offset_m)
+    found_once = relief.surfaces == 1
+    # The sweep misses single curves. Where a window reaches known heights, it decides by itself.
+    known = binary_dilation(found_once, np.ones(window.sides)) & (relief.surfaces < 2)
     # A slope that faces the sonar is imaged with more pixels per independent sample.
     _, level = sensitivity(grid, np.zeros(grid.shape), np.zeros((2, *grid.shape)), sights)
     level_growth = edge_growth(window, grid.shape)
     looks_on_plane = looks * window.fullness(grid.shape) / level
-    relief_m = first_m = filled(offset_m, known)
+    relief_m = first_m = filled(relief.offset_m, found_once)
     slope_m = np.array(np.gradient(relief_m))
     for done in range(1, PASSES + 1):
         on_relief = grid.with_height(relief_m)
