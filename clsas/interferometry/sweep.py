@@ -32,13 +32,13 @@ from clsas.interferometry.coherence import Moments, Window
 from clsas.interferometry.pair import Pair
 
 STEPS_PER_CYCLE = 6
-"""Heights per height of ambiguity. With 4, phases between two heights are so large that the
-magnitude of the coherence misleads; 8 takes longer and finds the same heights."""
+"""Heights per height of ambiguity. 4 and 8 give the same rms errors on the dunes and on the tall
+relief of tests/interferometry, to 1 % where the relief is several heights of ambiguity high."""
 
 _CANDIDATE_RAD = (
     1.3 * math.pi / STEPS_PER_CYCLE
 )  # phase at the height nearest to a zero, and margin
-_PLACES = 33  # along either side, for which curves are found; 17 give the same heights to 0.1 mm
+_PLACES = 33  # along either side, for which curves are found; 17 and 65 give the same heights
 _LEAST_SPACE = 3  # pixels beyond the outermost curve
 _PIXELS_AT_ONCE = 1 << 22  # of all heights that are imaged together; their positions take 96 MiB
 
