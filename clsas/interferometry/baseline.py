@@ -8,10 +8,10 @@ that shows it, the phase in that pixel is
 
     arg(a b*) = -K e,   K = 2 k D.t.
 
-On a seabed whose slope along t is m.t, a scatterer e/(1 - m.t) higher along the curve belongs to a
-surface that is e higher at the pixel, so a height error e causes the phase -K e/(1 - m.t). The
-factor 1 - m.t is the foreshortening: less than 1 on slopes that face the sonar, 0 where the slope
-is perpendicular to the line of sight, and negative in layover.
+On a seabed of slope m, a surface that passes e above the pixel meets the curve e/(1 - m.t) above
+it, so an error e of the assumed height causes the phase -K e/(1 - m.t). The factor 1 - m.t is the
+foreshortening: less than 1 on slopes that face the sonar, 0 where the slope is perpendicular to the
+line of sight, and negative in layover.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from clsas.sonar.directions import track_directions
 
 _POINTS_AT_ONCE = 64
 _LEAST_RISE = 1e-3  # of the tangent; directly below a track, no scatterer changes its height
-_LATTICE = 9  # points along either side of a grid; 5 and 17 give the same heights to 0.1 mm
-_LEVELS = 5  # heights of a lattice
+_LATTICE = 9  # points along either side of a grid; 5 and 17 change heights by at most 1 mm
+_LEVELS = 5  # heights of a lattice; 3 and 9 give the same heights
 
 
 class Sight(NamedTuple):

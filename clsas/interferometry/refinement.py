@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from clsas.core.grid import Grid
 from clsas.core.image import Image
@@ -18,21 +18,26 @@ from clsas.interferometry.coherence import (
     noise_coherence,
     phase_sd_rad,
 )
-from clsas.interferometry.pair import Pair
 from clsas.interferometry.planes import edge_growth, fit_planes
+from clsas.interferometry.sweep import Relief
+from clsas.interferometry.task import Task
 
 PASSES = 6
 """Most passes. Two or three are usual."""
 
-_CONVERGED = 0.3  # rms correction, in standard deviations; it then adds 4 % to the deviation
+# Rms correction, in standard deviations; it then adds 4 % to the deviation. Half and twice the
+# value stop after the same pass on the reliefs of tests/interferometry.
+_CONVERGED = 0.3
 # Last correction of a pixel, in deviations, from which on it is not valid: its window reaches to
 # where the relief is unknown, and contains echoes of another height.
 _UNSETTLED = 2.0
 _MEDIAN = 0.6745  # median absolute deviation of a Gaussian
+_CREDIBLE = 0.25  # largest credible correction of the sweep, in heights of ambiguity; arbitrary
 _FALSE_ALARM = 1e-3  # share of incoherent windows that exceed the threshold of coherence
 # Rms distance of the relief from the plane of a window, in deviations. Noise of the heights makes
 # 0.1 % of the windows of level seabeds rougher; those across steps are rougher by far. A parabola
-# displaces the height in the middle by about as much as it makes the window rough.
+# displaces the height in the middle by about as much as it makes the window rough. Half the value
+# masks a fifth of simulated dunes, twice the value adds less than 1 % to the valid pixels.
 _MOST_ROUGHNESS = 3.0
 # Variance in the middle of a window relative to that of an evenly lit one. It is 4 at the edge of a
 # shadow, beyond which a plane would be extrapolated.
@@ -70,56 +75,50 @@ class Refined:
 
 
 def refine(
-    pair: Pair,
-    grid: Grid,
-    offset_m: NDArray[np.float64],
+    task: Task,
+    relief: Relief,
     sights: Lattice,
     window: Window,
     looks: float,
-    least_coherence: float,
-    ambiguity_m: float,
     progress: Callable[[int], None],
 ) -> Refined:
     """Return heights, starting from those of a sweep.
 
     Parameters
     ----------
-    pair : Pair
-    grid : Grid
-        The plane.
-    offset_m : float64 [rows, columns]
-        Heights above the plane, NaN where unknown.
+    task : Task
+    relief : Relief
+        Heights that the sweep found.
     sights : Lattice
         K and the tangent of the curves, from `sight_lattice`.
     window : Window
     looks : float
         Effective number of looks of a window on the plane. They must not be measured on a relief:
         its small errors shift the phase of neighbouring pixels, which then seem uncorrelated.
-    least_coherence : float
-        Smallest coherence of a valid height.
-    ambiguity_m : float
-        Height of ambiguity. Corrections beyond a quarter of it are not credible.
     progress : callable
         Called with the number of passes done.
     """
-    known = np.isfinite(offset_m)
+    grid = task.grid
+    found_once = relief.surfaces == 1
+    # The sweep misses single curves. Where a window reaches known heights, it decides by itself.
+    known = binary_dilation(found_once, np.ones(window.sides)) & (relief.surfaces < 2)
     # A slope that faces the sonar is imaged with more pixels per independent sample.
     _, level = sensitivity(grid, np.zeros(grid.shape), np.zeros((2, *grid.shape)), sights)
     level_growth = edge_growth(window, grid.shape)
     looks_on_plane = looks * window.fullness(grid.shape) / level
-    relief_m = first_m = filled(offset_m, known)
+    relief_m = first_m = filled(relief.offset_m, found_once)
     slope_m = np.array(np.gradient(relief_m))
     for done in range(1, PASSES + 1):
         on_relief = grid.with_height(relief_m)
-        images = pair.images(on_relief)
+        images = task.pair.images(on_relief)
         rad_m, facing = sensitivity(grid, relief_m, slope_m, sights)
         planes = fit_planes(images, relief_m, -1 / rad_m, window)
         seen = looks_on_plane * np.maximum(facing, _LEAST_FORESHORTENING)
         coherence = debiased(planes.coherence, seen)
         sd_m = phase_sd_rad(coherence, seen / planes.growth) / np.abs(rad_m)
         valid = known & (facing > _LEAST_FORESHORTENING)
-        valid &= coherence >= np.maximum(least_coherence, noise_coherence(seen, _FALSE_ALARM))
-        valid &= np.abs(planes.height_m - first_m) < ambiguity_m / 4
+        valid &= coherence >= np.maximum(task.least_coherence, noise_coherence(seen, _FALSE_ALARM))
+        valid &= np.abs(planes.height_m - first_m) < _CREDIBLE * task.ambiguity_m
         valid &= planes.growth < _MOST_GROWTH * level_growth
         valid &= planes.roughness_m < _MOST_ROUGHNESS * sd_m
         change = np.abs(planes.height_m - relief_m) / sd_m

@@ -72,7 +72,7 @@ def test_curves_through_pixels_pass_through_them(baseline):
     offset_m = np.linspace(-1, 1, 7)
     curves = Curves.over(baseline, GRID, offset_m)
     for index in (0, 5):
-        rows, columns = curves.through(index, GRID.shape)
+        rows, columns = curves.through(index, *(np.arange(float(n)) for n in GRID.shape))
         places_m = curves.points_m(index)
         near = np.rint(rows).astype(int), np.rint(columns).astype(int)
         between = np.stack([rows, columns], axis=-1) - np.stack(near, axis=-1)
