@@ -165,7 +165,7 @@ for name in clsas.__all__:
         *("FileFormatError", "load", "save", "read_airsas", "read_cphd", "read_full_matrix"),
         *("read_phase_history", "write_cphd", "Mosaic", "Patch", "Store", "mosaic"),
         *("export", "Processed", "process", "assess", "survey_lines", "simulate", "simulate_lines"),
-        "wavenumber",
+        *("read_sound_speed", "wavenumber"),
     }
     assert "'sarkit>=" in said["read_cphd"]
     assert "'zarr>=" in said["mosaic"]

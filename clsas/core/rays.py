@@ -327,15 +327,15 @@ def _turning(
         beyond[0] = np.where(starts & shallow, limit - distance[everything], np.nan)
         with np.errstate(invalid="ignore"):
             crossed = beyond[:-1] * beyond[1:] <= 0
-        for step, ray in zip(*np.nonzero(crossed), strict=True):
-            some = everything[ray : ray + 1]
-            low, high = fraction[step], fraction[step + 1]
-            sign = np.sign(beyond[step + 1, ray]) or 1.0
-            for _ in range(_HALVINGS):
-                middle = (low + high) / 2
-                is_beyond = sign * (turned(middle, some)[0] - distance[some]) > 0
-                low, high = np.where(is_beyond, low, middle), np.where(is_beyond, middle, high)
-            _, time, slowness = turned(high, some)
-            if time[0] < best_time[some[0]]:
-                best_time[some], best_slowness[some] = time, slowness
+        step, ray = np.nonzero(crossed)
+        some, low, high = everything[ray], fraction[step, 0], fraction[step + 1, 0]
+        sign = np.where(beyond[step + 1, ray] < 0, -1.0, 1.0)
+        for _ in range(_HALVINGS if some.size else 0):
+            middle = (low + high) / 2
+            is_beyond = sign * (turned(middle, some)[0] - distance[some]) > 0
+            low, high = np.where(is_beyond, low, middle), np.where(is_beyond, middle, high)
+        _, time, slowness = turned(high, some)
+        order = np.argsort(-time)  # so that the first to arrive is kept
+        earlier = order[time[order] < best_time[some[order]]]
+        best_time[some[earlier]], best_slowness[some[earlier]] = time[earlier], slowness[earlier]
     return best_slowness, best_time

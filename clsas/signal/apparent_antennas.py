@@ -19,7 +19,7 @@ from clsas.signal.readout import Readout
 
 _NODES = 48  # distances from which the change of a range axis follows
 _DEGREE = 20  # of the polynomial through them
-_CHANGED_AT_ONCE = 1 << 20  # samples that are interpolated together; bounds memory
+_CHANGED_AT_ONCE = 1 << 16  # samples that are interpolated together; they fit into a cache
 _RESAMPLED_DB = -80.0  # largest error of the interpolation of samples
 _MARGIN_DB = 13.0  # by which interpolation is better than the image: its share is a twentieth
 

@@ -19,7 +19,8 @@ are. Every error is computed from exact rays, at sample pixels and channels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ from clsas.signal.ray_delays import RaySample, at_speed, sample_points_m, straig
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import REFRACTION, SHARE
 
+_MOST_KEPT_BYTES = 256 << 20  # of the samples of lines whose conversion is kept
 _LEVEL_M = 1e-6  # relief of a grid that counts as level
 
 
@@ -102,6 +104,9 @@ class Homogeneous:
     change: Change | None = None
     error: float = 0.0
     straight: StraightRays | None = None
+    _converted: WeakKeyDictionary[RangeLines, RangeLines] = field(
+        default_factory=WeakKeyDictionary, repr=False
+    )
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -109,12 +114,21 @@ class Homogeneous:
         return (REFRACTION,) if self.sound_speed_m_s and self.change is None else ()
 
     def lines(self, lines: RangeLines) -> RangeLines:
-        """Return lines of the geometry in homogeneous water, unchanged without a profile."""
+        """Return lines of the geometry in homogeneous water, unchanged without a profile.
+
+        Lines of up to 256 MiB are converted once, for planning and for imaging, and kept as long as
+        they exist.
+        """
         if lines.sound_speed is None:
             return lines
         if self.change is None:
             return at_speed(lines, self.sound_speed_m_s)
-        return self.change.lines(lines, self.sound_speed_m_s)
+        known = self._converted.get(lines)
+        if known is None:
+            known = self.change.lines(lines, self.sound_speed_m_s)
+            if lines.samples.nbytes <= _MOST_KEPT_BYTES:
+                self._converted[lines] = known
+        return known
 
 
 def homogeneous(

@@ -173,3 +173,55 @@ def test_a_wavenumber_image_has_the_same_water():
     sloping = Grid.oriented([0, 58, -22], [0, 0.1, 0.02], [0.1, 0, 0], (8, 8))
     with pytest.raises(ValueError, match="grid must be level"):
         clsas.wavenumber(lines, sloping)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n == QUICK else pytest.mark.slow) for n in list(CASES)[:6]]
+)
+def test_points_are_where_they_are(name):
+    """The phase of a pixel at a point is right to a thousandth of a cycle, and so is its range."""
+    case = CASES[name]
+    lines, grid, _ = made(name)
+    point_m = grid.positions_m()[11, 7]
+    times = travel_times(
+        case.depths_m, case.speeds_m_s, case.sonar_m, case.seabed_m, case.range_m + case.swath_m
+    )
+    range_m = NOMINAL * times(np.hypot(*(point_m[:2] - lines.tx_m[:, :2]).T))[:, None]
+    per_m = 2 * case.carrier_hz / NOMINAL
+    echo = oracle.Echo(range_m, 1.0, [oracle.Band(per_m, 0.15 * per_m, 0.015 * per_m)])
+    first_m = lines.first_range_m
+    samples = oracle.samples([echo], first_m, lines.range_step_m, lines.length, per_m)
+    image = clsas.backproject(replace(lines, samples=samples), grid, accuracy_db=-60)
+    brightest = np.unravel_index(np.abs(image.pixels).argmax(), image.shape)
+    assert brightest == (11, 7)
+    peak = image.pixels[brightest]
+    assert np.abs(peak) == pytest.approx(CHANNELS, rel=1e-3)
+    assert abs(np.angle(peak)) < 2 * np.pi * 1e-3
+
+
+def test_the_imager_is_the_adjoint_of_the_simulator():
+    """<A x, y> = <x, A^H y> for amplitudes x of points, lines y, and both along the same rays."""
+    lines, grid, _ = made(QUICK)
+    random = np.random.default_rng(11)
+    points = grid.positions_m().reshape(-1, 3)[::9]
+    x = random.normal(size=(len(points), 2)) @ [1, 1j]
+    oversampling, length = 1.6, 1200
+    ax = clsas.simulate_lines(
+        lines.tx_m, lines.rx_m, clsas.PointTargets(points, x), carrier_hz=100e3,
+        bandwidth_hz=20e3, oversampling=oversampling, sound_speed=lines.sound_speed,
+        first_range_m=48.0, length=length,
+    )  # fmt: skip
+    n = np.arange(length)
+    y = np.zeros((CHANNELS, length), complex)
+    for _ in range(30):  # bursts within the band, which end within the lines
+        at, frequency = (
+            random.uniform(*ends, (CHANNELS, 1)) for ends in ((300, 800), (-0.15, 0.15))
+        )
+        envelope = np.exp(-(((n - at) / 9) ** 2) + 2j * np.pi * frequency * n)
+        y += (random.normal(size=(CHANNELS, 1, 2)) @ [1, 1j]) * envelope
+    image = clsas.backproject(replace(ax, samples=y), clsas.Grid.points(points), accuracy_db=-60)
+    left = np.vdot(ax.samples.astype(complex), y)
+    right = np.vdot(x, oversampling * image.pixels)
+    size = np.linalg.norm(x) * np.linalg.norm(oversampling * image.pixels)
+    assert abs(left) > 0.01 * size
+    assert abs(left - right) < 1e-3 * size
