@@ -20,6 +20,15 @@ def at(transform, column, row):
     return a * column + b * row + c, d * column + e * row + f
 
 
+def in_order(image, values, transform):
+    """What was read, at the pixels of the image: looked up by map coordinates."""
+    on_map = image.georeference.to_map(image.grid.positions_m())
+    column, row = at(~transform, on_map[..., 0], on_map[..., 1])
+    np.testing.assert_allclose(column % 1, 0.5, atol=1e-6)
+    np.testing.assert_allclose(row % 1, 0.5, atol=1e-6)
+    return values[np.floor(row).astype(int), np.floor(column).astype(int)]
+
+
 def local(heading, latitude=60.39):
     return clsas.Georeference.local(latitude, 5.32, -12.0, heading_deg=heading)
 

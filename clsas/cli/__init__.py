@@ -41,7 +41,10 @@ _GROUPS = {
         "mosaic": ("mosaics", "Form an image of any size, patch by patch."),
         "view": ("view", "Show an image or a mosaic in a browser."),
         "show": ("show", "Draw an image, heights, range lines, a plan, a recording or a mosaic."),
-        "export": ("export", "Write an image or a mosaic as a map, a picture or a web page."),
+        "export": (
+            "export",
+            "Write an image, a mosaic or heights as a map, a picture or a web page.",
+        ),
     },
     "Measures": {
         "quality": ("measures", "Measure the contrast, a point or the error of an image."),

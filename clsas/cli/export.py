@@ -1,4 +1,4 @@
-"""Command that writes an image or a mosaic for other programs: export."""
+"""Command that writes images, mosaics and heights for other programs: export."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class _Target(File):
 @click.argument("output", metavar="OUTPUT", type=_Target())
 @click.option(
     "--as", "kind", type=click.Choice(KINDS),
-    help="Pixels of a GeoTIFF: amplitude in dB, complex numbers, or 8-bit levels with colours. "
-    "[default: db]",
+    help="Pixels of a GeoTIFF of an image: amplitude in dB, complex numbers, or 8-bit levels with "
+    "colours. [default: db]",
 )  # fmt: skip
 @options.dynamic_range
 @click.option(
@@ -107,13 +107,14 @@ def export(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Write an image or a mosaic as a map, a picture or a web page.
+    """Write an image, a mosaic or heights as a map, a picture or a web page.
 
-    INPUT is an image in HDF5 or the Zarr store of a finished mosaic, which may be larger than
-    memory. The suffix of OUTPUT decides: .tif is a cloud-optimized GeoTIFF, .nc is netCDF 4, .nitf
-    is SICD (radar images only), and .png, .pdf and .svg are pictures. A PNG of an image with a
-    georeference gets a world file.
-    Without a suffix, OUTPUT is a folder that any browser shows, as clsas view writes it.
+    INPUT is an image or heights in HDF5, or the Zarr store of a finished mosaic, which may be
+    larger than memory. The suffix of OUTPUT decides: .tif is a cloud-optimized GeoTIFF, .nc is
+    netCDF 4, .nitf is SICD (radar images only), and .png, .pdf and .svg are pictures. A PNG of an
+    image with a georeference gets a world file.
+    Without a suffix, OUTPUT is a folder that any browser shows, as clsas view writes it. Heights
+    become a .tif or .nc of height, deviation and coherence, or a picture.
 
     \b
     Example:  clsas export mosaic.zarr mosaic.tif --as 8bit

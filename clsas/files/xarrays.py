@@ -107,7 +107,7 @@ def to_xarray(obj: Grid | RangeLines | Image | Echoes) -> xarray.DataArray | xar
 
 
 def _image_to_xarray(xarray: ModuleType, image: Image) -> xarray.DataArray:
-    dims = _grid_dims(image.grid)
+    dims = grid_dims(image.grid)
     coordinates = _grid_coordinates(image.grid)
     for name, part in (("real", image.pixels.real), ("imag", image.pixels.imag)):
         words = {"real": "Real", "imag": "Imaginary"}[name]
@@ -128,7 +128,8 @@ def _image_to_xarray(xarray: ModuleType, image: Image) -> xarray.DataArray:
     return xarray.Dataset(level, coordinates)["amplitude_db"]
 
 
-def _grid_dims(grid: Grid) -> tuple[str, ...]:
+def grid_dims(grid: Grid) -> tuple[str, ...]:
+    """Return the names of the axes of an image on a grid."""
     if grid.points_m is not None:
         return tuple(f"point_{axis}" for axis in range(len(grid.shape)))
     return ("y", "x") if grid.has_axes else ("row", "column")
@@ -143,7 +144,7 @@ def _grid_coordinates(grid: Grid) -> dict[str, Any]:
     if not place.is_north_up:
         on_map = np.moveaxis(place.to_map(grid.positions_m()), -1, 0)
         for name, axis, values in zip(("easting", "northing"), "xy", on_map, strict=False):
-            known[name] = (_grid_dims(grid), values, dict(_ON_MAP[axis]))
+            known[name] = (grid_dims(grid), values, dict(_ON_MAP[axis]))
     return known | {GRID_MAPPING: ((), 0, grid_mapping(place))}
 
 
@@ -162,7 +163,7 @@ def grid_mapping(place: Georeference) -> dict[str, Any]:
 
 
 def _coordinates(grid: Grid, words: dict[str, dict[str, str]]) -> dict[str, Any]:
-    dims = _grid_dims(grid)
+    dims = grid_dims(grid)
     if not grid.has_axes:
         positions = np.moveaxis(grid.positions_m(), -1, 0)
         return {

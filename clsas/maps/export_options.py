@@ -16,6 +16,9 @@ from clsas.sonar.beam import BeamWindow
 SUFFIXES = (*geotiff.SUFFIXES, *netcdf.SUFFIXES, *sicd.SUFFIXES, *PICTURES)
 """Suffixes of the files that `clsas.export` writes."""
 
+HEIGHT_SUFFIXES = (*geotiff.SUFFIXES, *netcdf.SUFFIXES, *PICTURES)
+"""Those that it writes for heights."""
+
 _COLOURS = {"dynamic_range_db", "reference", "colour_map"}
 _ORIGIN = {"plan", "lines"}
 
@@ -70,9 +73,9 @@ class ExportOptions:
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         return {name: v for name, v in values.items() if v is not None and v is not False}
 
-    def check_used(self, suffix: str) -> None:
+    def check_used(self, suffix: str, *, of_heights: bool) -> None:
         """Raise ValueError if an option has no effect on the format of a suffix; "" is a folder."""
-        used, what = self._used(suffix)
+        used, what = self._used_by_heights(suffix) if of_heights else self._used(suffix)
         unused = [name for name in self.given if name not in used]
         if unused:
             raise ValueError(f"{unused[0]} must be left out, since it has no effect on {what}")
@@ -90,6 +93,19 @@ class ExportOptions:
         kind = self.kind or "db"
         used = _ORIGIN | {"kind", "north_up"}
         used |= {"8bit": _COLOURS, "complex": set()}.get(kind, {"reference"})
+        return self._used_by_resampling(used, f"{suffix} of kind {kind!r}")
+
+    def _used_by_heights(self, suffix: str) -> tuple[set[str], str]:
+        """Return the same of a format of heights, whose numbers are neither levels nor complex."""
+        what = f"{suffix} of heights"
+        if suffix in PICTURES:
+            return {"colour_map"}, what
+        if suffix in netcdf.SUFFIXES:
+            return {"lines"}, what
+        return self._used_by_resampling({"lines", "north_up"}, what)
+
+    def _used_by_resampling(self, used: set[str], what: str) -> tuple[set[str], str]:
+        """Return options of a GeoTIFF and its name, completed by whether it is resampled."""
         if self.north_up:
-            return used | {"pixel_m"}, f"{suffix} of kind {kind!r}"
-        return used, f"{suffix} of kind {kind!r} without north_up"
+            return used | {"pixel_m"}, what
+        return used, f"{what} without north_up"

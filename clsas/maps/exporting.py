@@ -1,4 +1,4 @@
-"""Export of images and mosaics to the files that other programs open."""
+"""Export of images, mosaics and heights to the files that other programs open."""
 
 from __future__ import annotations
 
@@ -13,21 +13,24 @@ from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.core.sidecars import remove_sidecars
 from clsas.core.version import __version__
+from clsas.interferometry.result import Heights
 from clsas.maps import geotiff, netcdf, sicd, viewer, world_files
-from clsas.maps.export_options import SUFFIXES, ExportOptions
+from clsas.maps.export_options import HEIGHT_SUFFIXES, SUFFIXES, ExportOptions
 from clsas.maps.geotiff import Progress
 from clsas.maps.orientation import Orientation
 from clsas.maps.sources import Source
 from clsas.mosaics.store import Store
 from clsas.plans.plan import Plan
+from clsas.plot import heights as heights_picture
 from clsas.plot.canvas import SUFFIXES as PICTURES
+from clsas.plot.canvas import save as save_picture
 from clsas.plot.colours import COLOUR_MAP
 from clsas.plot.levels import DYNAMIC_RANGE_DB
 from clsas.sonar.beam import BeamWindow
 
 
 def export(
-    source: Image | Store | str | os.PathLike,
+    source: Image | Store | Heights | str | os.PathLike,
     path: str | os.PathLike,
     *,
     kind: str | None = None,
@@ -44,7 +47,7 @@ def export(
     scale_bar: bool = False,
     progress: Progress | None = None,
 ) -> None:
-    """Write an image or a mosaic as a file that other programs open.
+    """Write an image, a mosaic or heights as a file that other programs open.
 
     The suffix of `path` determines the format:
 
@@ -61,17 +64,20 @@ def export(
     - no suffix, a folder whose ``index.html`` shows the image in any browser, as `clsas view` does.
       A mosaic may be larger than memory.
 
+    Heights become GeoTIFF or netCDF with three numbers per pixel, or a picture as
+    `clsas.plot.heights` draws it, without a world file.
+
     Parameters
     ----------
-    source : Image, Store or path-like
-        Image, finished mosaic, or path of a file or store that contains one.
+    source : Image, Store, Heights or path-like
+        Image, finished mosaic, heights, or path of a file or store that contains one of them.
     path : path-like
         File to write, or folder. An existing one is replaced in one step, but a folder only if it
         contains a viewer. Its name must not begin or end with a dot. Files beside it that describe
         the one it replaces, such as statistics in ``.aux.xml``, are removed.
     kind : {"db", "complex", "8bit"}, optional
-        Pixels of a GeoTIFF: the amplitude in dB (float32, NaN where nothing was received; the
-        default), complex numbers (complex64), or 8-bit levels with a colour table.
+        Pixels of a GeoTIFF of an image: the amplitude in dB (float32, NaN where nothing was
+        received; the default), complex numbers (complex64), or 8-bit levels with a colour table.
     dynamic_range_db : float, optional
         Level of the first colour below that of the last one, for 8-bit levels, pictures and
         folders; by default 60 dB.
@@ -80,7 +86,7 @@ def export(
         amplitude for 8-bit levels and pictures.
     colour_map : str, optional
         Colours of 8-bit levels, pictures and folders, as for `clsas.plot.image`; by default
-        "inferno".
+        "inferno", and "viridis" for pictures of heights.
     north_up : bool
         True to resample a GeoTIFF so that its columns run east and its rows south. By default
         pixels are kept, and the transform of the file states how they are rotated.
@@ -107,10 +113,10 @@ def export(
     TypeError, ValueError
         If an argument has the wrong type, is outside its limits or has no effect on the format; if
         a GeoTIFF has no georeference, its coordinate reference system is unknown, its grid is
-        vertical or consists of points, or complex pixels are to be resampled; or if a mosaic is
-        damaged, not finished, or changes meanwhile.
+        vertical or consists of points, or complex pixels are to be resampled; if heights are to
+        become SICD or a folder; or if a mosaic is damaged, not finished, or changes meanwhile.
     FileFormatError
-        If the file at `source` does not contain an image.
+        If the file at `source` does not contain an image or heights.
     ImportError
         If a package is missing (extra `maps`; `plot` for pictures and colours).
     OSError
@@ -133,16 +139,24 @@ def export(
     -----
     Rows and columns of a GeoTIFF are reversed or exchanged so that the image is never mirrored,
     and its rows run from north to south as far as that is possible without resampling. Pixels in dB
-    of a height map have the heights as their second band.
+    and complex pixels of a height map have the heights as their second band.
 
-    With `north_up`, power is interpolated bilinearly. Complex pixels are not resampled, since
-    their phase cannot be interpolated where pixels are larger than a quarter of a wavelength: form
-    the image on the grid of `Georeference.north_up` instead.
+    `Heights` have three bands in float32: height (m), standard deviation (m) and coherence. They
+    are NaN outside the mask, and means in overviews leave out such pixels.
+
+    Heights in both cases are those of the seabed on the vertical axis of the map: the height above
+    the plane of the grid, plus z of the plane, plus the height of the origin of a local
+    georeference. They count from its vertical datum.
+
+    With `north_up`, power is interpolated bilinearly, and so are heights. Complex pixels are not
+    resampled, since their phase cannot be interpolated where pixels are larger than a quarter of a
+    wavelength: form the image on the grid of `Georeference.north_up` instead.
 
     Examples
     --------
     >>> import clsas
     >>> clsas.export("image.h5", "image.tif")  # doctest: +SKIP
+    >>> clsas.export("heights.h5", "heights.tif", north_up=True)  # doctest: +SKIP
     >>> clsas.export(clsas.Store.opened("mosaic.zarr"), "mosaic.tif", kind="8bit")  # doctest: +SKIP
     """
     path = validate.path("path", path)
@@ -162,12 +176,20 @@ def export(
         north_arrow=north_arrow,
         scale_bar=scale_bar,
     )
-    options.check_used(suffix)
     validate.instance("georeference", georeference, Georeference, type(None))
     validate.progress(progress)
     opened = _opened(source)
+    of_heights = isinstance(opened, Heights)
+    if of_heights and suffix not in HEIGHT_SUFFIXES:
+        raise ValueError(
+            f"path must end in {' or '.join(HEIGHT_SUFFIXES)} for heights, got "
+            f"{validate.shown(str(path))}"
+        )
+    options.check_used(suffix, of_heights=of_heights)
     if suffix and suffix not in PICTURES:
         _write_data(path, _finished(opened, georeference), options, progress)
+    elif isinstance(opened, Heights):
+        save_picture(heights_picture(_placed_heights(opened, georeference), **options.given), path)
     elif suffix:
         world_files.write_picture(path, _placed(opened, georeference), options.given)
     else:
@@ -192,9 +214,9 @@ def check_name(name: str, path: Path) -> None:
         raise ValueError(f"{name} must not begin or end with a dot, got {validate.shown(last)}")
 
 
-def _opened(source: Image | Store | str | os.PathLike) -> Image | Store:
-    """Return an image or a store, read from a path if one is given."""
-    if isinstance(source, Image | Store):
+def _opened(source: Image | Store | Heights | str | os.PathLike) -> Image | Store | Heights:
+    """Return an image, a store or heights, read from a path if one is given."""
+    if isinstance(source, Image | Store | Heights):
         return source
     path = validate.path("source", source)
     if path.is_dir():
@@ -202,14 +224,16 @@ def _opened(source: Image | Store | str | os.PathLike) -> Image | Store:
     from clsas.files.formats import load
 
     found = load(path)
-    if not isinstance(found, Image):
-        raise ValueError(f"source must contain an image, but {path} has {type(found).__name__}")
+    if not isinstance(found, Image | Heights):
+        raise ValueError(
+            f"source must contain an image or heights, but {path} has {type(found).__name__}"
+        )
     return found
 
 
-def _name_of(source: Image | Store | str | os.PathLike) -> str:
+def _name_of(source: Image | Store | Heights | str | os.PathLike) -> str:
     """Return the name of an image for the page of a folder: that of its file, if it has one."""
-    if isinstance(source, Image | Store):
+    if isinstance(source, Image | Store | Heights):
         return "image"
     return validate.printable(validate.path("source", source).resolve().name)
 
@@ -287,6 +311,7 @@ def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
         "ACCURACY_DB": inputs.get("accuracy_db"),
         "PREDICTED_ERROR_DB": max((e for e in errors if e is not None), default=None),
         "PATCHES": len(source.records) or None,
+        "WINDOW_M": None if source.heights is None else source.heights.window_m,
     }
     if lines is not None:
         known |= {"CARRIER_HZ": lines.carrier_hz, "SOUND_SPEED_M_S": lines.sound_speed_m_s}
@@ -308,8 +333,8 @@ def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
     return {name: value for name, value in known.items() if value is not None}
 
 
-def _finished(source: Image | Store, georeference: Georeference | None) -> Source:
-    """Return the source of an image or a store; raise ValueError if a store is not finished."""
+def _finished(source: Image | Store | Heights, georeference: Georeference | None) -> Source:
+    """Return the source of what is exported; raise ValueError if a store is not finished."""
     found = Source.of(source, georeference)
     found.check_finished()
     return found
@@ -322,3 +347,8 @@ def _placed(source: Image | Store, georeference: Georeference | None) -> Image:
     if shown.georeference == found.grid.georeference:
         return shown
     return Image(shown.pixels, replace(shown.grid, georeference=found.grid.georeference))
+
+
+def _placed_heights(heights: Heights, georeference: Georeference | None) -> Heights:
+    """Return the heights that a picture shows, with the georeference of the export."""
+    return replace(heights, image=_placed(heights.image, georeference))

@@ -1,9 +1,10 @@
-"""Cloud-optimized GeoTIFF of images and mosaics, written window by window in bounded memory.
+"""Cloud-optimized GeoTIFF of images, mosaics and heights, written window by window.
 
 GDAL's driver for cloud-optimized files copies a file and its overviews in the required order. The
 file and each overview are first written here, since GDAL would average decibels or complex numbers
 instead of power. A pixel of an overview is the mean power of the pixels that received something;
-those that did not are left out, as GDAL leaves out pixels without data.
+those that did not are left out, as GDAL leaves out pixels without data. Heights and other numbers
+are averaged themselves. Memory is bounded by the window.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ from numpy.typing import NDArray
 from clsas.core import reprs
 from clsas.core.atomic import assembling
 from clsas.core.extras import needed
+from clsas.maps.bands import Band, bands_of
 from clsas.maps.encoding import Encoding, colour_table
 from clsas.maps.orientation import Orientation
 from clsas.maps.resampling import Resampling, north_up, steps_m
@@ -43,8 +46,8 @@ _COMPRESSION: dict[str, dict[str, str]] = {
 }
 
 _FULL_BYTES = 1 << 24  # free space of a disk on which a write failed because it is full
-# Free space per pixel that an export needs at least, in bytes: the file, its overviews and, for
-# complex pixels, which are not compressed, their copy.
+# Free space per pixel and band that an export needs at least, in bytes: the file, its overviews
+# and, for complex pixels, which are not compressed, their copy.
 _SPACE_BYTES = {"complex": 21, "db": 9, "8bit": 6}
 
 Progress = Callable[[int, int], object]
@@ -57,7 +60,7 @@ class Options:
     Attributes
     ----------
     kind : str
-        One of `clsas.maps.encoding.KINDS`.
+        One of `clsas.maps.encoding.KINDS`. Bands without amplitudes are float32, as those of "db".
     north_up : bool
         True to resample the image on the axes of the map.
     pixel_m : float or None
@@ -94,9 +97,12 @@ def write(
         import rasterio
     colours = colour_table(options.colour_map) if options.kind == "8bit" else None
     with assembling(path) as folder, rasterio.Env(GDAL_CACHEMAX=_CACHE_MB):
-        _check_space(folder, _SPACE_BYTES[options.kind] * source.grid.size)
+        bands = bands_of(source, options.kind)
+        _check_space(folder, len(bands) * _SPACE_BYTES[options.kind] * source.grid.size)
         try:
-            _Export(folder, source, options, progress).write(folder / path.name, tags, colours)
+            _Export(folder, source, bands, options, progress).write(
+                folder / path.name, tags, colours
+            )
         except Exception as error:
             if not type(error).__module__.startswith("rasterio"):
                 raise
@@ -124,19 +130,16 @@ class _Level:
 
     Attributes
     ----------
-    amplitude : Path
-        File with its amplitudes.
+    numbers : Path
+        File with its amplitudes and the numbers of other bands.
     path : Path
         File with its encoded pixels, which may be the same.
     shape : (rows, columns)
-    height_m : ndarray or None
-        Heights of its pixels.
     """
 
-    amplitude: Path
+    numbers: Path
     path: Path
     shape: tuple[int, int]
-    height_m: NDArray | None = None
 
     def below(self, folder: Path) -> _Level | None:
         """Return the overview with half as many rows and columns, or None if none is needed."""
@@ -145,8 +148,7 @@ class _Level:
         # GDAL finds the overviews of a file in file.ovr, and further ones in file.ovr.ovr.
         path = self.path.with_name(f"{self.path.name}.ovr")
         shape = (self.shape[0] + 1) // 2, (self.shape[1] + 1) // 2
-        heights = None if self.height_m is None else _halved(self.height_m)
-        return _Level(folder / f"amplitude-{shape[0]}-{shape[1]}.tif", path, shape, heights)
+        return _Level(folder / f"numbers-{shape[0]}-{shape[1]}.tif", path, shape)
 
 
 class _Steps:
@@ -165,20 +167,22 @@ class _Export:
     """One export: the passes over the image, with files in a temporary folder."""
 
     def __init__(
-        self, folder: Path, source: Source, options: Options, progress: Progress | None
+        self,
+        folder: Path,
+        source: Source,
+        bands: tuple[Band, ...],
+        options: Options,
+        progress: Progress | None,
     ) -> None:
         place = source.grid.georeference
         assert place is not None  # the caller has checked it
         self._folder, self._source, self._options = folder, source, options
+        self._bands = bands
         self._crs = place.wkt()
         shape = source.grid.shape
         self._turned = Orientation.of((shape[0], shape[1]), place.affine(source.grid))
         self._shape, self._affine = self._turned.shape, self._turned.affine
         self._largest = 0.0
-        height_m = source.grid.height_m
-        self._height_m: NDArray | None = None
-        if height_m is not None and options.kind != "8bit":
-            self._height_m = self._turned.turned(height_m)
         self._steps = _Steps(progress, 4 * source.grid.size)
 
     def write(self, path: Path, tags: dict[str, str], colours: dict | None) -> None:
@@ -198,19 +202,20 @@ class _Export:
         _check_whole(path)
 
     def _read(self, path: Path, dtype: Any) -> None:
-        """Write the pixels, or their amplitudes, in the order of the raster."""
+        """Write the numbers of all bands in the order of the raster."""
         with self._created(path, self._shape, dtype) as file:
             for rows, columns in self._source.windows():
-                pixels = self._source.read(rows, columns)
-                amplitude = np.abs(pixels)
-                self._largest = max(self._largest, float(amplitude.max()))
-                given = pixels if dtype is np.complex64 else amplitude
-                self._put(file, self._turned.window(rows, columns), self._turned.turned(given))
-                self._steps.add(pixels.size)
+                window = self._turned.window(rows, columns)
+                for number, band in enumerate(self._bands, 1):
+                    values = band.read(rows, columns)
+                    if band.is_amplitude:
+                        self._largest = max(self._largest, float(np.abs(values).max()))
+                    self._put(file, window, self._turned.turned(values), number)
+                self._steps.add(values.size)
         _check_whole(path)
 
     def _resampled(self, given: Path) -> Path:
-        """Write the amplitudes on the axes of the map; return the file."""
+        """Write the numbers on the axes of the map; return the file."""
         finest_m = min(steps_m(self._affine))
         pixel_m = self._options.pixel_m or finest_m
         if pixel_m < finest_m / _MOST_FINER:
@@ -220,70 +225,61 @@ class _Export:
             )
         shape, affine = north_up(self._shape, self._affine, pixel_m)
         resampling = Resampling(self._shape, self._affine, affine)
-        heights = None if self._height_m is None else np.empty(shape, np.float32)
         self._shape, self._affine = shape, affine
         path = self._folder / "north_up.tif"
         share = self._source.grid.size / (shape[0] * shape[1])
         with _opened(given) as file, self._created(path, shape, np.float32) as new:
             for rows, columns in windows_of(shape, (_TILE, _TILE)):
-                values = resampling.at(rows, columns, lambda *part: _get(file, part))
-                self._put(new, (rows, columns), values)
-                if heights is not None:
-                    heights[rows, columns] = resampling.at(
-                        rows, columns, self._heights_at, of_power=False
-                    )
+                for number, band in enumerate(self._bands, 1):
+                    values = resampling.at(rows, columns, band, partial(_get, file, number))
+                    self._put(new, (rows, columns), values, number)
                 self._steps.add(int(values.size * share))
         _check_whole(path)
         given.unlink()
-        self._height_m = heights
         return path
-
-    def _heights_at(self, rows: slice, columns: slice) -> NDArray:
-        """Return the heights of a window of the raster, metres."""
-        assert self._height_m is not None
-        return self._height_m[rows, columns]
 
     def _levels(
         self, first: Path, encoding: Encoding, tags: dict[str, str], colours: dict | None
     ) -> Path:
         """Write the encoded file and its overviews beside it; return the file."""
         base = self._folder / "base.tif"
-        level: _Level | None = _Level(first, base, self._shape, self._height_m)
-        if encoding.kind == "complex" and self._height_m is None:  # encoded already
+        level: _Level | None = _Level(first, base, self._shape)
+        if encoding.kind == "complex":  # encoded already
             level = _Level(first.rename(base), base, self._shape)
         while level is not None:
             below = level.below(self._folder)
             self._encode(level, below, encoding)
             if level.path == base:
                 self._describe(base, encoding, tags, colours)
-            if level.amplitude != level.path:
-                level.amplitude.unlink()
+            if level.numbers != level.path:
+                level.numbers.unlink()
             level = below
         return base
 
     def _encode(self, level: _Level, below: _Level | None, encoding: Encoding) -> None:
-        """Write a level from its amplitudes, and the amplitudes of the level below it."""
+        """Write a level from its numbers, and the numbers of the level below it."""
         with ExitStack() as opened:
-            file = opened.enter_context(_opened(level.amplitude))
+            file = opened.enter_context(_opened(level.numbers))
             encoded = smaller = None
-            if level.path != level.amplitude:
-                encoded = opened.enter_context(self._created_for(level, encoding))
+            if level.path != level.numbers:
+                encoded = opened.enter_context(
+                    self._created(level.path, level.shape, encoding.dtype, encoding.nodata)
+                )
             if below is not None:
                 smaller = opened.enter_context(
-                    self._created(below.amplitude, below.shape, np.float32)
+                    self._created(below.numbers, below.shape, np.float32)
                 )
-            for rows, columns in windows_of(level.shape):
-                values = _get(file, (rows, columns))
-                if encoded is not None:
-                    pixels = values if values.dtype.kind == "c" else encoding.encode(values)
-                    self._put(encoded, (rows, columns), pixels)
-                    if level.height_m is not None:
-                        self._put(encoded, (rows, columns), level.height_m[rows, columns], band=2)
-                if smaller is not None:
-                    halves = (slice(p.start // 2, (p.stop + 1) // 2) for p in (rows, columns))
-                    self._put(smaller, tuple(halves), _mean_power(np.abs(values)))
+            for window in windows_of(level.shape):
+                halves = tuple(slice(p.start // 2, (p.stop + 1) // 2) for p in window)
+                for number, band in enumerate(self._bands, 1):
+                    values = _get(file, number, *window)
+                    if encoded is not None:
+                        pixels = encoding.encode(values) if band.is_amplitude else values
+                        self._put(encoded, window, pixels, number)
+                    if smaller is not None:
+                        self._put(smaller, halves, _halved(values, band), number)
                 self._steps.add(values.size * 3 // 4)
-        for written in (level.path, None if below is None else below.amplitude):
+        for written in (level.path, None if below is None else below.numbers):
             if written is not None:
                 _check_whole(written)
 
@@ -293,14 +289,9 @@ class _Export:
         """Add tags, colours and the meaning of the bands to a file."""
         with _opened(path, "r+") as file:
             file.update_tags(**tags)
-            words = {
-                "complex": "Complex pixels",
-                "db": f"Amplitude (dB re {encoding.reference:.9g})",
-                "8bit": f"Amplitude (dB re {encoding.reference:.9g})",
-            }
-            heights = ["Height (m)"] * (file.count - 1)
-            file.descriptions = [words[encoding.kind], *heights]
-            file.units = ["" if encoding.kind == "complex" else "dB", *["m"] * (file.count - 1)]
+            file.descriptions = [_description(band, encoding) for band in self._bands]
+            of_amplitude = "" if encoding.kind == "complex" else "dB"
+            file.units = [of_amplitude if b.is_amplitude else b.unit for b in self._bands]
             if colours is not None:
                 file.write_colormap(1, colours)
                 scale, offset = encoding.scale_and_offset
@@ -316,18 +307,8 @@ class _Export:
         )  # fmt: skip
         self._steps.add(4 * self._source.grid.size)
 
-    def _created_for(self, level: _Level, encoding: Encoding) -> Any:
-        """Return a new file for the pixels of a level, open for writing."""
-        bands = 1 if level.height_m is None else 2
-        return self._created(level.path, level.shape, encoding.dtype, bands, encoding.nodata)
-
     def _created(
-        self,
-        path: Path,
-        shape: tuple[int, int],
-        dtype: Any,
-        bands: int = 1,
-        nodata: float | None = None,
+        self, path: Path, shape: tuple[int, int], dtype: Any, nodata: float | None = None
     ) -> Any:
         """Return a new file of plain tiles, open for writing, that covers the whole raster."""
         import rasterio
@@ -337,6 +318,7 @@ class _Export:
         affine = rasterio.Affine(a * across, b * down, c, d * across, e * down, f)
 
         tiles = math.prod(math.ceil(n / _TILE) for n in shape)
+        bands = len(self._bands)
         _check_space(self._folder, bands * tiles * _TILE**2 * np.dtype(dtype).itemsize)
         tiled = {"tiled": True, "blockxsize": _TILE, "blockysize": _TILE, "BIGTIFF": "YES"}
         return rasterio.open(
@@ -345,11 +327,11 @@ class _Export:
             INTERLEAVE="BAND", **tiled,
         )  # fmt: skip
 
-    def _put(self, file: Any, window: Any, values: NDArray, band: int = 1) -> None:
+    def _put(self, file: Any, window: Any, values: NDArray, number: int) -> None:
         from rasterio.windows import Window
 
         file.write(
-            np.ascontiguousarray(values, file.dtypes[0]), band, window=Window.from_slices(*window)
+            np.ascontiguousarray(values, file.dtypes[0]), number, window=Window.from_slices(*window)
         )
 
 
@@ -359,24 +341,26 @@ def _opened(path: Path, mode: str = "r") -> Any:
     return rasterio.open(path, mode)
 
 
-def _get(file: Any, window: tuple[slice, slice]) -> NDArray:
-    """Return a window of the first band of a file."""
+def _get(file: Any, number: int, rows: slice, columns: slice) -> NDArray:
+    """Return a window of a band of a file."""
     from rasterio.windows import Window
 
-    return file.read(1, window=Window.from_slices(*window))
+    return file.read(number, window=Window.from_slices(rows, columns))
 
 
-def _mean_power(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the amplitude of the mean power of 2 x 2 pixels, of those where it is not 0."""
-    received = amplitude != 0
-    power = _summed(amplitude.astype(np.float64) ** 2)
-    count = _summed(received.astype(np.uint8))
-    return np.sqrt(power / np.maximum(count, 1)).astype(np.float32)
+def _description(band: Band, encoding: Encoding) -> str:
+    """Return what a band of an encoded file contains, with the unit."""
+    if not band.is_amplitude:
+        return f"{band.name} ({band.unit})" if band.unit else band.name
+    if encoding.kind == "complex":
+        return "Complex pixels"
+    return f"{band.name} (dB re {encoding.reference:.9g})"
 
 
-def _halved(values: NDArray) -> NDArray:
-    """Return the means of 2 x 2 values; fewer at the last row and column of odd shapes."""
-    return (_summed(values) / _summed(np.ones(values.shape, np.uint8))).astype(np.float32)
+def _halved(values: NDArray, band: Band) -> NDArray[np.float32]:
+    """Return the means of 2 x 2 pixels, of those that have data."""
+    summands, known = band.summands(values)
+    return band.mean(_summed(summands), _summed(known.astype(np.uint8)), 1)
 
 
 def _summed(values: NDArray) -> NDArray:

@@ -1,4 +1,4 @@
-"""netCDF 4 files of images, after the CF conventions."""
+"""netCDF 4 files of images and heights, after the CF conventions."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import numpy as np
 from clsas.core import validate
 from clsas.core.atomic import replacing
 from clsas.core.extras import needed
+from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.version import __version__
-from clsas.files.xarrays import GRID_MAPPING, to_xarray
+from clsas.files.xarrays import GRID_MAPPING, grid_dims, to_xarray
+from clsas.maps.bands import bands_of
 from clsas.maps.encoding import Encoding
 from clsas.maps.sources import Source
 from clsas.plot.levels import DYNAMIC_RANGE_DB
@@ -25,7 +27,7 @@ SUFFIXES = (".nc",)
 
 _REFERENCE = 1.0  # amplitude of 0 dB
 _BYTES = 40  # memory of a pixel: complex number, level, coordinates, and the file in memory
-_ALONG = {"x": "Along-track", "y": "Across-track"}
+_ALL = slice(None), slice(None)
 
 
 def write(path: Path, source: Source, tags: dict[str, Any]) -> None:
@@ -34,7 +36,7 @@ def write(path: Path, source: Source, tags: dict[str, Any]) -> None:
     Raises
     ------
     ValueError
-        If the image does not fit into memory.
+        If the pixels do not fit into memory, or heights are on points.
     ImportError
         If xarray or h5netcdf is not installed, or pyproj for an image with a georeference.
     OSError
@@ -43,9 +45,11 @@ def write(path: Path, source: Source, tags: dict[str, Any]) -> None:
     with needed("netCDF files"):
         import h5netcdf  # noqa: F401  xarray's message would not say how to install it
         import xarray  # noqa: F401
-    validate.memory("the image as netCDF", _BYTES * source.grid.size)
-    pixels = source.read(slice(None), slice(None)) if source.image is None else source.image.pixels
-    data = _dataset(Image(pixels, source.grid), tags)
+    if source.heights is not None and source.grid.points_m is not None:
+        raise ValueError("source must be on a plane to have heights, got points")
+    validate.memory("the pixels as netCDF", _BYTES * source.grid.size)
+    data = _of_image(source) if source.heights is None else _of_heights(source)
+    data = _described(data, source.grid, tags)
     source.check_unchanged()
     # HDF5 does not recover from a full disk, so the file is assembled in memory.
     content = data.to_netcdf(engine="h5netcdf")
@@ -53,12 +57,13 @@ def write(path: Path, source: Source, tags: dict[str, Any]) -> None:
         temporary.write_bytes(content)
 
 
-def _dataset(image: Image, tags: dict[str, Any]) -> xarray.Dataset:
-    """Return an image with coordinates of the CF conventions.
+def _of_image(source: Source) -> xarray.Dataset:
+    """Return an image with its coordinates.
 
     Levels are those of a GeoTIFF and of stores: relative to 1, and NaN where nothing was received.
     """
-    grid = image.grid
+    pixels = source.read(*_ALL) if source.image is None else source.image.pixels
+    image = Image(pixels, source.grid)
     array = to_xarray(image)
     level = Encoding("db", _REFERENCE, DYNAMIC_RANGE_DB).encode(np.abs(image.pixels))
     array = array.copy(data=level)
@@ -69,6 +74,23 @@ def _dataset(image: Image, tags: dict[str, Any]) -> xarray.Dataset:
     }
     array.attrs = {name: v for name, v in array.attrs.items() if name != "Conventions"} | of_level
     data = array.to_dataset().reset_coords(["pixels_real", "pixels_imag"])
+    return data.assign_attrs(title="Synthetic aperture image", reference_amplitude=_REFERENCE)
+
+
+def _of_heights(source: Source) -> xarray.Dataset:
+    """Return heights with the coordinates of their grid: the numbers of the bands of a GeoTIFF."""
+    # The heights say where the pixels are; z is that of the image, which differs a little.
+    data = to_xarray(source.grid).drop_vars("z")
+    dims = grid_dims(source.grid)
+    for band in bands_of(source, "db"):
+        words = {"long_name": band.name, "units": band.unit or "1"}
+        data[band.name.lower().replace(" ", "_")] = (dims, band.read(*_ALL), words)
+    data["height"].attrs |= {"positive": "up", "ancillary_variables": "standard_deviation"}
+    return data.assign_attrs(title="Heights from two receiver banks")
+
+
+def _described(data: xarray.Dataset, grid: Grid, tags: dict[str, Any]) -> xarray.Dataset:
+    """Return variables with the map, the origin and the compression of a file."""
     if grid.georeference is not None:
         for name in data.data_vars:
             data[name].attrs["grid_mapping"] = GRID_MAPPING
@@ -76,9 +98,7 @@ def _dataset(image: Image, tags: dict[str, Any]) -> xarray.Dataset:
             data = _with_places_on_map(data)
     origin: dict[str, Any] = {
         "Conventions": "CF-1.11",
-        "title": "Synthetic aperture image",
         "source": f"clsas {__version__}",
-        "reference_amplitude": _REFERENCE,
         **{name.lower(): value for name, value in tags.items()},
     }
     compressed = {"zlib": True, "complevel": 1, "shuffle": True}
@@ -90,7 +110,7 @@ def _dataset(image: Image, tags: dict[str, Any]) -> xarray.Dataset:
 
 
 def _with_places_on_map(data: xarray.Dataset) -> xarray.Dataset:
-    """Return an image along a track with rows and columns as dimensions.
+    """Return variables along a track with rows and columns as dimensions.
 
     Programs take x and y for easting and northing if there is a grid mapping. The distances along
     and across the track therefore get other names.

@@ -1,4 +1,4 @@
-"""Resampling of amplitudes on grids whose rows and columns are the axes of the map."""
+"""Resampling of bands on grids whose rows and columns are the axes of the map."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from clsas.core.map_grids import Affine, cover
+from clsas.maps.bands import Band
 
 _CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
 _MOST_AVERAGED = 16  # samples per pixel and axis; coarser pixels are refused
@@ -44,10 +45,11 @@ def steps_m(affine: Affine) -> tuple[float, float]:
 
 
 class Resampling:
-    """Amplitudes of a raster at the pixels of another one, by interpolation of power.
+    """Numbers of a raster at the pixels of another one, by interpolation.
 
-    Power is interpolated bilinearly between pixels where something was received. New pixels that
-    are larger than the old ones are means of several interpolated powers.
+    Powers of amplitudes, and other numbers themselves, are interpolated bilinearly between pixels
+    that have data. New pixels that are larger than the old ones are means of several interpolated
+    numbers.
 
     Parameters
     ----------
@@ -77,27 +79,25 @@ class Resampling:
         self,
         rows: slice,
         columns: slice,
+        band: Band,
         read: Callable[[slice, slice], NDArray[np.float32]],
-        *,
-        of_power: bool = True,
     ) -> NDArray[np.float32]:
         """Return a window of the new raster, [rows, columns].
 
         Parameters
         ----------
         rows, columns : slice
+        band : Band
+            The band of the numbers, which says how they are averaged.
         read : callable
             Called as read(rows, columns); returns a window of the given raster.
-        of_power : bool
-            True to interpolate the squares of amplitudes that are not 0; False to interpolate the
-            values themselves, such as heights.
         """
         count = self._averaged
         matrix, offset = self._from_samples(rows, columns)
         shape = (rows.stop - rows.start) * count, (columns.stop - columns.start) * count
         inside = self._inside(matrix, offset, shape)
         if inside is not None and not inside.any():
-            return np.zeros((shape[0] // count, shape[1] // count), np.float32)
+            return np.full((shape[0] // count, shape[1] // count), band.no_data, np.float32)
         corners = offset + [matrix @ [i * (shape[0] - 1), j * (shape[1] - 1)] for i, j in _CORNERS]
         parts = [
             slice(max(math.floor(low), 0), min(math.ceil(high) + 1, most))
@@ -110,7 +110,7 @@ class Resampling:
             slice(min(part.start, most - 1), max(part.stop, 1))
             for part, most in zip(parts, self._shape, strict=True)
         ]
-        values = read(*parts).astype(np.float64)
+        summands, known = band.summands(read(*parts))
         first = np.array([part.start for part in parts])
 
         def interpolated(given: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -118,17 +118,14 @@ class Resampling:
                 given, matrix, offset - first, shape, order=1, mode="nearest"
             )
 
-        received = values != 0 if of_power else np.ones(values.shape, bool)
-        total = interpolated(values**2 if of_power else values)
-        weight = np.ones(shape) if received.all() else interpolated(received.astype(np.float64))
+        total = interpolated(summands)
+        weight = np.ones(shape) if known.all() else interpolated(known.astype(np.float64))
         if inside is not None:
             total *= inside
             weight *= inside
         blocks = shape[0] // count, count, shape[1] // count, count
         total, weight = (each.reshape(blocks).sum(axis=(1, 3)) for each in (total, weight))
-        seen = weight >= count**2 / 2  # at least half of the pixel
-        mean = np.divide(total, weight, out=np.zeros_like(total), where=seen)
-        return (np.sqrt(mean) if of_power else mean).astype(np.float32)
+        return band.mean(total, weight, count**2 / 2)  # at least half of the pixel
 
     def _from_samples(
         self, rows: slice, columns: slice

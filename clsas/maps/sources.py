@@ -1,4 +1,4 @@
-"""Sources of exports: images in memory, and stores of mosaics, read window by window."""
+"""Sources of exports: images and heights in memory, and stores of mosaics, read by windows."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image import Image
+from clsas.interferometry.result import Heights
 from clsas.mosaics.documents import read_document
 from clsas.mosaics.record import PatchIndex, Record
 from clsas.mosaics.store import Store
@@ -22,7 +23,7 @@ _WINDOW = 2048  # rows and columns that are read at once: 32 MiB of pixels; a pl
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """An image that is read window by window.
+    """An image that is read window by window, or heights.
 
     Attributes
     ----------
@@ -33,32 +34,37 @@ class Source:
         One of both has the pixels.
     records : dict
         Records of the patches of the store when the export began.
+    heights : Heights or None
+        Heights, if they are exported; `image` is then the image on their relief.
     """
 
     grid: Grid
     image: Image | None
     store: Store | None
     records: dict[PatchIndex, Record]
+    heights: Heights | None = None
 
     @classmethod
-    def of(cls, source: Image | Store, georeference: Georeference | None) -> Source:
-        """Return the source of an image or a store, with a georeference if one is given.
+    def of(cls, source: Image | Store | Heights, georeference: Georeference | None) -> Source:
+        """Return the source of what is exported, with a georeference if one is given.
 
         Raises
         ------
         ValueError
             If the source has another georeference, or a store is damaged.
         """
-        grid = source.grid
+        heights = source if isinstance(source, Heights) else None
+        found = source.image if isinstance(source, Heights) else source
+        grid = found.grid
         if georeference is not None:
             if grid.georeference not in (None, georeference):
                 raise ValueError(
                     f"georeference must be left out, since the source has one: {grid.georeference}"
                 )
             grid = replace(grid, georeference=georeference)
-        if isinstance(source, Store):
-            return cls(grid, None, source, source.records())
-        return cls(grid, source, None, {})
+        if isinstance(found, Store):
+            return cls(grid, None, found, found.records())
+        return cls(grid, found, None, {}, heights)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from placed import STEPS_M, UTM_NORTH, UTM_SOUTH, at, local, scene
+from placed import STEPS_M, UTM_NORTH, UTM_SOUTH, at, in_order, local, scene
 from stores import GRID, LINES, PLANE, REQUEST
 
 import clsas
@@ -74,15 +74,6 @@ def test_a_target_lies_where_proj_puts_it(place, tmp_path):
                 assert file.transform.b == file.transform.d == 0
 
 
-def in_order(image, values, transform):
-    """What was read, at the pixels of the image: looked up by map coordinates."""
-    on_map = image.georeference.to_map(image.grid.positions_m())
-    column, row = at(~transform, on_map[..., 0], on_map[..., 1])
-    np.testing.assert_allclose(column % 1, 0.5, atol=1e-6)
-    np.testing.assert_allclose(row % 1, 0.5, atol=1e-6)
-    return values[np.floor(row).astype(int), np.floor(column).astype(int)]
-
-
 @pytest.mark.parametrize("place", [UTM_NORTH, local(217.0), local(300.0)], ids=str)
 def test_what_comes_back_is_what_went_in_to_one_quantum(place, tmp_path):
     image, _ = scene(place)
@@ -138,7 +129,7 @@ def test_overviews_are_means_of_power(tmp_path):
                 np.testing.assert_allclose(power(file.read(1), kind), expected, rtol=3e-6)
 
 
-def test_heights_are_the_second_band(tmp_path):
+def test_heights_on_the_axis_of_the_map_are_the_second_band(tmp_path):
     image, _ = scene(local(217.0))
     height_m = np.add.outer(0.05 * np.arange(140), 0.01 * np.arange(190))
     raised = clsas.Image(image.pixels, image.grid.with_height(height_m))
@@ -147,12 +138,16 @@ def test_heights_are_the_second_band(tmp_path):
         with rasterio.open(tmp_path / "a.tif") as file:
             assert file.descriptions[1] == "Height (m)"
             read = in_order(image, file.read(2), file.transform)
-        np.testing.assert_allclose(read.real, height_m, rtol=1e-6)
+        np.testing.assert_allclose(read.real, height_m - 12.0, rtol=1e-6)  # the origin lies at -12
     clsas.export(raised, tmp_path / "a.tif", north_up=True)
     with rasterio.open(tmp_path / "a.tif") as file:
         where = image.georeference.to_map(image.grid.positions_m()[70, 90])
         column, row = (int(n) for n in at(~file.transform, *where[:2]))
-        assert file.read(2)[row, column] == pytest.approx(height_m[70, 90], abs=0.05)
+        level, read = file.read()
+        assert read[row, column] == pytest.approx(height_m[70, 90] - 12.0, abs=0.05)
+        outside = np.isnan(read)
+    assert outside.any()
+    assert np.isnan(level[outside]).all()
     with pytest.warns(ClsasWarning, match="8-bit levels leave out the heights"):
         clsas.export(raised, tmp_path / "a.tif", kind="8bit")
 

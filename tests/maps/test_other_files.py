@@ -124,5 +124,7 @@ def test_pictures_without_a_place_stand_alone(tmp_path):
         with pytest.raises(ValueError, match=r"path must not begin or end with a dot, got '"):
             clsas.export(image, tmp_path / name)
     clsas.save(tmp_path / "grid.h5", image.grid)
-    with pytest.raises(ValueError, match=r"source must contain an image, but .*grid.h5 has Grid"):
+    with pytest.raises(
+        ValueError, match=r"source must contain an image or heights, but .*grid.h5 has Grid"
+    ):
         clsas.export(tmp_path / "grid.h5", tmp_path / "b.tif")

@@ -24,6 +24,9 @@ def maps(folder: Path) -> dict[str, Call]:
     optional = ("None",)
     text = {"crs": "text", "vertical_datum": "text"}
     clsas.save(folder / "image.h5", s.image)
+    one = np.ones(s.image.shape)
+    relief = clsas.Heights(one, 0.1 * one, 0.9 * one, one > 0, 25 * one, one, s.image, 0.3)
+    clsas.save(folder / "heights.h5", relief)
     exported = {
         "source": folder / "image.h5",
         "kind": "8bit",
@@ -119,6 +122,19 @@ def maps(folder: Path) -> dict[str, Call]:
                 "scale_bar": False,
             },
             kinds={"colour_map": "text"},
+            accepts=unset | {"source": ("an Image",)},
+        ),
+        "export:heights": Call(
+            clsas.export,
+            {
+                "source": folder / "heights.h5",
+                "path": folder / "heights.tif",
+                "north_up": True,
+                "pixel_m": 0.2,
+                "georeference": place,
+                "lines": s.lines,
+                "progress": nothing,
+            },
             accepts=unset | {"source": ("an Image",)},
         ),
         "export:sicd": Call(

@@ -1,0 +1,103 @@
+"""Bands of rasters: what their numbers mean, and how numbers of several pixels become one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.grid import Grid
+from clsas.maps.sources import Source
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Numbers of the pixels of a grid, which are read window by window.
+
+    Means leave out pixels without data: amplitudes of 0, and other numbers that are NaN.
+
+    Attributes
+    ----------
+    name : str
+        What the numbers are, such as "Height".
+    unit : str
+        Their unit; "" for numbers without one, and for amplitudes.
+    read : callable
+        Called as read(rows, columns) with two slices; returns the numbers of a window of the grid.
+    is_amplitude : bool
+        True for amplitudes or complex pixels, whose mean is that of their power, and which
+        `Encoding` turns into pixels of a file. Other numbers are averaged and written as they are.
+    """
+
+    name: str
+    unit: str
+    read: Callable[[slice, slice], NDArray]
+    is_amplitude: bool = False
+
+    @property
+    def no_data(self) -> float:
+        """Number of pixels without data."""
+        return 0.0 if self.is_amplitude else math.nan
+
+    def summands(self, values: NDArray) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return what is added up for a mean, 0 without data, and which values have data."""
+        if self.is_amplitude:
+            return np.abs(values).astype(np.float64) ** 2, values != 0
+        known = ~np.isnan(values)
+        return np.where(known, values.real, 0.0).astype(np.float64), known
+
+    def mean(
+        self, total: NDArray[np.float64], weight: NDArray, least: float
+    ) -> NDArray[np.float32]:
+        """Return the means of sums of `summands`; no data where the weight is less than `least`."""
+        seen = weight >= least
+        mean = np.divide(total, weight, out=np.full(total.shape, self.no_data), where=seen)
+        return (np.sqrt(mean) if self.is_amplitude else mean).astype(np.float32)
+
+
+def bands_of(source: Source, kind: str) -> tuple[Band, ...]:
+    """Return the bands of a raster that shows a source.
+
+    Parameters
+    ----------
+    source : Source
+        An image on a plane or height map, a mosaic, or heights.
+    kind : str
+        One of `clsas.maps.encoding.KINDS`: pixels of the amplitude. 8-bit levels stand alone,
+        without the heights of a height map. Heights have no amplitude.
+    """
+    heights = source.heights
+    if heights is not None:
+        return (
+            _height(source.grid, heights.height_m),
+            _of_array("Standard deviation", "m", heights.sd_m),
+            _of_array("Coherence", "", np.where(heights.mask, heights.coherence, np.nan)),
+        )
+
+    def amplitude(rows: slice, columns: slice) -> NDArray[np.float32]:
+        return np.abs(source.read(rows, columns))
+
+    read = source.read if kind == "complex" else amplitude
+    bands = (Band("Amplitude", "", read, is_amplitude=True),)
+    if source.grid.height_m is None or kind == "8bit":
+        return bands
+    return (*bands, _height(source.grid, source.grid.height_m))
+
+
+def _height(grid: Grid, height_m: NDArray[np.float64]) -> Band:
+    """Return the band of heights above the plane of a grid, on the vertical axis of the map."""
+    plane, place = replace(grid, height_m=None), grid.georeference
+
+    def read(rows: slice, columns: slice) -> NDArray[np.float64]:
+        positions_m = plane.positions_m(rows, columns)
+        on_map_m = positions_m if place is None else place.to_map(positions_m)
+        return on_map_m[..., 2] + height_m[rows, columns]
+
+    return Band("Height", "m", read)
+
+
+def _of_array(name: str, unit: str, values: NDArray[np.float64]) -> Band:
+    return Band(name, unit, lambda rows, columns: values[rows, columns])
