@@ -15,7 +15,9 @@ from clsas.cli.inputs import load_lines, read_beam, read_grid
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, Parsed
 from clsas.core import validate
+from clsas.interferometry.checks import checked_coherence
 from clsas.interferometry.heights import LEAST_COHERENCE
+from clsas.processing import numbers
 
 
 def _heights(text: str) -> tuple[float, float]:
@@ -59,7 +61,7 @@ _SEARCH = Parsed("LOW:HIGH", _heights, "LOW:HIGH, two ascending heights in metre
     type=float,
     default=LEAST_COHERENCE,
     show_default=True,
-    callback=options.checked(partial(validate.number, "least_coherence", least=0.1, most=0.99)),
+    callback=options.checked(checked_coherence),
     help="Smallest coherence of a valid height.",
 )
 @options.beam
@@ -108,27 +110,24 @@ def heights(
             least_coherence=least_coherence, beam=beam, device=device, progress=progress,
         )  # fmt: skip
     clsas.save(output, found)
-    results: dict[str, Any] = {
-        "valid": float(found.mask.mean()),
-        "window_m": found.window_m,
-        "looks": float(np.median(found.looks)),
-        "coherence": float(np.median(found.coherence)),
-        "ambiguity_m": 2 * np.pi * float(np.median(np.abs(found.m_per_rad))),
-    }
-    text = f"{100 * results['valid']:.3g} % of {found.mask.size} pixels are valid"
-    if found.mask.any():
-        known_m = found.height_m[found.mask]
-        results["height_m"] = [float(known_m.min()), float(known_m.max())]
-        results["median_sd_m"] = float(np.median(found.sd_m[found.mask]))
-        text += (
-            f", {known_m.min():.3f} to {known_m.max():.3f} m high, median deviation "
-            f"{1e3 * results['median_sd_m']:.3g} mm"
-        )
+    results = numbers.of_heights(found)
     report(
         as_json,
-        f"{printable(output)}: {text}\n  coherence {results['coherence']:.2f}, windows of "
-        f"{found.window_m:.3g} m with {results['looks']:.0f} looks, height of ambiguity "
-        f"{results['ambiguity_m']:.3g} m",
+        f"{printable(output)}: {in_words(results)}\n  coherence "
+        f"{results['coherence']:.2f}, windows of {found.window_m:.3g} m with "
+        f"{results['looks']:.0f} looks, height of ambiguity {results['ambiguity_m']:.3g} m",
         file=output,
         **results,
+    )
+
+
+def in_words(results: dict[str, Any]) -> str:
+    """Return the valid share, the span of heights and the median deviation, in words."""
+    valid = f"{100 * results['valid']:.3g} % of {results['pixels']} pixels are valid"
+    if results["height_m"] is None:
+        return valid
+    low_m, high_m = results["height_m"]
+    return (
+        f"{valid}, {low_m:.3f} to {high_m:.3f} m high, median deviation "
+        f"{1e3 * results['median_sd_m']:.3g} mm"
     )

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 import clsas
-from clsas.cli import options
+from clsas.cli import heights, options
 from clsas.cli.inputs import read_scene
 from clsas.cli.outputs import printable, report, step_bar
 from clsas.cli.parameters import INPUT, keep_apart
@@ -47,9 +47,10 @@ def process(
     """Take a recording to a focused image, step by step.
 
     The table [process] of the scene names the recording and the steps: inspect, calibrate,
-    navigate, focus, image and mosaic. The results go into one folder, where process.json records
-    inputs, versions and results of every step. After an interruption the same command continues. It
-    repeats a step only if something changed, and replaces only files that its record lists.
+    navigate, focus, image, heights and mosaic. The results go into one folder, where process.json
+    records inputs, versions and results of every step. After an interruption the same command
+    continues. It repeats a step only if something changed, and replaces only files that its record
+    lists.
 
     \b
     Example:  clsas process scene.toml --lines lines.h5 -o processed
@@ -101,6 +102,8 @@ def _in_words(step: StepRecord) -> str:
     if step.name == "image" and "before" in numbers and numbers["peak_db"] is not None:
         gain_db = numbers["peak_db"] - (numbers["before"]["peak_db"] or 0.0)
         return f"; peak {gain_db:+.1f} dB by the corrections"
+    if step.name == "heights":
+        return f"; {heights.in_words(numbers)}"
     return ""
 
 

@@ -12,17 +12,21 @@ from pydantic import Field
 
 from clsas.core import validate
 from clsas.files.tables import Table, Vector, located
+from clsas.interferometry.checks import checked_coherence, checked_search
 from clsas.navigation.autofocus import UNKNOWNS as FOCUSED
 from clsas.navigation.known_points import UNKNOWNS as CALIBRATED
 from clsas.navigation.micronavigation import UNKNOWNS as NAVIGATED
+from clsas.planning.request import tolerance_in_db
 
-STEPS = ("inspect", "calibrate", "navigate", "focus", "image", "mosaic")
+STEPS = ("inspect", "calibrate", "navigate", "focus", "image", "heights", "mosaic")
 """Steps of `clsas process`, in the order in which they run."""
 
 CORRECTIONS = ("calibrate", "navigate", "focus")
-"""Steps that correct the lines. By default they run if their table exists."""
+"""Steps that correct the lines."""
 
 _USUAL = ("inspect", "image")
+_OPTIONAL = (*CORRECTIONS, "heights")  # by default they run if their table exists
+_REQUIRED = {"calibrate": "points_m", "heights": "search_m"}  # key without which a step cannot run
 _Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
@@ -83,6 +87,23 @@ class _Focus(Table):
         return options
 
 
+class _Heights(Table):
+    search_m: _Pair
+    window_m: float | None = None
+    least_coherence: float | None = None
+    tolerance_db: float | None = None
+
+    def build(self) -> dict[str, Any]:
+        options = self.given()
+        with located("[process.heights]"):
+            options["search_m"] = checked_search(self.search_m)
+            _check(options, validate.positive, window_m="m")
+            if self.least_coherence is not None:
+                checked_coherence(self.least_coherence)
+            tolerance_in_db(self.tolerance_db, None)
+        return options
+
+
 class ProcessTable(Table):
     """`[process]`."""
 
@@ -93,6 +114,7 @@ class ProcessTable(Table):
     calibrate: _Calibrate | None = None
     navigate: _Navigate | None = None
     focus: _Focus | None = None
+    heights: _Heights | None = None
 
     def build(self, folder: Path) -> dict[str, Any]:
         """Return paths, steps and the options of every step. Paths are relative to `folder`."""
@@ -105,7 +127,7 @@ class ProcessTable(Table):
                     options[name] = folder / path
             if self.bank is not None:
                 options["bank"] = validate.count("bank", self.bank, least=0)
-        for name in CORRECTIONS:
+        for name in _OPTIONAL:
             if (table := getattr(self, name)) is not None:
                 options[name] = table.build()
         with located("[process]"):
@@ -115,21 +137,22 @@ class ProcessTable(Table):
 
 
 def checked_steps(steps: Sequence[str] | None, options: dict[str, Any]) -> tuple[str, ...]:
-    """Return steps in order; by default the usual ones and corrections that have options.
+    """Return steps in order; by default the usual ones and those that have options.
 
     Raises
     ------
     TypeError, ValueError
-        If a step is unknown, none is given, or "calibrate" lacks its points.
+        If a step is unknown, none is given, or one lacks an option that it requires.
     """
     if steps is None:
-        chosen = {*_USUAL, *(name for name in CORRECTIONS if name in options)}
+        chosen = {*_USUAL, *(name for name in _OPTIONAL if name in options)}
     else:
         chosen = set(validate.named("steps", steps, STEPS))
     if not chosen:
         raise ValueError(f"steps must name at least one of {STEPS}, got none")
-    if "calibrate" in chosen and "calibrate" not in options:
-        raise ValueError("steps may include calibrate only with points_m in [process.calibrate]")
+    for name, key in _REQUIRED.items():
+        if name in chosen and name not in options:
+            raise ValueError(f"steps may include {name} only with {key} in [process.{name}]")
     return tuple(name for name in STEPS if name in chosen)
 
 

@@ -52,8 +52,8 @@ class SceneFile:
         `memory_mib`.
     process : dict
         Paths that `clsas process` reads (`lines`) and writes (`output`), its `steps`, the receiver
-        `bank` that it images, and the keyword arguments of the steps `calibrate`, `navigate` and
-        `focus`.
+        `bank` that it images, and the keyword arguments of the steps `calibrate`, `navigate`,
+        `focus` and `heights`.
     files : dict
         Paths of the files that the scene refers to, by key: "track.file", "grid.height_file",
         "sound_speed.file", "mosaic.lines", "process.lines".

@@ -26,6 +26,11 @@ def checked_search(search_m: ArrayLike) -> tuple[float, float]:
     return low_m, high_m
 
 
+def checked_coherence(least_coherence: float) -> float:
+    """Return the smallest coherence of a valid height."""
+    return validate.number("least_coherence", least_coherence, least=0.1, most=0.99)
+
+
 def check_grid(grid: Grid) -> None:
     """Raise ValueError unless a grid is a plane that heights along z can raise."""
     if not grid.is_planar:

@@ -21,7 +21,13 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.wavelengths import cycles_per_m_at
 from clsas.interferometry.baseline import Baseline, sight_lattice
-from clsas.interferometry.checks import check_geometry, check_grid, check_pair, checked_search
+from clsas.interferometry.checks import (
+    check_geometry,
+    check_grid,
+    check_pair,
+    checked_coherence,
+    checked_search,
+)
 from clsas.interferometry.coherence import (
     Window,
     check_looks,
@@ -191,7 +197,7 @@ def heights(
     tolerance_db = validate.number(
         "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
     )
-    least_coherence = validate.number("least_coherence", least_coherence, least=0.1, most=0.99)
+    least_coherence = checked_coherence(least_coherence)
     validate.instance("beam", beam, BeamWindow, type(None))
     validate.progress(progress)
     if window_m is not None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,11 +21,21 @@ from clsas.core.validate import ClsasWarning
 from clsas.files.hdf5 import save
 from clsas.files.process_tables import CORRECTIONS, STEPS, checked_steps
 from clsas.files.scene_files import SceneFile, read_scene
+from clsas.interferometry.checks import check_grid
+from clsas.interferometry.result import Heights
 from clsas.opencl.device import Device, open_device
 from clsas.processing.folders import check_folder, checked_records, folder_of, made
 from clsas.processing.record import StepRecord, file_digest, step_digest, write_records
 from clsas.processing.recording import Recording, loaded
-from clsas.processing.steps import RUN, TABLES, Job, Outcome, check_pictures, options_of
+from clsas.processing.steps import (
+    RUN,
+    TABLES,
+    Job,
+    Outcome,
+    check_banks,
+    check_pictures,
+    options_of,
+)
 from clsas.signal.echoes import Echoes
 
 
@@ -78,8 +89,24 @@ class Processed:
         ValueError
             If the file has changed since it was written.
         """
-        record = self["image"]
-        return loaded(self.folder / record.result_file, record.files[record.result_file], Image)
+        return self._result("image", Image)
+
+    @property
+    def heights(self) -> Heights:
+        """Heights of the seabed, read from the folder.
+
+        Raises
+        ------
+        KeyError
+            If the step "heights" did not run.
+        ValueError
+            If the file has changed since it was written.
+        """
+        return self._result("heights", Heights)
+
+    def _result(self, name: str, kind: type) -> Any:
+        record = self[name]
+        return loaded(self.folder / record.result_file, record.files[record.result_file], kind)
 
 
 def process(
@@ -93,9 +120,9 @@ def process(
 ) -> Processed:
     """Return the results of processing a recording to a focused image.
 
-    The steps are inspect, calibrate, navigate, focus, image and mosaic. Every step is recorded in
-    `process.json` in the folder `output`: its inputs and options, the version of clsas, its
-    numbers, warnings and files. A step is not run again if it ran before with the same inputs,
+    The steps are inspect, calibrate, navigate, focus, image, heights and mosaic. Every step is
+    recorded in `process.json` in the folder `output`: its inputs and options, the version of clsas,
+    its numbers, warnings and files. A step is not run again if it ran before with the same inputs,
     options and version, and its files have not changed. The files of a step appear together once it
     is done, and replace all files that it wrote before.
 
@@ -159,16 +186,23 @@ def process(
     of_scene = checked_steps(scene.process.get("steps"), scene.process)
     chosen = of_scene if steps is None else checked_steps(steps, scene.process)
     names = _with_corrections(chosen, of_scene)
-    if {"focus", "image", "mosaic"} & set(names):
+    if {"focus", "image", "heights", "mosaic"} & set(names):
         (grid,) = scene.need("grid")
         if "image" in names:
             validate.memory("[grid]", 16 * grid.size)  # two images
+        if "heights" in names:
+            with _naming(scene, "heights"):
+                check_grid(grid)
     recording = Recording.of(scene, lines)
     folder = folder_of(scene, output)
     check_folder(folder, recording)
     check_pictures()
     with made(folder):
         records = checked_records(scene, folder, names)
+        if "heights" in names and "heights" not in records:
+            uncorrected = recording.read()  # which stays in memory for the first step
+            with _naming(scene, "heights"):  # before other steps, which may take hours
+                check_banks(uncorrected)
         chain = _Chain(scene, folder, recording, open_device(device), records)
         for name in STEPS:
             if name in names:
@@ -307,15 +341,11 @@ class _Chain:
 
 
 def _outcome(name: str, job: Job) -> tuple[Outcome, tuple[str, ...]]:
-    """Return the outcome of a step and its ClsasWarnings; put its name in front of errors."""
+    """Return the outcome of a step and its ClsasWarnings."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", append=True)  # after the caller's filters
-        try:
+        with _naming(job.scene, name):
             outcome = RUN[name](job)
-        except (TypeError, ValueError) as error:
-            where = f"{job.scene.name or 'scene'}: {name} ({TABLES[name]})"
-            kind = TypeError if isinstance(error, TypeError) else ValueError
-            raise kind(f"{where}: {error}") from error
     messages = []
     for each in caught:
         if issubclass(each.category, ClsasWarning):
@@ -323,3 +353,14 @@ def _outcome(name: str, job: Job) -> tuple[Outcome, tuple[str, ...]]:
         else:
             warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
     return outcome, tuple(dict.fromkeys(messages))  # images before and after share theirs
+
+
+@contextmanager
+def _naming(scene: SceneFile, name: str) -> Iterator[None]:
+    """Put the scene, a step and its table in front of errors."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        where = f"{scene.name or 'scene'}: {name} ({TABLES[name]})"
+        kind = TypeError if isinstance(error, TypeError) else ValueError
+        raise kind(f"{where}: {error}") from error

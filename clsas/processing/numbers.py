@@ -8,6 +8,7 @@ import numpy as np
 
 from clsas.core.contrast import contrast, entropy
 from clsas.core.image import Image
+from clsas.interferometry.result import Heights
 from clsas.navigation.autofocus import Autofocus
 from clsas.navigation.micronavigation import Micronavigation
 
@@ -49,4 +50,23 @@ def of_image(image: Image) -> dict[str, Any]:
         "peak_db": 20 * float(np.log10(peak)),
         "contrast": contrast(image),
         "entropy": entropy(image),
+    }
+
+
+def of_heights(found: Heights) -> dict[str, Any]:
+    """Return the valid share of heights, their span and median deviation, and what limits them.
+
+    Span and deviation are None if no height is valid.
+    """
+    known_m = found.height_m[found.mask]
+    is_any = known_m.size > 0
+    return {
+        "pixels": found.mask.size,
+        "valid": float(found.mask.mean()),
+        "height_m": [float(known_m.min()), float(known_m.max())] if is_any else None,
+        "median_sd_m": float(np.median(found.sd_m[found.mask])) if is_any else None,
+        "window_m": found.window_m,
+        "looks": float(np.median(found.looks)),
+        "coherence": float(np.median(found.coherence)),
+        "ambiguity_m": 2 * np.pi * float(np.median(np.abs(found.m_per_rad))),
     }

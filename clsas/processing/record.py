@@ -37,7 +37,8 @@ class StepRecord:
     Attributes
     ----------
     name : str
-        The step: "inspect", "calibrate", "navigate", "focus", "image" or "mosaic".
+        The step: "inspect", "calibrate", "navigate", "focus", "image", "heights" or
+        "mosaic".
     digest : str
         Digest of the inputs, the options and the version of clsas.
     lines : str
@@ -78,12 +79,12 @@ class StepRecord:
 
     @property
     def result_file(self) -> str:
-        """Name of the file for the lines or the image of the step, if it saves any."""
+        """Name of the file for the lines, the image or the heights of the step, if it saves any."""
         return f"{self.name}.h5"
 
     def is_intact(self, folder: Path) -> bool:
         """Return whether all files of the step exist as they were written."""
-        if self.name in (*CORRECTIONS, "image") and self.result_file not in self.files:
+        if self.name in (*CORRECTIONS, "image", "heights") and self.result_file not in self.files:
             return False
         try:
             return all(file_digest(folder / name) == each for name, each in self.files.items())

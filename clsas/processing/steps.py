@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from clsas import plot
 from clsas.core import banks
@@ -27,11 +23,12 @@ from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS
 from clsas.inspection.inspection import inspect
+from clsas.interferometry.heights import heights
 from clsas.mosaics.mosaic import mosaic
 from clsas.mosaics.provenance import OtherInputsError, stored_digest
-from clsas.navigation.autofocus import Autofocus, autofocus
+from clsas.navigation.autofocus import autofocus
 from clsas.navigation.known_points import calibrate_track
-from clsas.navigation.micronavigation import Micronavigation, micronavigate
+from clsas.navigation.micronavigation import micronavigate
 from clsas.opencl.device import Device
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
@@ -39,6 +36,7 @@ from clsas.planning.request import TOLERANCE_DB
 from clsas.plans.factorization import ExactImage
 from clsas.processing import numbers
 from clsas.processing.record import StepRecord
+from clsas.processing.tracks import csv_of_track
 
 Progress = Callable[[int, int], None] | None
 
@@ -90,6 +88,16 @@ class Job:
         except ValueError as error:
             raise ValueError(f"[process] {str(error).replace('number', 'bank', 1)}") from None
 
+    @property
+    def title(self) -> str:
+        """Title of pictures, with the steps that corrected the lines.
+
+        The folder may still have lines of steps that the scene now leaves out.
+        """
+        if not self.corrections:
+            return "Uncorrected recording"
+        return f"After {', '.join(self.corrections)}"
+
     def draw(self, name: str, draw: Callable[[], Any]) -> list[str]:
         """Write a picture and return a list of its name; the list is empty without matplotlib."""
         if not is_installed("matplotlib"):
@@ -120,7 +128,7 @@ class Outcome:
 def options_of(step: str, scene: SceneFile) -> dict[str, Any]:
     """Return all options of a scene that a step depends on, as JSON types or arrays."""
     options = dict(scene.process.get(step, {}))
-    if step in ("inspect", "focus", "image", "mosaic"):
+    if step in ("inspect", "focus", "image", "heights", "mosaic"):
         options["grid"] = None if scene.grid is None else grid_digest(scene.grid)
         if scene.georeference is not None:
             options["georeference"] = str(scene.georeference)
@@ -166,7 +174,7 @@ def calibrated(job: Job) -> Outcome:
 def navigated(job: Job) -> Outcome:
     """Correct the track with displaced phase centres (micronavigation)."""
     found = micronavigate(job.lines, **job.options("navigate"), progress=job.progress)
-    _write_track(job.folder / "navigate.csv", found)
+    _write(job.folder / "navigate.csv", csv_of_track(found))
     files = ["navigate.csv"]
     files += job.draw("navigate-track.png", lambda: plot.corrections(found))
     range_m = job.options("navigate").get("range_m")
@@ -181,7 +189,7 @@ def focused(job: Job) -> Outcome:
         job.lines, grid, beam=job.scene.image.get("beam"), **job.options("focus"),
         device=job.device, progress=job.progress,
     )  # fmt: skip
-    _write_track(job.folder / "focus.csv", found)
+    _write(job.folder / "focus.csv", csv_of_track(found))
     files = ["focus.csv"]
     files += job.draw("focus-track.png", lambda: plot.corrections(found))
     files += job.draw("focus-sharpness.png", lambda: plot.sharpness(found))
@@ -200,9 +208,8 @@ def imaged(job: Job) -> Outcome:
         before, _ = _formed(job, given, grid, shares[0])
         image, error_db = _formed(job, lines, grid, shares[1])
     save(job.folder / "image.h5", image)
-    # Name the corrections: the folder may still have lines of steps that the scene now leaves out.
-    title = f"After {', '.join(job.corrections)}" if corrected else "Uncorrected recording"
-    files = ["image.h5", *job.draw("image.png", lambda: plot.image_db(image, title=title))]
+    files = ["image.h5"]
+    files += job.draw("image.png", lambda: plot.image_db(image, title=job.title))
     found = numbers.of_image(image) | {"predicted_error_db": error_db}
     if corrected:
         save(job.folder / "before.h5", before)
@@ -210,6 +217,28 @@ def imaged(job: Job) -> Outcome:
         both = job.draw("before-and-after.png", lambda: plot.before_and_after(before, image))
         files += ["before.h5", *both]
     return Outcome(found, files)
+
+
+def measured(job: Job) -> Outcome:
+    """Measure the heights of the seabed from the first two receiver banks."""
+    (grid,) = job.scene.need("grid")
+    check_banks(job.lines)
+    first, second, *_ = banks.present(job.lines.bank_numbers)
+    found = heights(
+        job.lines.bank(first), job.lines.bank(second), grid, beam=job.scene.image.get("beam"),
+        **job.options("heights"), device=job.device, progress=job.progress,
+    )  # fmt: skip
+    save(job.folder / "heights.h5", found)
+    files = ["heights.h5"]
+    if found.mask.any():
+        files += job.draw("heights.png", lambda: plot.heights(found, title=job.title))
+    return Outcome(numbers.of_heights(found), files)
+
+
+def check_banks(lines: RangeLines) -> None:
+    """Raise ValueError unless heights can be measured from several receiver banks."""
+    if lines.banks == 1:
+        raise ValueError("the recording must have at least 2 receiver banks (bank_numbers), got 1")
 
 
 def joined(job: Job) -> Outcome:
@@ -279,6 +308,7 @@ RUN: dict[str, Callable[[Job], Outcome]] = {
     "navigate": navigated,
     "focus": focused,
     "image": imaged,
+    "heights": measured,
     "mosaic": joined,
 }
 """Function of every step, in the order in which they run."""
@@ -290,6 +320,7 @@ FILES: dict[str, tuple[str, ...]] = {
     "navigate": ("navigate.csv", "navigate-track.png", "navigate-coherence.png", "navigate.h5"),
     "focus": ("focus.csv", "focus-track.png", "focus-sharpness.png", "focus.h5"),
     "image": ("image.h5", "image.png", "before.h5", "before-and-after.png"),
+    "heights": ("heights.h5", "heights.png"),
     "mosaic": (),
 }
 """Files that every step may write. The store of a mosaic has its own checks."""
@@ -297,6 +328,7 @@ FILES: dict[str, tuple[str, ...]] = {
 TABLES = {name: f"[process.{name}]" for name in CORRECTIONS} | {
     "inspect": "[grid]",
     "image": "[image]",
+    "heights": "[process.heights]",
     "mosaic": "[mosaic]",
 }
 """Table of the scene file that contains the options of a step, by step."""
@@ -334,37 +366,6 @@ def _formed(
     else:
         image = factorize(lines, grid, chosen, device=job.device, progress=progress)
     return image, chosen.predicted_error_db
-
-
-def _write_track(path: Path, found: Micronavigation | Autofocus) -> None:
-    """Write the corrected track, with the corrections and their standard deviations, as CSV."""
-    at_m = found.lines.ping_centres_m
-    columns: dict[str, Any] = {"ping": np.arange(len(at_m))}
-    columns |= {f"{name}_m": at_m[:, axis] for axis, name in enumerate("xyz")}
-    if isinstance(found, Micronavigation):
-        columns["heading_rad"] = found.track.yaw_rad
-        for name in (
-            "sway_m",
-            "sway_sd_m",
-            "shape_sd_m",
-            "yaw_rad",
-            "yaw_sd_rad",
-            "surge_m",
-            "surge_sd_m",
-        ):
-            columns[name] = getattr(found, name)
-    else:
-        starts = found.lines.ping_starts
-        for axis, name in enumerate("xyz"):
-            columns[f"correction_{name}_m"] = found.correction_m[starts, axis]
-        columns["correction_sd_m"] = found.correction_sd_m[starts]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(
-        [f"{value:.9g}" for value in row] for row in zip(*columns.values(), strict=True)
-    )
-    _write(path, text.getvalue())
 
 
 def _write(path: Path, text: str) -> None:

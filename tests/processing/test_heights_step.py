@@ -1,0 +1,251 @@
+"""The step `heights` of a processing: heights from the corrected lines of two receiver banks."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from reliefs import flat_banks
+
+import clsas
+from clsas.cli import main
+from clsas.core.validate import ClsasWarning
+from clsas.files.process_tables import checked_steps
+from clsas.files.scene_files import read_scene
+
+pytest.importorskip("matplotlib")
+
+POINTS_M = [0.0, 30.6, 0.0], [0.3, 33.4, 0.0]
+SCENE = """
+[grid]
+x = { start_m = -0.5, stop_m = 0.5, count = 51 }
+y = { start_m = 31.5, stop_m = 32.5, count = 51 }
+
+[image]
+tolerance_db = -40
+
+[process]
+lines = "lines.h5"
+steps = ["image", "heights"]
+
+[process.heights]
+search_m = [-0.5, 0.5]
+window_m = 0.2
+"""
+CALIBRATE = f"""
+[process.calibrate]
+points_m = {[*POINTS_M]}
+unknowns = ["time_offset"]
+search_m = 0.3
+
+"""
+
+
+def together(banks):
+    """Return the lines of banks as one recording, ping by ping."""
+
+    def joined(name):
+        arrays = [getattr(lines, name) for lines in banks]
+        return np.stack(arrays, axis=1).reshape(-1, *arrays[0].shape[1:])
+
+    varying = ("samples", "tx_m", "rx_m", "first_range_m")
+    numbers = np.tile(np.arange(len(banks)), banks[0].channels)
+    return replace(banks[0], **{name: joined(name) for name in varying}, bank_numbers=numbers)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    path = tmp_path_factory.mktemp("banks") / "lines.h5"
+    clsas.save(path, together(flat_banks()))
+    return path
+
+
+@pytest.fixture
+def scene(recorded, tmp_path):
+    (tmp_path / "lines.h5").symlink_to(recorded)
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE)
+    return path
+
+
+def change(scene, old, new):
+    text = scene.read_text()
+    assert old in text
+    scene.write_text(text.replace(old, new))
+
+
+@pytest.mark.slow
+def test_heights_are_those_that_the_library_finds(scene):
+    told = []
+    found = clsas.process(scene, progress=lambda *each: told.append(each))
+    assert found.repeated == ("image", "heights")
+    assert {path.name for path in found.folder.iterdir()} == {
+        "process.json", "image.h5", "image.png", "heights.h5", "heights.png"
+    }  # fmt: skip
+    grid = read_scene(scene).grid
+    expected = clsas.heights(*flat_banks(), grid, search_m=(-0.5, 0.5), window_m=0.2)
+    for name in ("height_m", "sd_m", "mask", "coherence"):
+        np.testing.assert_array_equal(getattr(found.heights, name), getattr(expected, name))
+    numbers, known = found["heights"].numbers, expected.mask
+    assert numbers["valid"] == known.mean() > 0.9
+    assert numbers["height_m"] == [np.nanmin(expected.height_m), np.nanmax(expected.height_m)]
+    assert numbers["median_sd_m"] == np.median(expected.sd_m[known])
+    assert numbers["ambiguity_m"] == pytest.approx(2.06, rel=0.03)
+    done, total = [(done, total) for step, done, total in told if step == "heights"][-1]
+    assert done == total
+    printed = CliRunner().invoke(main, ["process", str(scene)]).output
+    low_m, high_m = numbers["height_m"]
+    assert (
+        f"  heights, unchanged: heights.h5, heights.png; {100 * numbers['valid']:.3g} % of 2601 "
+        f"pixels are valid, {low_m:.3f} to {high_m:.3f} m high, median deviation "
+        f"{1e3 * numbers['median_sd_m']:.3g} mm\n"
+    ) in printed
+
+
+@pytest.mark.slow
+def test_heights_are_measured_again_only_if_something_changed(scene):
+    def repeated(**options):
+        return clsas.process(scene, **options).repeated
+
+    steps = "image", "heights"
+    assert repeated() == steps
+    assert repeated() == ()
+    change(scene, "window_m = 0.2", "window_m = 0.25")
+    assert repeated() == ("heights",)
+    # Heights are of both banks, whichever is imaged and how accurately.
+    change(scene, "[process]\n", "[process]\nbank = 1\n")
+    change(scene, "tolerance_db = -40", "tolerance_db = -30")
+    assert repeated() == ("image",)
+    (scene.with_suffix("") / "heights.h5").unlink()
+    assert repeated() == ("heights",)
+    change(scene, "stop_m = 0.5, count = 51", "stop_m = 0.4, count = 46")
+    message = "results of image in .* are out of date, since its lines or options have changed"
+    with pytest.warns(ClsasWarning, match=message):
+        assert repeated(steps=("heights",)) == ("heights",)
+    louder = clsas.load(scene.parent / "lines.h5")
+    louder = replace(louder, samples=2 * louder.samples)
+    with pytest.warns(ClsasWarning, match=message):
+        assert repeated(lines=louder, steps=("heights",)) == ("heights",)
+
+
+@pytest.mark.slow
+def test_heights_are_of_the_corrected_lines(scene):
+    """A range error of both banks displaces heights, until known points correct it."""
+    marks = clsas.PointTargets(POINTS_M, np.full(len(POINTS_M), 8.0))
+    late = together([late_with_marks(bank, marks, 0.06) for bank in flat_banks()])
+    change(scene, '"image", "heights"', '"heights"')
+    change(scene, "[process.heights]", CALIBRATE + "[process.heights]")
+    uncorrected = clsas.process(scene, lines=late).heights
+    # At 34.2 m of range from 12 m above the seabed, 6 cm are 2.1 cm of height.
+    assert np.median(uncorrected.height_m[uncorrected.mask]) == pytest.approx(-0.021, abs=2e-3)
+    change(scene, '"heights"', '"calibrate", "heights"')
+    found = clsas.process(scene, lines=late)
+    assert found.repeated == ("calibrate", "heights")
+    assert found["heights"].corrections == ("calibrate",)
+    assert abs(np.median(found.heights.height_m[found.heights.mask])) < 2e-3
+
+
+def late_with_marks(bank, marks, late_m):
+    """Return lines with the echoes of reflectors, all of them displaced in range."""
+    echoes = clsas.simulate_lines(
+        bank.tx_m, bank.rx_m, marks, carrier_hz=bank.carrier_hz, bandwidth_hz=30e3,
+        window="hamming", first_range_m=bank.first_range_m[0], length=bank.length,
+    )  # fmt: skip
+    assert echoes.range_step_m == bank.range_step_m
+    # Lines without a carrier keep their phase, so that the phase has to be displaced as well.
+    turned = np.exp(-4j * np.pi * bank.carrier_hz / bank.sound_speed_m_s * late_m)
+    samples = (turned * (bank.samples + echoes.samples)).astype(np.complex64)
+    return replace(bank, samples=samples, first_range_m=bank.first_range_m + late_m)
+
+
+@pytest.mark.slow
+def test_the_first_two_of_several_banks_are_used(scene):
+    """Whatever their numbers."""
+    low, high = flat_banks()
+    silent = replace(high, rx_m=high.rx_m + [0, 0, 0.3], samples=0 * high.samples)
+    three = together([low, high, silent])
+    renumbered = replace(three, bank_numbers=np.array([1, 4, 6])[three.bank_numbers])
+    change(scene, '"image", "heights"', '"heights"')
+    found = clsas.process(scene, lines=renumbered).heights
+    expected = clsas.heights(low, high, read_scene(scene).grid, search_m=(-0.5, 0.5), window_m=0.2)
+    np.testing.assert_array_equal(found.height_m, expected.height_m)
+
+
+@pytest.mark.slow
+def test_without_a_valid_height_there_is_no_picture(scene):
+    """Nor a span or a deviation: the banks contain noise alone."""
+    random = np.random.default_rng(1)
+    two = clsas.load(scene.parent / "lines.h5")
+    noise = random.standard_normal((*two.samples.shape, 2)) @ [1, 1j]
+    change(scene, '"image", "heights"', '"heights"')
+    change(scene, "window_m = 0.2", "window_m = 0.4\nleast_coherence = 0.9")
+    with pytest.warns(ClsasWarning, match="heights: only 0 % of the pixels are coherent"):
+        found = clsas.process(scene, lines=replace(two, samples=noise.astype(np.complex64)))
+    assert list(found["heights"].files) == ["heights.h5"]
+    assert found["heights"].numbers["height_m"] is None
+    assert found["heights"].numbers["median_sd_m"] is None
+    assert json.loads((found.folder / "process.json").read_text())["steps"][0]["warnings"]
+
+
+def test_one_bank_is_refused_before_any_step(scene):
+    message = (
+        r"scene.toml: heights \(\[process.heights\]\): the recording must have at least 2 receiver "
+        r"banks \(bank_numbers\), got 1"
+    )
+    for lines in (flat_banks()[0], replace(flat_banks()[0], bank_numbers=np.zeros(120, int))):
+        with pytest.raises(ValueError, match=message):
+            clsas.process(scene, lines=lines)
+        assert not scene.with_suffix("").exists()
+
+
+@pytest.mark.slow
+def test_one_bank_is_refused_instead_of_two(scene):
+    """The results of the former recording are kept."""
+    change(scene, '"image", "heights"', '"heights"')
+    found = clsas.process(scene)
+    with pytest.raises(ValueError, match="at least 2 receiver banks"):
+        clsas.process(scene, lines=flat_banks()[0])
+    assert found.heights.mask.any()
+
+
+def test_heights_run_only_if_asked_for(scene):
+    change(scene, 'steps = ["image", "heights"]\n', "")
+    assert read_scene(scene).process["heights"] == {"search_m": (-0.5, 0.5), "window_m": 0.2}
+    assert checked_steps(None, read_scene(scene).process) == ("inspect", "image", "heights")
+    assert checked_steps(None, {}) == ("inspect", "image")
+    change(scene, "[process]\n", '[process]\nsteps = ["image"]\n')
+    found = clsas.process(scene)
+    assert found.repeated == ("image",)
+    with pytest.raises(KeyError):
+        _ = found.heights
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("search_m = [-0.5, 0.5]\n", "", r"missing key 'search_m' in \[process.heights\]"),
+        ("[-0.5, 0.5]", "[0.5, -0.5]", r"\[process.heights\] search_m must be \(lowest, highest\)"),
+        ("[-0.5, 0.5]", "[0.5]", "search_m"),
+        ("window_m = 0.2", "window_m = 0.0", r"\[process.heights\] window_m must be"),
+        ("window_m = 0.2", "least_coherence = 1.0", r"\[process.heights\] least_coherence must be"),
+        ("window_m = 0.2", "tolerance_db = -5.0", r"\[process.heights\] tolerance_db must be"),
+        ("window_m = 0.2", "window = 0.2", r"unknown key 'window' in \[process.heights\]"),
+        (SCENE[SCENE.index("[process.heights]") :], "", "may include heights only with search_m"),
+        (SCENE[: SCENE.index("[image]")], "", r"missing table \[grid\]"),
+    ],
+)
+def test_mistakes_are_named(scene, old, new, message):
+    change(scene, old, new)
+    with pytest.raises(ValueError, match=message):
+        clsas.process(scene)
+    assert not scene.with_suffix("").exists()
+
+
+def test_a_relief_is_refused_before_any_step(scene):
+    relief = scene.parent / "relief.csv"
+    np.savetxt(relief, np.zeros((51, 51)), delimiter=",")
+    change(scene, "[grid]\n", '[grid]\nheight_file = "relief.csv"\n')
+    with pytest.raises(ValueError, match=r"heights \(.*\): grid must be a plane.*got a height map"):
+        clsas.process(scene)
+    assert not scene.with_suffix("").exists()
