@@ -40,10 +40,10 @@ _GROUPS = {
         "heights": ("heights", "Measure the heights of a seabed from two receiver banks."),
         "mosaic": ("mosaics", "Form an image of any size, patch by patch."),
         "view": ("view", "Show an image or a mosaic in a browser."),
-        "show": ("show", "Draw an image, heights, range lines, a plan, a recording or a mosaic."),
+        "show": ("show", "Draw an image, heights, lines, a plan or a recording."),
         "export": (
             "export",
-            "Write an image, a mosaic or heights as a map, a picture or a web page.",
+            "Write an image or heights as a map, a picture or a web page.",
         ),
     },
     "Measures": {

@@ -107,7 +107,7 @@ def export(
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Write an image, a mosaic or heights as a map, a picture or a web page.
+    """Write an image or heights as a map, a picture or a web page.
 
     INPUT is an image or heights in HDF5, or the Zarr store of a finished mosaic, which may be
     larger than memory. The suffix of OUTPUT decides: .tif is a cloud-optimized GeoTIFF, .nc is

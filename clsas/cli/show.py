@@ -73,7 +73,7 @@ def show(
     scale_bar: bool,
     as_json: bool,
 ) -> None:
-    """Draw an image, heights, range lines, a plan, a recording or a mosaic.
+    """Draw an image, heights, lines, a plan or a recording.
 
     FILE is any file that clsas writes or reads: an image, an interferogram, heights, range lines or
     echoes in HDF5; a recording as CPHD, AirSAS or MATLAB; a plan that `clsas plan --json --filters`
