@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -216,8 +217,10 @@ def measure(
     progress: Callable[[int, int], None] | None,
 ) -> Heights:
     """Return the heights that a pair of banks shows; parameters are those of `heights`."""
-    task = _task(pair, grid, search_m, least_coherence)
-    images = pair.images(grid)
+    # Rays are exact on the relief that is refined. A sweep needs no more than nearly right ones.
+    straight = pair.straightened(grid)
+    task = _task(straight, grid, search_m, least_coherence)
+    images = straight.images(grid)
     window_m = _default_window_m(images, grid) if window_m is None else window_m
     window = Window.of(grid, window_m)
     looks = effective_looks(images, window)
@@ -229,7 +232,12 @@ def measure(
     relief = _first_relief(task, images, window_m, heights_m, lambda done: report(done, total))
     sights = sight_lattice(task.baseline, grid, search_m)
     refined = refine(
-        task, relief, sights, window, looks, lambda done: report(len(heights_m) + done, total)
+        replace(task, pair=pair),
+        relief,
+        sights,
+        window,
+        looks,
+        lambda done: report(len(heights_m) + done, total),
     )
     report(total, total)
     _warn(refined)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.opencl.device import Device
 from clsas.planning.imager import Imager
+from clsas.signal.refraction import homogeneous
 from clsas.sonar.beam import BeamWindow
 
 
@@ -44,3 +45,26 @@ class Pair:
             for lines in (self.a, self.b)
         )  # fmt: skip
         return first, second
+
+    def straightened(self, grid: Grid) -> Pair:
+        """Return the pair in homogeneous water, unchanged without a profile of the sound speed.
+
+        Delays are those of exact rays on a level plane through the middle of the grid, and echoes
+        come from the right direction. A metre above or below, heights err by some millimetres.
+        """
+        if self.a.sound_speed is None and self.b.sound_speed is None:
+            return self
+        level_only = np.array([1.0, 1.0, 0.0])
+        origin_m, row_step_m, column_step_m = grid.vectors_m
+        low_m, high_m = grid.bounds_m
+        level = Grid.oriented(
+            origin_m * level_only + [0, 0, (low_m[2] + high_m[2]) / 2],
+            row_step_m * level_only,
+            column_step_m * level_only,
+            (grid.shape[0], grid.shape[1]),
+            georeference=grid.georeference,
+        )
+        first, second = (
+            homogeneous(lines, level, self.beam, None).lines(lines) for lines in (self.a, self.b)
+        )
+        return replace(self, a=first, b=second)

@@ -327,3 +327,31 @@ class TestBadInput:
                 window_m=WINDOW_M,
             )  # fmt: skip
         assert result.mask.mean() < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("height_m", [0.2, -1.5])
+def test_refraction_does_not_displace_heights(height_m):
+    """Through a thermocline, heights are right with the profile, and far off without it."""
+    random = np.random.default_rng(3)
+    places_m = random.uniform([-0.6, 19.2, height_m - 10], [0.6, 21.4, height_m - 10], (8000, 3))
+    scene = clsas.PointTargets(places_m, random.standard_normal((8000, 2)) @ [1, 1j])
+    tx_m = np.outer(np.linspace(-2, 2, 81), [1, 0, 0]) + [0, 0, -4]
+    profile = clsas.SoundSpeed([0, 6, 9, 40], [1510, 1508, 1498, 1497])
+    through = [
+        clsas.simulate_lines(
+            tx_m, tx_m + [0, 0, up_m], scene, carrier_hz=100e3, bandwidth_hz=30e3,
+            sound_speed=profile,
+        )
+        for up_m in (0.0, 0.2)
+    ]  # fmt: skip
+    grid = clsas.Grid.plane((-0.4, 0.4, 33), (19.8, 20.6, 33), z=-10)
+    right, wrong = (
+        heights(*pair, grid, search_m=(height_m - 0.5, height_m + 0.5))
+        for pair in (through, [replace(lines, sound_speed=None) for lines in through])
+    )
+    assert right.mask.mean() > 0.9
+    errors = (right.height_m - height_m)[right.mask]
+    assert abs(errors.mean()) < 0.5 * np.median(right.sd_m[right.mask])
+    assert np.sqrt(np.mean(errors**2)) < 1.3 * np.sqrt(np.mean(right.sd_m[right.mask] ** 2))
+    assert abs(np.nanmedian(wrong.height_m) - height_m) > 0.1
