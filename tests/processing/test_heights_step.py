@@ -249,3 +249,13 @@ def test_a_relief_is_refused_before_any_step(scene):
     with pytest.raises(ValueError, match=r"heights \(.*\): grid must be a plane.*got a height map"):
         clsas.process(scene)
     assert not scene.with_suffix("").exists()
+
+
+@pytest.mark.parametrize("name", ["heights.h5", "heights.png"])
+def test_files_of_others_are_never_replaced(scene, name):
+    folder = scene.with_suffix("")
+    folder.mkdir()
+    (folder / name).write_text("mine")
+    with pytest.raises(ValueError, match=f"contains {name}, which heights would replace"):
+        clsas.process(scene)
+    assert (folder / name).read_text() == "mine"
