@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,12 +89,14 @@ def bands_of(source: Source, kind: str) -> tuple[Band, ...]:
 
 def _height(grid: Grid, height_m: NDArray[np.float64]) -> Band:
     """Return the band of heights above the plane of a grid, on the vertical axis of the map."""
-    plane, place = replace(grid, height_m=None), grid.georeference
+    origin_m, *steps_m = grid.vectors_m
+    place = grid.georeference
+    first_m = (origin_m if place is None else place.to_map(origin_m))[2]
+    down_m, right_m = (step[2] * np.arange(n) for step, n in zip(steps_m, grid.shape, strict=True))
 
     def read(rows: slice, columns: slice) -> NDArray[np.float64]:
-        positions_m = plane.positions_m(rows, columns)
-        on_map_m = positions_m if place is None else place.to_map(positions_m)
-        return on_map_m[..., 2] + height_m[rows, columns]
+        plane_m = first_m + np.add.outer(down_m[rows], right_m[columns])
+        return plane_m + height_m[rows, columns]
 
     return Band("Height", "m", read)
 

@@ -130,6 +130,18 @@ def test_a_slope_turned_north_up_stays_a_slope(tmp_path):
     np.testing.assert_allclose(bands[0][inside], at_m[inside], atol=1e-5)
 
 
+def test_corners_far_from_a_narrow_swath_have_no_data(tmp_path):
+    """Tiles of the north-up raster that the swath does not reach are not read at all."""
+    heights = relief(local(217.0), shape=(9, 2000))
+    clsas.export(heights, tmp_path / "a.tif", north_up=True, pixel_m=0.25)
+    with rasterio.open(tmp_path / "a.tif") as file:
+        bands = file.read()
+    assert min(bands.shape[1:]) > 1024
+    share = heights.mask.sum() * 0.25 * 0.2 / (bands[0].size * 0.25**2)
+    for band in bands:
+        assert np.isfinite(band).mean() == pytest.approx(share, rel=0.1)
+
+
 @pytest.mark.parametrize("place", [UTM_NORTH, NN2000, None], ids=str)
 def test_netcdf_has_the_numbers_of_the_bands(place, tmp_path):
     xarray = pytest.importorskip("xarray")
