@@ -286,6 +286,17 @@ class TestBadInput:
         _, second = flat_banks()
         self.refused("same carrier_hz", b=replace(second, carrier_hz=90e3))
 
+    def test_other_water(self):
+        first, second = flat_banks()
+        profile = clsas.SoundSpeed([0, 30], [1500, 1490], 20.0)
+        other = clsas.SoundSpeed([0, 30], [1500, 1480], 20.0)
+        refused = "same sound_speed.*None and SoundSpeed"
+        self.refused(refused, b=replace(second, sound_speed=profile))
+        self.refused(
+            "same sound_speed", replace(first, sound_speed=profile),
+            replace(second, sound_speed=other),
+        )  # fmt: skip
+
     def test_silence(self):
         first, _ = flat_banks()
         self.refused("b must contain echoes", b=replace(first, samples=0 * first.samples))
@@ -304,6 +315,7 @@ class TestBadInput:
     def test_search(self):
         self.refused("must end below the sonar, which is 12 m", search_m=(-1, 12.5))
         self.refused("within the range of the lines", search_m=(-60, 1))
+        self.refused("must end below the sonar", search_m=(-1e6, 1e6))
         self.refused("within the range of the lines", search_m=(-1e6, 1))
         self.refused("lowest, highest", search_m=(1, -1))
         self.refused("search_m must have shape", search_m=(1, 2, 3))
