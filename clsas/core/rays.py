@@ -34,6 +34,7 @@ _VERTICAL = 1e-9  # least horizontal distance over height, for which a time diff
 _TURNS = 32  # depths per layer at which turning rays are tried before they are refined
 _HALVINGS = 50  # of the interval between two of them
 _AT_ONCE = 1 << 15  # rays that are computed together; bounds memory
+_PIECES_AT_ONCE = 1 << 22  # of rays, one per layer; bounds memory for profiles of many depths
 _TURNING_AT_ONCE = 1 << 9
 
 
@@ -95,8 +96,9 @@ def rays(
         check_reaches(profile, z)
     found = np.empty((5, distance.size))
     flat = [np.ravel(each) for each in (distance, one, other)]
-    for first in range(0, distance.size, _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
+    at_once = max(min(_AT_ONCE, _PIECES_AT_ONCE // len(profile.depth_m)), 1)
+    for first in range(0, distance.size, at_once):
+        some = slice(first, first + at_once)
         found[:, some] = _some_rays(profile, *(each[some] for each in flat))
     time, slowness, of_one, of_other, exists = found.reshape(5, *distance.shape)
     return Rays(time, slowness, of_one, of_other, exists > 0)
@@ -224,8 +226,9 @@ def _some_rays(
         slowness[same] = 0.0
     turns = np.zeros(len(v), bool)
     missing = np.flatnonzero(np.isnan(v))
-    for first in range(0, len(missing), _TURNING_AT_ONCE):
-        some = missing[first : first + _TURNING_AT_ONCE]
+    at_once = max(min(_TURNING_AT_ONCE, _PIECES_AT_ONCE // len(profile.depth_m)), 1)
+    for first in range(0, len(missing), at_once):
+        some = missing[first : first + at_once]
         slowness[some], time[some] = _turning(profile, distance[some], upper[some], lower[some])
         turns[some] = np.isfinite(time[some])
     exists = ~np.isnan(v) | turns

@@ -49,6 +49,20 @@ def read_bytes(path: str | os.PathLike) -> bytes:
     return path.read_bytes()
 
 
+def read_text(path: str | os.PathLike) -> str:
+    """Return the text of an ordinary file in UTF-8, with or without a byte-order mark.
+
+    Raises ValueError if it is not UTF-8, and as `read_bytes` does.
+    """
+    try:
+        return read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"{os.fspath(path)} must be text in UTF-8, got the byte "
+            f"{error.object[error.start]:#04x} at position {error.start}"
+        ) from None
+
+
 def parse_toml(text: bytes) -> dict[str, Any]:
     """Return the tables of a TOML text; raises ValueError if it is invalid or too deeply nested."""
     try:

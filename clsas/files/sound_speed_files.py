@@ -45,7 +45,7 @@ def read_sound_speed(path: str | os.PathLike, *, surface_z_m: float = 0.0) -> So
     >>> profile = clsas.read_sound_speed("cast.csv", surface_z_m=20.0)  # doctest: +SKIP
     """
     path = validate.path("path", path)
-    text = reading.read_bytes(path).decode("utf-8-sig")
+    text = reading.read_text(path)
     reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
     try:
         names = [name.strip() for name in next(reader, [])]
@@ -68,7 +68,7 @@ def read_sound_speed(path: str | os.PathLike, *, surface_z_m: float = 0.0) -> So
     values = np.empty((len(rows), len(names)))
     for index, (line, row) in enumerate(rows):
         try:
-            values[index] = [float(value) for value in row]
+            values[index] = [float(value) for _, value in zip(names, row, strict=True)]
         except ValueError:
             got = validate.shown(",".join(row))
             raise ValueError(

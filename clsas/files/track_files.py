@@ -70,7 +70,7 @@ def read_track(path: str | os.PathLike, georeference: Georeference | None = None
 
 def _columns(path: str | os.PathLike) -> dict[str, NDArray[np.float64]]:
     """Return the columns of a file by their names, which are those of one of both kinds."""
-    text = reading.read_bytes(path).decode("utf-8-sig")
+    text = reading.read_text(path)
     reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
     try:
         names = [name.strip() for name in next(reader, [])]
@@ -83,7 +83,7 @@ def _columns(path: str | os.PathLike) -> dict[str, NDArray[np.float64]]:
     values = np.empty((len(rows), len(names)))
     for index, (line, row) in enumerate(rows):
         try:
-            values[index] = [float(value) for value in row]
+            values[index] = [float(value) for _, value in zip(names, row, strict=True)]
         except ValueError:
             got = validate.shown(",".join(row))
             raise ValueError(

@@ -61,6 +61,11 @@ def check_pair(a: RangeLines, b: RangeLines) -> None:
             raise ValueError(
                 f"a and b must have the same {name}, got {first:.9g} and {second:.9g} {unit}"
             )
+    if a.sound_speed != b.sound_speed:
+        raise ValueError(
+            "a and b must have the same sound_speed, since echoes reach both banks through the "
+            f"same water, got {a.sound_speed!r} and {b.sound_speed!r}"
+        )
     apart_m = np.linalg.norm(a.phase_centres_m - b.phase_centres_m, axis=1)
     usual_m = float(np.median(apart_m))
     worst = int(np.abs(apart_m - usual_m).argmax())
@@ -98,6 +103,9 @@ def check_geometry(
     """
     points_m = grid.spread(5)
     low_m, high_m = search_m
+    # The phase hardly changes far from the sonar, so an absurd search would look like no baseline.
+    _check_below(baseline, points_m, search_m)
+    _check_ranges(baseline, points_m, search_m)
     up = np.array([0.0, 0.0, 1.0])
     sights = [baseline.sight(points_m + offset_m * up) for offset_m in (low_m, 0.0, high_m)]
     rad_m = np.concatenate([each.rad_m for each in sights])
@@ -110,13 +118,11 @@ def check_geometry(
             f"{usual_rad_m * (high_m - low_m):.2g} rad over search_m, less than "
             f"{_LEAST_PHASE_RAD:g} rad"
         )
-    _check_below(baseline, points_m, search_m)
     if (rad_m > 0).any() and (rad_m < 0).any():
         raise ValueError(
             "a and b must see all of the grid and search_m from one side: the sign of the phase "
             "changes within them. Divide the grid at the track's nadir"
         )
-    _check_ranges(baseline, points_m, search_m)
     ambiguity_m = 2 * math.pi / usual_rad_m
     if high_m - low_m > _MOST_CYCLES * ambiguity_m:
         raise ValueError(

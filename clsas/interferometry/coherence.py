@@ -119,7 +119,8 @@ def effective_looks(images: tuple[NDArray, ...], window: Window) -> float:
     """Return the effective number of looks of a window, measured in images of speckle.
 
     The squared autocorrelation is averaged over tiles. A sample autocorrelation of n pairs of
-    pixels exceeds the true one by sum |rho|^2 / n in the mean square, which is subtracted.
+    pixels exceeds the true one by sum |rho|^2 / n in the mean square, or by 1 if all pixels are
+    correlated. That is taken into account, for the power too.
     """
     sides = [min(_TILE * side, n) for side, n in zip(window.sides, images[0].shape, strict=True)]
     lags = [np.arange(1 - min(n, m), min(n, m)) for n, m in zip(window.sides, sides, strict=True)]
@@ -137,8 +138,26 @@ def effective_looks(images: tuple[NDArray, ...], window: Window) -> float:
         for lengths in (sides, window.sides)
     )
     correlated = float(np.sum(weights * squared / pairs**2)) / power
-    area = correlated / (1 + float(np.sum(weights / pairs)) / math.prod(sides))
-    return window.pixels / max(area, 1.0)
+    return window.pixels / _correlated_area(correlated, weights, pairs * math.prod(sides))
+
+
+def _correlated_area(
+    measured: float, weights: NDArray[np.float64], pairs: NDArray[np.float64]
+) -> float:
+    """Return sum |rho|^2 in pixels, 1 to that of a window, from the sum that was measured.
+
+    `pairs` of pixels contribute to each lag; most of them to the power, whose square exceeds that
+    of the true power in the same way.
+    """
+    least, most = 1.0, float(weights.sum())
+    for _ in range(50):
+        area = (least + most) / 2
+        expected = area + float(np.sum(weights * np.minimum(area / pairs, 1)))
+        if expected < measured * (1 + min(area / float(pairs.max()), 1)):
+            least = area
+        else:
+            most = area
+    return most
 
 
 def _tiles(image: NDArray, rows: int, columns: int) -> NDArray[np.complex64]:

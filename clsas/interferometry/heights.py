@@ -85,7 +85,8 @@ def heights(
     grid : Grid
         Plane above which heights are measured, along z.
     search_m : (lowest, highest)
-        Heights above the plane between which the seabed lies, metres.
+        Heights above the plane between which the seabed lies, metres. The phase repeats with the
+        height of ambiguity: a seabed outside may appear inside, that much too high or too low.
     window_m : float, optional
         Side of the windows in which the coherence is estimated, metres. It is the resolution of the
         heights. By default windows contain about 50 independent samples.

@@ -177,6 +177,12 @@ def interferogram(a: Image, b: Image, window_m: float) -> Interferogram:
 def window_within(grid: Grid, window_m: float) -> Window:
     """Return the window of about `window_m`; raise ValueError unless it fits into a grid."""
     _, *steps_m = grid.vectors_m
-    sides_m = [n * float(np.linalg.norm(step)) for n, step in zip(grid.shape, steps_m, strict=True)]
+    sides_m = [
+        n * float(np.linalg.norm(step))
+        for n, step in zip(grid.shape, steps_m, strict=True)
+        if n > 1  # the window of a single row is that row
+    ]
+    if not sides_m:
+        raise ValueError("grid must have more than one pixel")
     validate.number("window_m", window_m, "m", above=0.0, most=min(sides_m))
     return Window.of(grid, window_m)

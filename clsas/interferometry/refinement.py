@@ -39,6 +39,7 @@ _FALSE_ALARM = 1e-3  # share of incoherent windows that exceed the threshold of 
 # displaces the height in the middle by about as much as it makes the window rough. Half the value
 # masks a fifth of simulated dunes, twice the value adds less than 1 % to the valid pixels.
 _MOST_ROUGHNESS = 3.0
+_LINEAR_RAD = 0.15  # roughness as a phase, up to which the fit of a plane is almost linear
 # Variance in the middle of a window relative to that of an evenly lit one. It is 4 at the edge of a
 # shadow, beyond which a plane would be extrapolated.
 _MOST_GROWTH = 3.0
@@ -120,7 +121,11 @@ def refine(
         valid &= coherence >= np.maximum(task.least_coherence, noise_coherence(seen, _FALSE_ALARM))
         valid &= np.abs(planes.height_m - first_m) < _CREDIBLE * task.ambiguity_m
         valid &= planes.growth < _MOST_GROWTH * level_growth
-        valid &= planes.roughness_m < _MOST_ROUGHNESS * sd_m
+        # Without noise, the sweep's heights are rougher than the deviation. Filling their windows
+        # would make steps, which make the neighbours rough in turn.
+        smooth_m = _MOST_ROUGHNESS * sd_m
+        usable = valid & (planes.roughness_m < np.maximum(smooth_m, _LINEAR_RAD / np.abs(rad_m)))
+        valid &= planes.roughness_m < smooth_m
         change = np.abs(planes.height_m - relief_m) / sd_m
         # The median is not affected by the few pixels beside steps of the relief.
         correction = float(np.median(change[valid])) / _MEDIAN if valid.any() else 0.0
@@ -132,7 +137,7 @@ def refine(
         progress(done)
         if found.converged:
             break
-        relief_m = filled(planes.height_m, valid)
+        relief_m = filled(planes.height_m, usable)
         slope_m = np.stack([planes.row_slope_m, planes.column_slope_m])
     return found
 

@@ -78,6 +78,8 @@ class ExportOptions:
         used, what = self._used_by_heights(suffix) if of_heights else self._used(suffix)
         unused = [name for name in self.given if name not in used]
         if unused:
+            if unused[0] == "pixel_m" and "north_up" in used:
+                what += " without north_up"
             raise ValueError(f"{unused[0]} must be left out, since it has no effect on {what}")
 
     def _used(self, suffix: str) -> tuple[set[str], str]:
@@ -93,7 +95,7 @@ class ExportOptions:
         kind = self.kind or "db"
         used = _ORIGIN | {"kind", "north_up"}
         used |= {"8bit": _COLOURS, "complex": set()}.get(kind, {"reference"})
-        return self._used_by_resampling(used, f"{suffix} of kind {kind!r}")
+        return self._with_pixel_m(used), f"{suffix} of kind {kind!r}"
 
     def _used_by_heights(self, suffix: str) -> tuple[set[str], str]:
         """Return the same of a format of heights, whose numbers are neither levels nor complex."""
@@ -102,10 +104,8 @@ class ExportOptions:
             return {"colour_map"}, what
         if suffix in netcdf.SUFFIXES:
             return {"lines"}, what
-        return self._used_by_resampling({"lines", "north_up"}, what)
+        return self._with_pixel_m({"lines", "north_up"}), what
 
-    def _used_by_resampling(self, used: set[str], what: str) -> tuple[set[str], str]:
-        """Return options of a GeoTIFF and its name, completed by whether it is resampled."""
-        if self.north_up:
-            return used | {"pixel_m"}, what
-        return used, f"{what} without north_up"
+    def _with_pixel_m(self, used: set[str]) -> set[str]:
+        """Return the options of a GeoTIFF, with `pixel_m` if it is resampled."""
+        return used | {"pixel_m"} if self.north_up else used

@@ -194,7 +194,7 @@ def time_and_axes(
     Raises
     ------
     ValueError
-        If no line reaches the middle of the grid.
+        If no line reaches the middle of the grid, or all see it from one direction.
     """
     lengths_m = np.linalg.norm(raster.vectors_m(), axis=1)
     sides = (np.linspace(0, n - 1, _PIXELS) for n in raster.shape)
@@ -231,6 +231,11 @@ def time_and_axes(
         amplitude = np.multiply.outer(weight, collection.amplitude).ravel()
         amplitude, edges = np.histogram(cycles, _BINS, weights=amplitude)
         width_m = half_power_width((edges[:-1] + edges[1:]) / 2, amplitude)
+        if not np.isfinite(width_m):
+            raise ValueError(
+                "lines must resolve the middle of the image for SICD: those within the beam see it "
+                "from one direction only"
+            )
         axes.append(
             Axis(
                 step_m=float(step_m),

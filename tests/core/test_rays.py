@@ -1,3 +1,5 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 from bent import shot, travel_times
@@ -149,3 +151,17 @@ def test_tables_keep_their_error(heights):
 
 def test_shadows_have_no_table():
     assert RayTable.of(gradient(1.0), -10.0, (100.0, 250.0), (-22.0, -21.0)) is None
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_depths():
+    depth_m = np.linspace(0, 40, 20_001)
+    cast = SoundSpeed(depth_m, 1500 + np.sin(depth_m))
+    distance_m = np.linspace(1, 30, 500)
+    tracemalloc.start()
+    found = rays(cast, distance_m, -5, -30)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 700e6  # 1.2 GB if all rays are computed together
+    alone = rays(cast, distance_m[-1], -5, -30)
+    assert found.time_s[-1] == pytest.approx(alone.time_s, rel=1e-15)

@@ -70,6 +70,7 @@ def test_csv_with_speeds_or_what_they_follow_from(tmp_path):
         ("depth,speed_m_s\n0,1500\n", "unknown column 'depth'.*depth_m"),
         ("depth_m,speed_m_s,salinity\n0,1500,35\n", "must have the columns"),
         ("depth_m,speed_m_s\n0,1500\n1,fast\n", "line 3 must be 2 numbers, got '1,fast'"),
+        ("depth_m,temperature_c,salinity\n0,25,35\n26\n", "line 3 must be 3 numbers, got '26'"),
         ("depth_m,speed_m_s\n0,4900\n10,4900\n", "cast.csv: speed_m_s .* feet per second"),
     ],
 )
@@ -77,6 +78,13 @@ def test_csv_that_is_no_profile(text, message, tmp_path):
     path = tmp_path / "cast.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
+        read_sound_speed(path)
+
+
+def test_csv_that_is_not_utf_8(tmp_path):
+    path = tmp_path / "cast.csv"
+    path.write_bytes("depth_m,speed_m_s\n0,1500\n".encode("utf-16"))
+    with pytest.raises(ValueError, match=r"cast.csv must be text in UTF-8, got the byte 0xff at"):
         read_sound_speed(path)
 
 

@@ -65,6 +65,23 @@ def test_looks_do_not_depend_on_a_carrier():
     assert effective_looks(turned, window) == pytest.approx(effective_looks(images, window))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_looks_of_images_smaller_than_a_resolution_cell(seed):
+    alike = tuple(speckle(np.random.default_rng(seed), 2, 800, 800, 0.01)[:, :21, :21])
+    assert effective_looks(alike, Window(21, 21)) < 2.5
+
+
+def test_looks_of_a_window_as_large_as_the_images():
+    random = np.random.default_rng(7)
+    images = speckle(random, 2, 1600, 1600, 0.05)
+    window = Window(41, 41)
+    expected = effective_looks(tuple(images), window)
+    assert 4 < expected < 8
+    tiles = images[:, :1558, :1558].reshape(2, 38, 41, 38, 41).swapaxes(2, 3).reshape(2, -1, 41, 41)
+    found = np.median([effective_looks((a, b), window) for a, b in tiles.swapaxes(0, 1)])
+    assert expected < found < 1.7 * expected  # a few samples do not show their correlation exactly
+
+
 def test_looks_of_images_without_echoes():
     nothing = np.zeros((30, 30), np.complex64)
     assert effective_looks((nothing, nothing), Window(5, 5)) == 1.0

@@ -232,6 +232,16 @@ def test_banks_in_the_other_order_give_the_same_heights():
     assert np.abs(one.height_m - other.height_m)[both].max() < 0.5 * one.sd_m[both].max()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("slope", [-0.25, 0.3])
+def test_slopes_without_noise_are_not_masked(slope):
+    def relief(x, y):
+        return slope * (y - 31.8) + 0 * x
+
+    result = heights(*banks(relief, snr_db=None), GRID, search_m=(-0.7, 0.7))
+    assert result.mask.mean() > 0.95
+
+
 def test_planes_and_georeferences_carry_over():
     first, second = flat_banks()
     place = clsas.Georeference.local(60.39, 5.32, heading_deg=90)
@@ -276,6 +286,17 @@ class TestBadInput:
         _, second = flat_banks()
         self.refused("same carrier_hz", b=replace(second, carrier_hz=90e3))
 
+    def test_other_water(self):
+        first, second = flat_banks()
+        profile = clsas.SoundSpeed([0, 30], [1500, 1490], 20.0)
+        other = clsas.SoundSpeed([0, 30], [1500, 1480], 20.0)
+        refused = "same sound_speed.*None and SoundSpeed"
+        self.refused(refused, b=replace(second, sound_speed=profile))
+        self.refused(
+            "same sound_speed", replace(first, sound_speed=profile),
+            replace(second, sound_speed=other),
+        )  # fmt: skip
+
     def test_silence(self):
         first, _ = flat_banks()
         self.refused("b must contain echoes", b=replace(first, samples=0 * first.samples))
@@ -294,6 +315,8 @@ class TestBadInput:
     def test_search(self):
         self.refused("must end below the sonar, which is 12 m", search_m=(-1, 12.5))
         self.refused("within the range of the lines", search_m=(-60, 1))
+        self.refused("must end below the sonar", search_m=(-1e6, 1e6))
+        self.refused("within the range of the lines", search_m=(-1e6, 1))
         self.refused("lowest, highest", search_m=(1, -1))
         self.refused("search_m must have shape", search_m=(1, 2, 3))
         self.refused("search_m must be finite", search_m=(np.nan, 1))

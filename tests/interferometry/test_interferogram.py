@@ -65,6 +65,16 @@ def test_images_on_other_grids_are_refused(change, match):
         interferogram(*change(*images(np.random.default_rng(6), 0.9, 1.0)), window_m=0.1)
 
 
+def test_windows_of_a_single_row_are_rows():
+    row = GRID.window(slice(1))
+    found = interferogram(*images(np.random.default_rng(8), 0.9, 1.0, row), window_m=0.21)
+    assert np.median(found.looks) == pytest.approx(21, rel=0.3)
+    assert np.median(found.phase_rad) == pytest.approx(1.0, abs=0.1)
+    pixel = GRID.window(slice(1), slice(1))
+    with pytest.raises(ValueError, match="more than one pixel"):
+        interferogram(*images(np.random.default_rng(8), 0.9, 1.0, pixel), window_m=0.21)
+
+
 def test_windows_that_cannot_be_are_refused():
     a, b = images(np.random.default_rng(7), 0.9, 1.0)
     with pytest.raises(ValueError, match="window_m must contain at least 4 independent samples"):

@@ -188,7 +188,7 @@ def test_what_heights_cannot_become_is_refused(tmp_path):
     points = clsas.Grid.points(image.grid.positions_m(), georeference=UTM_NORTH)
     scattered = replace(heights, image=clsas.Image(image.pixels, points))
     for source, name, how, message in (
-        (heights, "a.tif", {"kind": "complex"}, r"kind must be left out, .* on \.tif of heights"),
+        (heights, "a.tif", {"kind": "complex"}, r"kind must be left out, .* on \.tif of heights$"),
         (heights, "a.tif", {"kind": "8bit"}, "kind must be left out"),
         (heights, "a.tif", {"reference": 1.0}, "reference must be left out"),
         (heights, "a.tif", {"pixel_m": 1.0}, "pixel_m must be left out, .* without north_up"),

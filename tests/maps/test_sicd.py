@@ -347,6 +347,14 @@ def test_options_without_effect_are_refused(tmp_path):
         clsas.export(image, tmp_path / "a.nitf", lines=lines, beam=3.0)
 
 
+def test_a_beam_of_a_single_ping_is_refused(tmp_path):
+    image, lines = image_of(local(0.0)), lines_of(local(0.0))
+    beam = clsas.BeamWindow(0.02, along=[1, 0, 0])
+    with pytest.raises(ValueError, match="lines must resolve the middle of the image"):
+        clsas.export(image, tmp_path / "a.nitf", lines=lines, beam=beam)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_heights_above_another_surface_cause_a_warning(tmp_path):
     place = replace(local(0.0), vertical_datum="NN2000")
     with pytest.warns(clsas.ClsasWarning, match="heights above NN2000 are written as heights"):
