@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
+from functools import partial
+from pathlib import Path
 
-import numpy as np
-
-from clsas.core import reading, validate
+from clsas.core import validate
 from clsas.core.sound_speed import SoundSpeed
+from clsas.files.csv_columns import read_columns
 from clsas.files.mistakes import suggestion
 from clsas.files.tables import located
 
@@ -45,13 +44,17 @@ def read_sound_speed(path: str | os.PathLike, *, surface_z_m: float = 0.0) -> So
     >>> profile = clsas.read_sound_speed("cast.csv", surface_z_m=20.0)  # doctest: +SKIP
     """
     path = validate.path("path", path)
-    text = reading.read_text(path)
-    reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
-    try:
-        names = [name.strip() for name in next(reader, [])]
-        rows = [(reader.line_num, row) for row in reader if row]
-    except csv.Error as error:
-        raise ValueError(f"{path}: line {reader.line_num} is not CSV: {error}") from None
+    column = read_columns(path, partial(_check_names, path), "depths")
+    with located(f"{path}:"):
+        if "speed_m_s" in column:
+            return SoundSpeed(column["depth_m"], column["speed_m_s"], surface_z_m)
+        return SoundSpeed.from_temperature(
+            *(column[name] for name in _DERIVED), surface_z_m=surface_z_m
+        )
+
+
+def _check_names(path: Path, names: list[str]) -> None:
+    """Raise ValueError unless the names of columns are those of one kind of file."""
     known = tuple(dict.fromkeys((*_MEASURED, *_DERIVED)))
     for name in names:
         if name not in known:
@@ -62,22 +65,4 @@ def read_sound_speed(path: str | os.PathLike, *, surface_z_m: float = 0.0) -> So
         raise ValueError(
             f"{path} must have the columns {', '.join(_MEASURED)} or {', '.join(_DERIVED)}, got "
             f"{', '.join(names)}"
-        )
-    if not rows:
-        raise ValueError(f"{path} must have depths below the names of the columns")
-    values = np.empty((len(rows), len(names)))
-    for index, (line, row) in enumerate(rows):
-        try:
-            values[index] = [float(value) for _, value in zip(names, row, strict=True)]
-        except ValueError:
-            got = validate.shown(",".join(row))
-            raise ValueError(
-                f"{path}: line {line} must be {len(names)} numbers, got {got}"
-            ) from None
-    column = dict(zip(names, values.T, strict=True))
-    with located(f"{path}:"):
-        if "speed_m_s" in column:
-            return SoundSpeed(column["depth_m"], column["speed_m_s"], surface_z_m)
-        return SoundSpeed.from_temperature(
-            *(column[name] for name in _DERIVED), surface_z_m=surface_z_m
         )

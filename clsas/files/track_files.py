@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from clsas.core import reading, validate
+from clsas.core import validate
 from clsas.core.georeference import Georeference
+from clsas.files.csv_columns import read_columns
 from clsas.files.mistakes import suggestion
 from clsas.files.tables import located
 from clsas.sonar.track import Track
@@ -48,7 +47,7 @@ def read_track(path: str | os.PathLike, georeference: Georeference | None = None
     OSError
         If the file cannot be read.
     """
-    column = _columns(path)
+    column = read_columns(path, partial(_check_names, path), "at least one ping")
     with located(f"{path}:"):
         if set(column) & set(_GEOGRAPHIC):
             return Track.from_geographic(**column, georeference=georeference)
@@ -66,30 +65,6 @@ def read_track(path: str | os.PathLike, georeference: Georeference | None = None
         if track.pings > 1:
             return replace(track, velocity_m_s=np.gradient(positions, track.time_s, axis=0))
         return track
-
-
-def _columns(path: str | os.PathLike) -> dict[str, NDArray[np.float64]]:
-    """Return the columns of a file by their names, which are those of one of both kinds."""
-    text = reading.read_text(path)
-    reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
-    try:
-        names = [name.strip() for name in next(reader, [])]
-        rows = [(reader.line_num, row) for row in reader if row]
-    except csv.Error as error:
-        raise ValueError(f"{path}: line {reader.line_num} is not CSV: {error}") from None
-    _check_names(path, names)
-    if not rows:
-        raise ValueError(f"{path} must have at least one ping below the names of the columns")
-    values = np.empty((len(rows), len(names)))
-    for index, (line, row) in enumerate(rows):
-        try:
-            values[index] = [float(value) for _, value in zip(names, row, strict=True)]
-        except ValueError:
-            got = validate.shown(",".join(row))
-            raise ValueError(
-                f"{path}: line {line} must be {len(names)} numbers, got {got}"
-            ) from None
-    return dict(zip(names, values.T, strict=True))
 
 
 def _check_names(path: str | os.PathLike, names: list[str]) -> None:

@@ -72,9 +72,7 @@ def _relief(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def _banks(x_m: tuple[float, float], y_m: tuple[float, float]) -> list[clsas.RangeLines]:
     """Return the lines of both banks."""
-    beyond = np.array([-1.0, 1.0])
-    wide_x, wide_y = x_m + beyond, y_m + beyond
-    x, y = (np.arange(*each, 0.04) for each in (wide_x, wide_y))
+    x, y = (np.arange(first - 1.0, last + 1.0, 0.04) for first, last in (x_m, y_m))
     heights_m = _relief(*np.meshgrid(x, y))
     seabed = clsas.Seabed((x[0], x[-1]), (y[0], y[-1]), heights_m, density_m2=DENSITY_M2)
     points = clsas.PointTargets(*seabed.visible(Observer(np.array([0.0, 0.0, ALTITUDE_M]))))

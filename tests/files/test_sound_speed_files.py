@@ -127,3 +127,9 @@ def test_scenes_have_temperatures(tmp_path):
 def test_a_table_has_one_way_to_give_a_profile(keys, tmp_path):
     with pytest.raises(ValueError, match=r"\[sound_speed\] must have the keys file; or depth_m"):
         scene(tmp_path, f"[sound_speed]\n{keys}\n")
+
+
+def test_blank_lines_are_skipped(tmp_path):
+    path = tmp_path / "cast.csv"
+    path.write_text("\ndepth_m, speed_m_s\n\n0, 1500\n   \n20, 1490\n\n")
+    assert clsas.read_sound_speed(path).speed_m_s.tolist() == [1500, 1490]
