@@ -189,8 +189,6 @@ class TrackTable(Table):
                     raise ValueError(
                         f"must be readable: {error.strerror}: {folder / self.file}"
                     ) from None
-                except UnicodeDecodeError as error:
-                    raise ValueError(f"must be text: {folder / self.file}: {error}") from None
         course = ("start_m", "velocity_m_s", "pings", "ping_interval_s")
         for name in course:
             if getattr(self, name) is None:

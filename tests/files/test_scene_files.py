@@ -337,7 +337,8 @@ def test_bad_track_files(tmp_path, text, message):
 def test_a_track_file_that_is_no_text(tmp_path):
     (tmp_path / "track.csv").write_bytes(b"\xff\x00\xfe")
     told = refused("[track]\nfile = 'track.csv'", tmp_path)
-    assert "[track] file must be text" in told
+    assert "[track] file" in told
+    assert "must be text in UTF-8" in told
     assert "track.csv" in told
 
 
