@@ -14,7 +14,7 @@ from clsas.simulation.scenes import Observer
 SIDES = (512, 1024)
 PIXEL_M, NEAR_M, ALTITUDE_M, BASELINE_M = 0.01, 28.0, 12.0, 0.25
 CARRIER_HZ, BAND_HZ = 100e3, 30e3
-PINGS, APERTURE_M = 400, 16.0
+PINGS, APERTURE_M = 1000, 10.0  # 1 cm apart, so that no grating lobes fall into the scene
 SEARCH_M = (-3.0, 3.0)  # 20 heights at six per height of ambiguity
 DENSITY_M2 = 500.0
 TOLERANCE_DB = -40.0
