@@ -14,7 +14,7 @@ from clsas.cli import options
 from clsas.cli.inputs import load_lines, read_beam, read_grid
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, Parsed
-from clsas.core import validate
+from clsas.core import banks, validate
 from clsas.interferometry.checks import checked_coherence
 from clsas.interferometry.heights import LEAST_COHERENCE
 from clsas.processing import numbers
@@ -101,7 +101,7 @@ def heights(
                 else f"{first_file} must hold range lines of 2 receiver banks, got {lines.banks}: "
                 "take two of them by clsas convert --bank"
             )
-        first, second = lines.bank(0), lines.bank(1)
+        first, second = (lines.bank(number) for number in banks.present(lines.bank_numbers))
     else:
         first, second = (load_lines(each, None, described) for each in (first_file, second_file))
     with progress_bar("measuring heights") as progress:

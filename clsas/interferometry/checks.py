@@ -103,7 +103,8 @@ def check_geometry(
     """
     points_m = grid.spread(5)
     low_m, high_m = search_m
-    # The phase hardly changes far from the sonar, so an absurd search would look like no baseline.
+    # These come first: far from the sonar the phase hardly changes, so a search that reaches too
+    # far would be reported as a missing baseline.
     _check_below(baseline, points_m, search_m)
     _check_ranges(baseline, points_m, search_m)
     up = np.array([0.0, 0.0, 1.0])

@@ -1,4 +1,4 @@
-"""What heights are measured from, and what is known before any image is formed."""
+"""Inputs of a measurement of heights, with the geometry that follows from them."""
 
 from __future__ import annotations
 

@@ -71,6 +71,10 @@ def test_one_file_may_hold_both_banks(tmp_path):
     run("heights", tmp_path / "lines.h5", *given)
     found = clsas.load(output)
     assert np.nanmedian(np.abs(found.height_m)) < 3 * np.nanmedian(found.sd_m)
+    # Lines of two banks out of more keep their numbers.
+    clsas.save(tmp_path / "upper.h5", replace(both, bank_numbers=both.bank_numbers + 1))
+    run("heights", tmp_path / "upper.h5", *given)
+    assert np.array_equal(clsas.load(output).height_m, found.height_m, equal_nan=True)
     alone = run("heights", tmp_path / "low.h5", *given, code=1)
     assert "must hold range lines of 2 receiver banks, got 1" in alone.stderr
 
