@@ -161,6 +161,37 @@ class Lattice:
             np.stack(np.broadcast_arrays(*inside), axis=-1)
         )
 
+    def over(
+        self,
+        rows: NDArray[np.float64],
+        columns: NDArray[np.float64],
+        offset_m: NDArray[np.float64] | float,
+    ) -> NDArray[np.float64]:
+        """Return the quantities at all crossings of rows and columns, [quantities, n, m].
+
+        This is faster than `at`.
+
+        Parameters
+        ----------
+        rows, columns : float64 [n], [m]
+        offset_m : float64, broadcast to [n, m]
+        """
+        of_rows = interpolation(rows, self.rows)
+        of_columns = interpolation(columns, self.columns).T
+        found = np.zeros((self.values.shape[-1], len(rows), len(columns)))
+        for level, values in enumerate(np.moveaxis(self.values, 2, 0)):
+            unit = np.eye(len(self.offset_m))[level]
+            share = np.interp(offset_m, self.offset_m, unit)
+            if np.any(share):
+                found += share * (of_rows @ np.moveaxis(values, -1, 0) @ of_columns)
+        return found
+
+
+def interpolation(places: NDArray, known: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the matrix of linear interpolation from known places to others, [places, known]."""
+    unit = np.eye(len(known))
+    return np.stack([np.interp(places, known, each) for each in unit], axis=1)
+
 
 def lattice_pixels(grid: Grid) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the rows and columns of a lattice over a grid."""

@@ -46,6 +46,11 @@ class Pair:
         )  # fmt: skip
         return first, second
 
+    def within(self, tolerance_db: float) -> Pair:
+        """Return the pair with a tolerance of at least so many decibels."""
+        least_db = tolerance_db if self.tolerance_db is None else self.tolerance_db
+        return replace(self, tolerance_db=max(tolerance_db, least_db), accuracy_db=None)
+
     def straightened(self, grid: Grid) -> Pair:
         """Return the pair in homogeneous water, unchanged without a profile of the sound speed.
 

@@ -161,11 +161,11 @@ def sensitivity(
     sights : Lattice
     """
     _, row_step_m, column_step_m = grid.vectors_m
-    row, column = np.indices(grid.shape).astype(float)
-    found = sights.at(row, column, offset_m)
-    tilt = np.array([row_step_m[2], column_step_m[2]])[:, None, None]
-    facing = 1 - np.einsum("irc,rci->rc", slope_m + tilt, found[..., 1:])
-    return found[..., 0] / np.maximum(facing, _LEAST_FORESHORTENING), facing
+    rows, columns = map(np.arange, grid.shape)
+    rad_m, row_tangent, column_tangent = sights.over(rows, columns, offset_m)
+    facing = 1 - (slope_m[0] + row_step_m[2]) * row_tangent
+    facing -= (slope_m[1] + column_step_m[2]) * column_tangent
+    return rad_m / np.maximum(facing, _LEAST_FORESHORTENING), facing
 
 
 def filled(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -27,7 +27,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, maximum_filter1d
 
 from clsas.core.grid import Grid
-from clsas.interferometry.baseline import Baseline, Lattice, in_pixels, lattice_pixels
+from clsas.interferometry.baseline import (
+    Baseline,
+    Lattice,
+    in_pixels,
+    interpolation,
+    lattice_pixels,
+)
 from clsas.interferometry.coherence import Moments, Window
 from clsas.interferometry.pair import Pair
 
@@ -83,25 +89,21 @@ class Curves:
     def points_m(self, index: int) -> NDArray[np.float64]:
         """Return the positions of all curves at a height, float64 [rows, columns, 3]."""
         _, row_step_m, column_step_m = self.grid.vectors_m
-        shift = self._everywhere(index)
+        down, across, _ = self._everywhere(index)
         points_m = self.grid.positions_m()
-        points_m[..., :2] += shift[..., :1] * row_step_m[:2] + shift[..., 1:2] * column_step_m[:2]
+        for along, step_m in ((down, row_step_m), (across, column_step_m)):
+            points_m[..., :2] += along[..., None] * step_m[:2]
         points_m[..., 2] += self.offset_m[index]
         return points_m
 
     def rad_m(self, index: int) -> NDArray[np.float64]:
         """Return K of all curves at a height, rad/m, float64 [rows, columns]."""
-        return self._everywhere(index)[..., 2]
+        return self._everywhere(index)[2]
 
     def _everywhere(self, index: int) -> NDArray[np.float64]:
-        """Return the values of the lattice at every curve, at a height."""
-        weights = (
-            _interpolation(np.arange(n), known)
-            for n, known in zip(
-                self.grid.shape, (self.lattice.rows, self.lattice.columns), strict=True
-            )
-        )
-        return _spread(self.lattice.values[:, :, index], *weights)
+        """Return the values of the lattice at every curve, at a height, [3, rows, columns]."""
+        rows, columns = map(np.arange, self.grid.shape)
+        return self.lattice.over(rows, columns, self.offset_m[index])
 
     def through(
         self, index: int, rows: NDArray[np.float64], columns: NDArray[np.float64]
@@ -135,23 +137,9 @@ class Curves:
         for _ in range(3):
             curve = place - shift
             shift = level.at(curve[..., 0], curve[..., 1], 0.0)
-        weights = (_interpolation(each, known) for each, known in zip(inside, some, strict=True))
-        down, across = np.moveaxis(_spread(shift, *weights), -1, 0)
+        of_rows, of_columns = map(interpolation, inside, some)
+        down, across = of_rows @ np.moveaxis(shift, -1, 0) @ of_columns.T
         return inside[0][:, None] - down, inside[1] - across
-
-
-def _interpolation(places: NDArray, known: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the matrix of linear interpolation from known places to others, [places, known]."""
-    unit = np.eye(len(known))
-    return np.stack([np.interp(places, known, each) for each in unit], axis=1)
-
-
-def _spread(
-    values: NDArray[np.float64], of_rows: NDArray[np.float64], of_columns: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return values of a lattice, [n, m, quantities], interpolated to rows and columns."""
-    found = [of_rows @ each @ of_columns.T for each in np.moveaxis(values, -1, 0)]
-    return np.stack(found, axis=-1)
 
 
 def _traced(baseline: Baseline, grid: Grid, offset_m: NDArray[np.float64]) -> Lattice:
