@@ -179,11 +179,11 @@ class Lattice:
         of_rows = interpolation(rows, self.rows)
         of_columns = interpolation(columns, self.columns).T
         found = np.zeros((self.values.shape[-1], len(rows), len(columns)))
-        for level, values in enumerate(np.moveaxis(self.values, 2, 0)):
-            unit = np.eye(len(self.offset_m))[level]
+        levels = np.ascontiguousarray(self.values.transpose(2, 3, 0, 1))
+        for values, unit in zip(levels, np.eye(len(levels)), strict=True):
             share = np.interp(offset_m, self.offset_m, unit)
             if np.any(share):
-                found += share * (of_rows @ np.moveaxis(values, -1, 0) @ of_columns)
+                found += share * (of_rows @ values @ of_columns)
         return found
 
 

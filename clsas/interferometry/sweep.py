@@ -89,21 +89,21 @@ class Curves:
     def points_m(self, index: int) -> NDArray[np.float64]:
         """Return the positions of all curves at a height, float64 [rows, columns, 3]."""
         _, row_step_m, column_step_m = self.grid.vectors_m
-        down, across, _ = self._everywhere(index)
+        down, across, _ = self._at(self.offset_m[index])
         points_m = self.grid.positions_m()
         for along, step_m in ((down, row_step_m), (across, column_step_m)):
             points_m[..., :2] += along[..., None] * step_m[:2]
         points_m[..., 2] += self.offset_m[index]
         return points_m
 
-    def rad_m(self, index: int) -> NDArray[np.float64]:
-        """Return K of all curves at a height, rad/m, float64 [rows, columns]."""
-        return self._everywhere(index)[2]
+    def rad_m(self, offset_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return K of all curves at heights of their own, rad/m, float64 [rows, columns]."""
+        return self._at(offset_m)[2]
 
-    def _everywhere(self, index: int) -> NDArray[np.float64]:
-        """Return the values of the lattice at every curve, at a height, [3, rows, columns]."""
+    def _at(self, offset_m: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Return the values of the lattice at every curve, at heights, [3, rows, columns]."""
         rows, columns = map(np.arange, self.grid.shape)
-        return self.lattice.over(rows, columns, self.offset_m[index])
+        return self.lattice.over(rows, columns, offset_m)
 
     def through(
         self, index: int, rows: NDArray[np.float64], columns: NDArray[np.float64]
@@ -270,10 +270,8 @@ def sweep(
         progress(some[-1] + 1)
     best = likeliest(coherence, coarse)
     found = np.take_along_axis(coherence, best[None], axis=0)[0].astype(np.complex128)
-    rad_m = np.empty(grid.shape)
-    for level in np.unique(best):
-        rad_m[best == level] = curves.rad_m(level)[best == level]
-    return Sweep(curves, offset_m[best] - np.angle(found) / rad_m, np.abs(found))
+    at_m = offset_m[best]
+    return Sweep(curves, at_m - np.angle(found) / curves.rad_m(at_m), np.abs(found))
 
 
 def likeliest(coherence: NDArray[np.complex64], coarse: Window) -> NDArray[np.intp]:
