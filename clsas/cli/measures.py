@@ -215,7 +215,8 @@ def bench(
     Without CASE, all cases run, which takes minutes. Cases bp-... form an image exactly. Cases
     ffbp-... form a factorized image, and compare it with the exact one. mosaic-wreck forms a
     mosaic, and compares it with exact images with and without a beam; its lines are simulated once,
-    which takes minutes. With --json, the results of each case are one line.
+    which takes minutes. Cases heights... measure heights from two banks, and compare their time
+    with that of one image. With --json, the results of each case are one line.
 
     \b
     Example:  clsas bench ffbp-2k --tolerance-db -40 --json
@@ -227,6 +228,7 @@ def bench(
     measures = dict.fromkeys(cases.EXACT_CASES, benchmark.run)
     measures |= dict.fromkeys(cases.FACTORIZED_CASES, benchmark.run_factorized)
     measures |= dict.fromkeys(cases.MOSAIC_CASES, benchmark.run_mosaic)
+    measures |= dict.fromkeys(cases.HEIGHTS_CASES, benchmark.run_heights)
     if case is not None:
         _one_of(case, measures)
         if (tolerance_db if case in cases.EXACT_CASES else accuracy_db) is not None:

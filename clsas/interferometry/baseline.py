@@ -163,8 +163,8 @@ class Lattice:
 
     def over(
         self,
-        rows: NDArray[np.float64],
-        columns: NDArray[np.float64],
+        rows: NDArray,
+        columns: NDArray,
         offset_m: NDArray[np.float64] | float,
     ) -> NDArray[np.float64]:
         """Return the quantities at all crossings of rows and columns, [quantities, n, m].
@@ -173,7 +173,7 @@ class Lattice:
 
         Parameters
         ----------
-        rows, columns : float64 [n], [m]
+        rows, columns : array [n], [m]
         offset_m : float64, broadcast to [n, m]
         """
         of_rows = interpolation(rows, self.rows)

@@ -1,4 +1,4 @@
-"""Benchmarks: speed and accuracy of imaging on a device, for the built-in cases."""
+"""Benchmarks: speed and accuracy of images and heights on a device, for the built-in cases."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.image import Image
@@ -16,6 +18,9 @@ from clsas.core.lines import RangeLines
 from clsas.exact import reference
 from clsas.exact.backprojection import form_exactly, prepare
 from clsas.exact.run import execute
+from clsas.interferometry.heights import heights
+from clsas.interferometry.refinement import PASSES
+from clsas.interferometry.result import Heights
 from clsas.measures.tradeoff import REFERENCE_DB
 from clsas.mosaics.mosaic import mosaic
 from clsas.mosaics.store import Record
@@ -25,7 +30,7 @@ from clsas.planning.imager import Imager
 from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
-from clsas.trials import cases, wreck
+from clsas.trials import cases, dunes, wreck
 from clsas.trials.cases import Case
 from clsas.trials.dense_cases import DenseCase
 
@@ -293,6 +298,85 @@ def run_mosaic(
         "predicted_error_db": max(predicted),
         "shadow_contrast_db": contrast_db,
         "shadow_contrast_difference_db": contrast_db - reference_db,
+    }
+
+
+def run_heights(
+    case: str = "heights",
+    *,
+    device: Device | str | int | None = None,
+    tolerance_db: float = -40.0,
+    repeats: int = 3,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Return speed and errors of heights from two banks, and the time of one image.
+
+    Parameters
+    ----------
+    case : str
+        One of `clsas.trials.cases.HEIGHTS_CASES`.
+    device : Device, str or int, optional
+        See `clsas.opencl.device.choose`.
+    tolerance_db : float
+        Requested tolerance of the images, see `clsas.heights`.
+    repeats : int
+        As for `run_factorized`.
+    progress : callable, optional
+        Called as progress(rounds done, rounds).
+
+    Returns
+    -------
+    dict
+        Results as JSON types.
+
+        - `seconds`: time of `clsas.heights` including all plans, of which `sweep_seconds` and
+          `refinement_seconds` are parts.
+        - `image_seconds`: time of a factorized image of one bank on the plane, planned before.
+        - `images`: median of `seconds` in such images.
+        - `error_m`, `deviation_m`: rms error of the valid heights, and rms of their stated
+          deviations.
+        - `valid_share`: share of the pixels with a valid height.
+    """
+    validate.one_of("case", case, tuple(cases.HEIGHTS_CASES))
+    pixels = cases.HEIGHTS_CASES[case]
+    device = open_device(device)
+    grid, banks = dunes.grid(pixels), dunes.banks(pixels)
+    runs: list[tuple[Heights, float, float]] = []
+
+    def measure() -> None:
+        steps: list[tuple[int, float]] = []
+        start = time.perf_counter()
+        found = heights(
+            *banks, grid, search_m=dunes.SEARCH_M, tolerance_db=tolerance_db, device=device,
+            progress=lambda done, total: steps.append((total - done, time.perf_counter())),
+        )  # fmt: skip
+        swept = next(at for left, at in steps if left <= PASSES)
+        runs.append((found, swept - start, time.perf_counter() - swept))
+
+    with Imager(banks[0], grid, tolerance_db=tolerance_db, device=device) as imager:
+        image = partial(imager, banks[0])
+        methods: list[tuple[str, Callable[[], object]]] = [
+            ("seconds", measure),
+            *_FAST_RUNS * [("image_seconds", image)],
+        ]
+        taken = _in_turns(methods, repeats, progress)
+    found = runs[-1][0]
+    _, sweeps, refinements = zip(*runs[-repeats:], strict=True)
+    error_m = (found.height_m - dunes.relief_m(*np.meshgrid(*grid.axes_m)))[found.mask]
+    return {
+        "case": case,
+        "device": device.info.label,
+        "driver": device.info.driver,
+        "channels": banks[0].channels,
+        "pixels": list(grid.shape),
+        "tolerance_db": tolerance_db,
+        **taken,
+        "sweep_seconds": statistics.median(sweeps),
+        "refinement_seconds": statistics.median(refinements),
+        "images": taken["seconds"]["median"] / taken["image_seconds"]["median"],
+        "error_m": float(np.sqrt(np.mean(error_m**2))),
+        "deviation_m": float(np.sqrt(np.mean(found.sd_m[found.mask] ** 2))),
+        "valid_share": float(found.mask.mean()),
     }
 
 

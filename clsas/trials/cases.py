@@ -121,6 +121,9 @@ FACTORIZED_CASES: dict[str, Case | DenseCase] = {
 MOSAIC_CASES = {"mosaic-wreck": (4096, BeamWindow(5.0, "hann"))}
 """Cases of mosaics of the wreck (`clsas.trials.wreck`): pixels along each side, and the beam."""
 
+HEIGHTS_CASES = {"heights-512": 512, "heights": 1024}
+"""Cases of heights from two banks (`clsas.trials.dunes`): pixels along each side."""
+
 
 def scaled(size: int) -> Case:
     """Return ffbp-2k with `size` channels and `size` x `size` pixels over the same area.

@@ -3,14 +3,18 @@
 import pytest
 from studies import relief
 
+from clsas.trials import cases, dunes
+
 
 @pytest.mark.slow
 def test_heights_err_as_much_as_they_say(monkeypatch):
-    monkeypatch.setattr(relief, "SIDES", (128,))
-    monkeypatch.setattr(relief, "SEARCH_M", (-1.0, 1.0))
+    monkeypatch.setattr(cases, "HEIGHTS_CASES", {"small": 128})
+    monkeypatch.setattr(dunes, "SEARCH_M", (-1.0, 1.0))
     (row,) = relief.rows("pocl")
     found = dict(zip(relief.COLUMNS, row, strict=True))
     assert found["pixels"] == "128 x 128"
     assert float(found["valid %"]) > 70
     assert float(found["rms error mm"]) < 1.5 * float(found["rms deviation mm"])
-    assert min(float(found[name]) for name in ("image s", "sweep s", "refinement s")) > 0
+    parts = [float(found[name]) for name in ("image s", "sweep s", "refinement s")]
+    assert min(parts) > 0
+    assert float(found["heights over image"]) == pytest.approx(sum(parts[1:]) / parts[0], rel=0.3)

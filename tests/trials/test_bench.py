@@ -10,7 +10,7 @@ from stored_tables import printed
 from studies import tables
 
 from clsas.sonar.beam import BeamWindow
-from clsas.trials import bench, cases
+from clsas.trials import bench, cases, dunes
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "bench"
 SMALL = cases.Case(200, 8.25e-3, 1e6, 100e3, (-0.3, 0.3), (40.0, 40.6), 128)
@@ -86,6 +86,22 @@ def test_factorized_against_exact(beam, monkeypatch):
     assert json.loads(json.dumps(result)) == result
 
 
+@pytest.mark.slow
+def test_heights_against_one_image(monkeypatch):
+    monkeypatch.setitem(cases.HEIGHTS_CASES, "small", 128)
+    monkeypatch.setattr(dunes, "SEARCH_M", (-1.0, 1.0))
+    seen = []
+    result = bench.run_heights("small", repeats=1, progress=lambda *done: seen.append(done))
+    assert seen == [(1, 1)]
+    assert result["pixels"] == [128, 128]
+    assert result["valid_share"] > 0.7
+    assert 0.7 < result["error_m"] / result["deviation_m"] < 1.4
+    parts = result["sweep_seconds"] + result["refinement_seconds"]
+    assert result["seconds"]["median"] == pytest.approx(parts, rel=1e-3)
+    assert result["images"] == pytest.approx(parts / result["image_seconds"]["median"], rel=1e-3)
+    assert json.loads(json.dumps(result)) == result
+
+
 def test_unknown_cases_are_refused():
     with pytest.raises(
         ValueError, match=r"case must be one of 'bp-thesis', 'bp-2k', got 'ffbp-2k'"
@@ -93,6 +109,8 @@ def test_unknown_cases_are_refused():
         bench.run("ffbp-2k")
     with pytest.raises(ValueError, match=r"case must be one of 'ffbp-thesis', .* got 'bp-2k'"):
         bench.run_factorized("bp-2k")
+    with pytest.raises(ValueError, match=r"case must be one of 'heights-512', 'heights', got 'h'"):
+        bench.run_heights("h")
 
 
 def test_scaling_fits_exponents_and_writes_them(monkeypatch, tmp_path, capsys):
