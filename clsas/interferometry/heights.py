@@ -95,7 +95,8 @@ def heights(
         Side of the windows in which the coherence is estimated, metres. It is the resolution of the
         heights. By default windows contain about 50 independent samples.
     tolerance_db : float
-        Largest relative rms error of the images, dB, as for `factorize`.
+        Largest relative rms error of the images on the relief, dB, as for `factorize`. Images of
+        the sweep may have an error of -30 dB.
     least_coherence : float
         Smallest coherence of a valid height, 0.1 to 0.99.
     beam : BeamWindow, optional
