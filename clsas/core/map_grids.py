@@ -85,6 +85,15 @@ def north_up(place: Georeference, grid: Grid, pixel_m: float | None = None) -> G
     if pixel_m is None:
         pixel_m = min(math.hypot(turn[0], turn[3]), math.hypot(turn[1], turn[4]))
     pixel_m = validate.positive("pixel_m", pixel_m, "m")
+    across_m = max(
+        n * float(np.linalg.norm(step_m))
+        for n, step_m in zip(grid.shape, (row_step_m, column_step_m), strict=True)
+    )
+    if pixel_m > across_m:
+        raise ValueError(
+            f"pixel_m must be at most the longer side of the grid, {across_m:.4g} m, got "
+            f"{pixel_m:.4g} m"
+        )
     left, bottom, rows, columns = cover(grid.shape, turn, pixel_m)
     validate.memory("pixel_m", 8 * rows * columns)
     first_m = place.from_map([(left + 0.5) * pixel_m, (bottom + 0.5) * pixel_m, 0.0])
@@ -152,7 +161,7 @@ def cover(
     # Rounding must not add a row or column of pixels that see nothing.
     left, bottom = (math.floor(min(each) / pixel_m + 1e-6) for each in (east, north))
     right, top = (math.ceil(max(each) / pixel_m - 1e-6) for each in (east, north))
-    return left, bottom, top - bottom, right - left
+    return left, bottom, max(top - bottom, 1), max(right - left, 1)
 
 
 def _turned(step: NDArray[np.float64]) -> NDArray[np.float64]:

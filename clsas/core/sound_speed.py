@@ -337,7 +337,7 @@ def _check_speeds(depth: NDArray[np.float64], speed: NDArray[np.float64]) -> Non
     at = int(steepness.argmax())
     if steepness[at] > STEEPEST_PER_S:
         raise ValueError(
-            f"speed_m_s must change by at most {STEEPEST_PER_S:g} m/s per metre of depth, got "
+            f"speed_m_s must change by at most {STEEPEST_PER_S:g} m/s per metre of depth_m, got "
             f"{speed[at]:g} m/s at {depth[at]:g} m and {speed[at + 1]:g} m/s at {depth[at + 1]:g} "
             "m: remove the outlier"
         )

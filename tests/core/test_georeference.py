@@ -162,3 +162,12 @@ def test_a_north_up_grid_covers_the_grid_along_the_map(place):
         shift, [0, 1, 0.1], [1, 0, 0], (2, 2), georeference=place)):  # fmt: skip
         with pytest.raises(ValueError, match="grid must be a horizontal plane"):
             place.north_up(other)
+
+
+def test_pixels_of_a_north_up_grid_are_no_larger_than_the_grid():
+    place = clsas.Georeference.local(60.0, 5.0, heading_deg=30.0)
+    grid = clsas.Grid.plane((0.0, 9.0, 10), (0.0, 4.0, 5), georeference=place)
+    assert min(place.north_up(grid, 10.0).shape) >= 1
+    for pixel_m in (10.1, 1e12, 1e300):
+        with pytest.raises(ValueError, match="pixel_m must be at most the longer side of the grid"):
+            place.north_up(grid, pixel_m)

@@ -63,7 +63,10 @@ def test_the_mean_speed_is_that_of_the_time(one, other):
         (([0, 10], [4921, 4900]), "look like feet per second, multiply them by 0.3048"),
         (([0, 10], [1.5, 1.49]), "look like kilometres per second, multiply them by 1000"),
         (([0, 10], [343, 343]), "must be that of water, 1300 to 1800 m/s, got 343 to 343 m/s$"),
-        (([0, 1, 2], [1500, 1400, 1500]), "at most 60 m/s per metre .* remove the outlier"),
+        (
+            ([0, 1, 2], [1500, 1400, 1500]),
+            "at most 60 m/s per metre of depth_m.* remove the outlier",
+        ),
         (([0, 10], [1500]), r"speed_m_s must have shape \(2\)"),
         (([0, 10], [1500, np.nan]), "speed_m_s must be finite"),
         (([0, 10], [1500, 1500], np.inf), "surface_z_m must be finite"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 
@@ -36,9 +35,9 @@ def pictures(folder: Path) -> dict[str, Call]:
     )
     volume = clsas.Image(np.arange(60.0).reshape(box.shape) + 1j, box)
     figure = plot.image_db(image)
-    zero = np.zeros(s.grid.shape)
-    fringes = SimpleNamespace(grid=s.grid, phase_rad=zero, coherence=zero)
-    relief = SimpleNamespace(image=image, height_m=zero, sd_m=zero, mask=zero == 0)
+    one = np.ones(image.shape)
+    fringes = clsas.interferogram(image, image, window_m=0.5)
+    relief = clsas.Heights(one, 0.1 * one, 0.9 * one, one > 0, 25 * one, one, image, 0.3)
     return {
         "plot.image": Call(
             plot.image,
