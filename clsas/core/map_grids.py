@@ -85,17 +85,18 @@ def north_up(place: Georeference, grid: Grid, pixel_m: float | None = None) -> G
     if pixel_m is None:
         pixel_m = min(math.hypot(turn[0], turn[3]), math.hypot(turn[1], turn[4]))
     pixel_m = validate.positive("pixel_m", pixel_m, "m")
-    across_m = max(
+    sides_m = [
         n * float(np.linalg.norm(step_m))
         for n, step_m in zip(grid.shape, (row_step_m, column_step_m), strict=True)
-    )
+    ]
+    across_m = max(sides_m)
     if pixel_m > across_m:
         raise ValueError(
             f"pixel_m must be at most the longer side of the grid, {across_m:.4g} m, got "
             f"{pixel_m:.4g} m"
         )
+    validate.memory("pixel_m", 8 * (sides_m[0] / pixel_m) * (sides_m[1] / pixel_m))
     left, bottom, rows, columns = cover(grid.shape, turn, pixel_m)
-    validate.memory("pixel_m", 8 * rows * columns)
     first_m = place.from_map([(left + 0.5) * pixel_m, (bottom + 0.5) * pixel_m, 0.0])
     first_m[2] = origin_m[2]
     steps_m = np.zeros((2, 3))  # of columns to the east, and of rows to the north
