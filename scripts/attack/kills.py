@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -37,6 +38,7 @@ from clsas.mosaics.levels import patch_arrays
 KILLS_PER_STORE = 10
 ORPHANS_S = 60  # after which workers whose main process was killed must have ended
 DEADLINE_S = 600  # for one run
+WRITTEN = re.compile(rb"20\d\d-?\d\d-?\d\dT?\d\d:?\d\d:?\d\d")
 
 
 class Miss(Exception):
@@ -266,9 +268,13 @@ def attack_export(
 
 
 def contents(path: Path) -> dict[str, bytes]:
-    """Return the contents of a file, or of the files in a folder, by their names."""
+    """Return the contents of a file, or of the files in a folder, by their names.
+
+    The times at which a SICD file was written are left out.
+    """
     files = [each for each in path.rglob("*") if each.is_file()] if path.is_dir() else [path]
-    return {str(each.relative_to(path)): each.read_bytes() for each in files}
+    read = {str(each.relative_to(path)): each.read_bytes() for each in files}
+    return {name: WRITTEN.sub(b"", each) for name, each in read.items()}
 
 
 def write_radar_image(folder: Path) -> tuple[Path, Path]:
