@@ -159,7 +159,8 @@ def grid_mapping(place: Georeference) -> dict[str, Any]:
         for field in fields(place)
         if getattr(place, field.name) is not None
     }
-    return {**of_map, "spatial_ref": of_map["crs_wkt"], **fields_given}
+    words = {"long_name": "Coordinate reference system", "spatial_ref": of_map["crs_wkt"]}
+    return {**of_map, **words, **fields_given}
 
 
 def _coordinates(grid: Grid, words: dict[str, dict[str, str]]) -> dict[str, Any]:

@@ -94,7 +94,8 @@ class ExportOptions:
             return _ORIGIN | {"beam"}, suffix
         kind = self.kind or "db"
         used = _ORIGIN | {"kind", "north_up"}
-        used |= {"8bit": _COLOURS, "complex": set()}.get(kind, {"reference"})
+        of_complex = {"beam"} if self.north_up else set()
+        used |= {"8bit": _COLOURS, "complex": of_complex}.get(kind, {"reference"})
         return self._with_pixel_m(used), f"{suffix} of kind {kind!r}"
 
     def _used_by_heights(self, suffix: str) -> tuple[set[str], str]:

@@ -9,14 +9,17 @@ from typing import Any
 
 from clsas.core import map_grids, validate
 from clsas.core.georeference import Georeference
+from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.core.sidecars import remove_sidecars
 from clsas.core.version import __version__
 from clsas.interferometry.result import Heights
 from clsas.maps import geotiff, netcdf, sicd, viewer, world_files
+from clsas.maps.collection import check_lines
 from clsas.maps.export_options import HEIGHT_SUFFIXES, SUFFIXES, ExportOptions
 from clsas.maps.geotiff import Progress
+from clsas.maps.interpolation import check_image
 from clsas.maps.orientation import Orientation
 from clsas.maps.sources import Source
 from clsas.mosaics.store import Store
@@ -72,9 +75,10 @@ def export(
     source : Image, Store, Heights or path-like
         Image, finished mosaic, heights, or path of a file or store that contains one of them.
     path : path-like
-        File to write, or folder. An existing one is replaced in one step, but a folder only if it
-        contains a viewer. Its name must not begin or end with a dot. Files beside it that describe
-        the one it replaces, such as statistics in ``.aux.xml``, are removed.
+        File to write, or folder. An existing file is replaced in one step. An existing folder is
+        replaced only if it contains a viewer; for a moment between two renamings there is neither.
+        The name must not begin or end with a dot. Files beside it that describe the one it
+        replaces, such as statistics in ``.aux.xml``, are removed.
     kind : {"db", "complex", "8bit"}, optional
         Pixels of a GeoTIFF of an image: the amplitude in dB (float32, NaN where nothing was
         received; the default), complex numbers (complex64), or 8-bit levels with a colour table.
@@ -98,11 +102,11 @@ def export(
         Plan of the image. Its tolerance, predicted error and stages become tags of the file. A
         mosaic knows its own.
     lines : RangeLines, optional
-        Range lines of the image. Their carrier and sound speed become tags of the file. SICD
-        requires them, for track, band and resolution.
+        Range lines of the image. Their carrier and sound speed become tags of the file. SICD, and
+        complex pixels with `north_up`, require them: track and band follow from them.
     beam : BeamWindow, optional
-        Beam with which the image was formed, for SICD. Without it, every line that reaches a pixel
-        contributes to it.
+        Beam with which the image was formed, for SICD, and for complex pixels with `north_up`.
+        Without it, every line that reaches a pixel contributes to it.
     north_arrow, scale_bar : bool
         True to draw an arrow to the north and a scale bar into a picture.
     progress : callable, optional
@@ -112,9 +116,10 @@ def export(
     ------
     TypeError, ValueError
         If an argument has the wrong type, is outside its limits or has no effect on the format; if
-        a GeoTIFF has no georeference, its coordinate reference system is unknown, its grid is
-        vertical or consists of points, or complex pixels are to be resampled; if heights are to
-        become SICD or a folder; or if a mosaic is damaged, not finished, or changes meanwhile.
+        a GeoTIFF has no georeference, its coordinate reference system is unknown, or its grid is
+        vertical or consists of points; if complex pixels are to be resampled, but they are on a
+        height map, are too far apart, or there are no lines; if heights are to become SICD or a
+        folder; or if a mosaic is damaged, not finished, or changes meanwhile.
     FileFormatError
         If the file at `source` does not contain an image or heights.
     ImportError
@@ -148,15 +153,23 @@ def export(
     the plane of the grid, plus z of the plane, plus the height of the origin of a local
     georeference. They count from its vertical datum.
 
-    With `north_up`, power is interpolated bilinearly, and so are heights. Complex pixels are not
-    resampled, since their phase cannot be interpolated where pixels are larger than a quarter of a
-    wavelength: form the image on the grid of `Georeference.north_up` instead.
+    With `north_up`, power is interpolated bilinearly, and so are heights. Complex pixels are
+    interpolated by a windowed sinc, without the carrier that the phase has at every place: the
+    middle of the frequencies K dr/dx, where r is the range of a channel that sees the place, and K
+    the two-way phase per metre in the band of the lines. The tag INTERPOLATION_ERROR_DB bounds the
+    rms error relative to the rms of the image. It is measured: twice the power that the image would
+    have if its spectrum were everywhere as dense as at half the sample rate. If it exceeds -40 dB,
+    the export is refused. Pixels closer to the border of the image than half the sinc, which are 12
+    to 48 rows or columns, are left out.
 
     Examples
     --------
     >>> import clsas
     >>> clsas.export("image.h5", "image.tif")  # doctest: +SKIP
     >>> clsas.export("heights.h5", "heights.tif", north_up=True)  # doctest: +SKIP
+    >>> clsas.export(
+    ...     "image.h5", "complex.tif", kind="complex", north_up=True, lines=lines, beam=beam
+    ... )  # doctest: +SKIP
     >>> clsas.export(clsas.Store.opened("mosaic.zarr"), "mosaic.tif", kind="8bit")  # doctest: +SKIP
     """
     path = validate.path("path", path)
@@ -270,6 +283,8 @@ def _write_geotiff(
         dynamic_range_db=options.dynamic_range_db or DYNAMIC_RANGE_DB,
         reference=options.reference,
         colour_map=options.colour_map or COLOUR_MAP,
+        lines=options.lines,
+        beam=options.beam,
     )
     geotiff.write(path, source, completed, tags, progress)
 
@@ -286,16 +301,26 @@ def _check_map(source: Source, options: ExportOptions) -> None:
             "the image by a scene with a table [georeference]"
         )
     turned = Orientation.of((grid.shape[0], grid.shape[1]), grid.georeference.affine(grid))
-    resamples = options.north_up and (options.pixel_m is not None or not turned.is_north_up)
-    if options.kind == "complex" and resamples:
-        raise ValueError(
-            "north_up must be off for complex pixels, whose phase cannot be interpolated: form the "
-            "image on the grid of Georeference.north_up, or export it rotated"
-        )
+    if options.kind == "complex" and geotiff.resamples(
+        turned, north_up=options.north_up, pixel_m=options.pixel_m
+    ):
+        _check_phase(grid, options.lines)
     if grid.height_m is not None and options.kind == "8bit":
         validate.warn(
             "8-bit levels leave out the heights of the grid; the kind 'db' has them as second band"
         )
+
+
+def _check_phase(grid: Grid, lines: RangeLines | None) -> None:
+    """Raise an error if complex pixels cannot be resampled."""
+    check_image(grid)
+    if lines is None:
+        raise ValueError(
+            "lines must be given for complex pixels with north_up, since the phase between pixels "
+            "follows from them; without them, form the image on the grid of Georeference.north_up, "
+            "or export it rotated"
+        )
+    check_lines(lines, grid)
 
 
 def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:

@@ -27,11 +27,17 @@ from numpy.typing import NDArray
 from clsas.core import reprs
 from clsas.core.atomic import assembling
 from clsas.core.extras import needed
+from clsas.core.lines import RangeLines
+from clsas.core.map_grids import Affine
 from clsas.maps.bands import Band, bands_of
+from clsas.maps.carrier import Carrier
+from clsas.maps.collection import Collection
 from clsas.maps.encoding import Encoding, colour_table
+from clsas.maps.interpolation import Interpolation
 from clsas.maps.orientation import Orientation
 from clsas.maps.resampling import Resampling, north_up, steps_m
 from clsas.maps.sources import Source, windows_of
+from clsas.sonar.beam import BeamWindow
 
 SUFFIXES = (".tif", ".tiff")
 """Suffixes of GeoTIFF files."""
@@ -69,6 +75,9 @@ class Options:
     reference : float or None
         Amplitude of 0 dB; None for 1, or for the largest amplitude if the kind is "8bit".
     colour_map : str
+    lines : RangeLines or None
+    beam : BeamWindow or None
+        Lines and beam of the image, by which complex pixels are resampled.
     """
 
     kind: str
@@ -77,6 +86,13 @@ class Options:
     dynamic_range_db: float
     reference: float | None
     colour_map: str
+    lines: RangeLines | None
+    beam: BeamWindow | None
+
+
+def resamples(turned: Orientation, *, north_up: bool, pixel_m: float | None) -> bool:
+    """Return whether pixels of a raster are resampled: not if they lie north-up already."""
+    return north_up and (pixel_m is not None or not turned.is_north_up)
 
 
 def write(
@@ -184,20 +200,21 @@ class _Export:
         self._shape, self._affine = self._turned.shape, self._turned.affine
         self._largest = 0.0
         self._steps = _Steps(progress, 4 * source.grid.size)
+        self._more_tags: dict[str, str] = {}
 
     def write(self, path: Path, tags: dict[str, str], colours: dict | None) -> None:
         """Write the file from the passes: read, resample, encode with overviews, and copy."""
         is_complex = self._options.kind == "complex"
         first = self._folder / "first.tif"
         self._read(first, np.complex64 if is_complex else np.float32)
-        resamples = not self._turned.is_north_up or self._options.pixel_m is not None
-        if self._options.north_up and resamples:
+        how = self._options
+        if resamples(self._turned, north_up=how.north_up, pixel_m=how.pixel_m):
             first = self._resampled(first)
         reference = self._options.reference
         if reference is None:
             reference = self._largest if self._options.kind == "8bit" and self._largest else 1.0
         encoding = Encoding(self._options.kind, reference, self._options.dynamic_range_db)
-        base = self._levels(first, encoding, tags, colours)
+        base = self._levels(first, encoding, tags | self._more_tags, colours)
         self._copy(base, path)
         _check_whole(path)
 
@@ -224,19 +241,38 @@ class _Export:
                 f"{finest_m / _MOST_FINER:g} m, got {pixel_m:g} m"
             )
         shape, affine = north_up(self._shape, self._affine, pixel_m)
-        resampling = Resampling(self._shape, self._affine, affine)
-        self._shape, self._affine = shape, affine
         path = self._folder / "north_up.tif"
         share = self._source.grid.size / (shape[0] * shape[1])
-        with _opened(given) as file, self._created(path, shape, np.float32) as new:
-            for rows, columns in windows_of(shape, (_TILE, _TILE)):
-                for number, band in enumerate(self._bands, 1):
-                    values = resampling.at(rows, columns, band, partial(_get, file, number))
-                    self._put(new, (rows, columns), values, number)
-                self._steps.add(int(values.size * share))
+        with _opened(given) as file:
+            side, values_at = self._resampler(file, affine)
+            self._shape, self._affine = shape, affine
+            with self._created(path, shape, file.dtypes[0]) as new:
+                for rows, columns in windows_of(shape, (side, side)):
+                    for number in range(1, len(self._bands) + 1):
+                        self._put(new, (rows, columns), values_at(rows, columns, number), number)
+                    pixels = (rows.stop - rows.start) * (columns.stop - columns.start)
+                    self._steps.add(int(pixels * share))
         _check_whole(path)
         given.unlink()
         return path
+
+    def _resampler(
+        self, file: Any, onto: Affine
+    ) -> tuple[int, Callable[[slice, slice, int], NDArray]]:
+        """Return the side of windows of a new raster, and the function that reads a band there."""
+        lines, beam = self._options.lines, self._options.beam
+        if self._options.kind != "complex":
+            resampling = Resampling(self._shape, self._affine, onto)
+            return _TILE, lambda rows, columns, number: resampling.at(
+                rows, columns, self._bands[number - 1], partial(_get, file, number)
+            )
+        assert lines is not None  # the caller has checked it
+        vectors_m = self._turned.vectors_m(self._source.grid)
+        carrier = Carrier.of(Collection.of(lines, beam), self._shape, *vectors_m)
+        read = partial(_get, file, 1)
+        interpolation = Interpolation.of(carrier, self._affine, onto, read)
+        self._more_tags["INTERPOLATION_ERROR_DB"] = f"{interpolation.error_db:.12g}"
+        return interpolation.side, lambda rows, columns, _: interpolation.at(rows, columns, read)
 
     def _levels(
         self, first: Path, encoding: Encoding, tags: dict[str, str], colours: dict | None

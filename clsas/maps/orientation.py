@@ -10,8 +10,10 @@ import itertools
 import math
 from dataclasses import dataclass
 
+import numpy as np
 from numpy.typing import NDArray
 
+from clsas.core.grid import Grid
 from clsas.core.map_grids import Affine
 
 _SAME = 1e-9  # smallest gain for which a raster is turned, far above rounding
@@ -74,6 +76,19 @@ class Orientation:
             )
         )
         return down, across
+
+    def vectors_m(self, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the position of the raster's first pixel, [3], and its steps, metres.
+
+        The steps, float64 [2, 3], lead from row to row and from column to column.
+        """
+        first_m, *given_m = grid.vectors_m
+        steps_m = np.stack(given_m[::-1] if self.transposed else given_m)
+        for axis, is_reversed in enumerate((self.rows_reversed, self.columns_reversed)):
+            if is_reversed:
+                first_m = first_m + (self.shape[axis] - 1) * steps_m[axis]
+                steps_m[axis] = -steps_m[axis]
+        return first_m, steps_m
 
     def turned(self, pixels: NDArray) -> NDArray:
         """Return a window of the image as the raster shows it, without copying."""

@@ -44,6 +44,57 @@ def steps_m(affine: Affine) -> tuple[float, float]:
     return math.hypot(b, e), math.hypot(a, d)
 
 
+def averaged(affine: Affine, onto: Affine) -> int:
+    """Return how many pixels a pixel of a new raster spans along either side, rounded up.
+
+    Raises
+    ------
+    ValueError
+        If they are more than 16.
+    """
+    finest = min(steps_m(affine))
+    count = max(math.ceil(max(steps_m(onto)) / finest - 1e-6), 1)
+    if count > _MOST_AVERAGED:
+        raise ValueError(
+            f"pixel_m must be at most {_MOST_AVERAGED} times the distance of the pixels, "
+            f"{_MOST_AVERAGED * finest:g} m, got {max(steps_m(onto)):g} m"
+        )
+    return count
+
+
+def lattice(
+    affine: Affine, onto: Affine, first: tuple[int, int], count: int = 1
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where samples of a new raster lie in a given one.
+
+    Parameters
+    ----------
+    affine, onto : tuple of float
+        Transforms of the given raster and of the new one.
+    first : (row, column)
+        Pixel of the new raster with the first sample.
+    count : int
+        Samples per pixel along either side.
+
+    Returns
+    -------
+    matrix : float64 [2, 2]
+        Steps of row and column of the given raster (first axis) from sample to sample down and
+        across.
+    offset : float64 [2]
+        Row and column of the first sample. They count from the centre of the first pixel.
+    """
+    a, b, c, d, e, f = affine
+    p, q, r, s, t, u = onto
+    forward = np.array([[a, b, c], [d, e, f], [0, 0, 1]])
+    to = np.linalg.inv(forward) @ np.array([[p, q, r], [s, t, u], [0, 0, 1]])
+    # Sample s of a row lies at row + (s + 0.5)/count.
+    centre = np.array([first[1], first[0]]) + 0.5 / count
+    column, row = to[:2, :2] @ centre + to[:2, 2] - 0.5
+    matrix = np.array([[to[1, 1], to[1, 0]], [to[0, 1], to[0, 0]]]) / count
+    return matrix, np.array([row, column])
+
+
 class Resampling:
     """Numbers of a raster at the pixels of another one, by interpolation.
 
@@ -62,18 +113,8 @@ class Resampling:
     """
 
     def __init__(self, shape: tuple[int, int], affine: Affine, onto: Affine) -> None:
-        self._shape = shape
-        a, b, c, d, e, f = affine
-        forward = np.array([[a, b, c], [d, e, f], [0, 0, 1]])
-        p, q, r, s, t, u = onto
-        self._to_source = np.linalg.inv(forward) @ np.array([[p, q, r], [s, t, u], [0, 0, 1]])
-        finest = min(steps_m(affine))
-        self._averaged = max(math.ceil(max(steps_m(onto)) / finest - 1e-6), 1)
-        if self._averaged > _MOST_AVERAGED:
-            raise ValueError(
-                f"pixel_m must be at most {_MOST_AVERAGED} times the distance of the pixels, "
-                f"{_MOST_AVERAGED * finest:g} m, got {max(steps_m(onto)):g} m"
-            )
+        self._shape, self._affine, self._onto = shape, affine, onto
+        self._averaged = averaged(affine, onto)
 
     def at(
         self,
@@ -93,7 +134,7 @@ class Resampling:
             Called as read(rows, columns); returns a window of the given raster.
         """
         count = self._averaged
-        matrix, offset = self._from_samples(rows, columns)
+        matrix, offset = lattice(self._affine, self._onto, (rows.start, columns.start), count)
         shape = (rows.stop - rows.start) * count, (columns.stop - columns.start) * count
         inside = self._inside(matrix, offset, shape)
         if inside is not None and not inside.any():
@@ -126,17 +167,6 @@ class Resampling:
         blocks = shape[0] // count, count, shape[1] // count, count
         total, weight = (each.reshape(blocks).sum(axis=(1, 3)) for each in (total, weight))
         return band.mean(total, weight, count**2 / 2)  # at least half of the pixel
-
-    def _from_samples(
-        self, rows: slice, columns: slice
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the matrix and offset from samples of a window to indices of the given raster."""
-        to, count = self._to_source, self._averaged
-        # Sample s of a row lies at row + (s + 0.5)/count; indices count from the centre of pixels.
-        centre = np.array([columns.start, rows.start]) + 0.5 / count
-        column, row = to[:2, :2] @ centre + to[:2, 2] - 0.5
-        matrix = np.array([[to[1, 1], to[1, 0]], [to[0, 1], to[0, 0]]]) / count
-        return matrix, np.array([row, column])
 
     def _inside(
         self, matrix: NDArray[np.float64], offset: NDArray[np.float64], shape: tuple[int, int]

@@ -15,7 +15,8 @@ from clsas.core.extras import needed
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.version import __version__
-from clsas.maps.sicd_collection import Axis, Collection, time_and_axes
+from clsas.maps.collection import Collection, check_lines
+from clsas.maps.sicd_collection import Axis, time_and_axes, times_s, track_polynomials
 from clsas.maps.sicd_raster import Raster, ecf_m
 from clsas.maps.sources import Source
 from clsas.sonar.beam import BeamWindow
@@ -59,7 +60,13 @@ def write(
     radar_m = lines.phase_centres_m.mean(axis=0)
     raster = Raster.of(source.grid, radar_m)
     _check_range(lines, raster)
-    tree = _document(sarkit.sicd, raster, Collection.of(lines, beam), tags)
+    collection = Collection.of(lines, beam)
+    if not collection.band_hz[0] > 0:
+        raise ValueError(
+            "lines must have frequencies above 0 Hz with their carrier_hz for SICD, got "
+            f"{collection.band_hz[0]:.4g} Hz"
+        )
+    tree = _document(sarkit.sicd, raster, collection, tags)
     security = sarkit.sicd.NitfSecurityFields(clas="U")
     metadata = sarkit.sicd.NitfMetadata(
         xmltree=tree,
@@ -121,13 +128,7 @@ def _checked(grid: Grid, lines: RangeLines | None, most_bytes: int) -> RangeLine
             "lines must be those of a radar for SICD, whose waves have the speed of light, got "
             f"{lines.sound_speed_m_s:g} m/s: export sonar images as a GeoTIFF of kind 'complex'"
         )
-    if lines.georeference not in (None, grid.georeference):
-        raise ValueError(
-            f"lines must have the georeference of the source ({grid.georeference}), "
-            f"got {lines.georeference}"
-        )
-    if not lines.samples.any():
-        raise ValueError("lines must have samples other than 0, from which the band is measured")
+    check_lines(lines, grid)
     if len(lines.ping_starts) < 2:
         raise ValueError("lines must have at least 2 pings for SICD")
     if grid.georeference.vertical_datum is not None:
@@ -160,7 +161,7 @@ def _document(sicd: Any, raster: Raster, collection: Collection, tags: dict[str,
     place, centre_m = raster.georeference, raster.positions_m(raster.centre)
     range_m = float(np.linalg.norm(collection.lines.phase_centres_m.mean(axis=0) - centre_m))
     time, axes = time_and_axes(collection, raster)
-    track = collection.track(place, range_m)
+    track = track_polynomials(collection.lines, place, range_m)
     root["CollectionInfo"] = {
         "CollectorName": "unknown",
         "CoreName": "clsas",
@@ -189,7 +190,7 @@ def _document(sicd: Any, raster: Raster, collection: Collection, tags: dict[str,
     }
     root["Timeline"] = {
         "CollectStart": datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC),
-        "CollectDuration": collection.duration_s,
+        "CollectDuration": float(times_s(collection.lines)[-1]),
     }
     root["Position"] = {"ARPPoly": track}
     lowest_hz, highest_hz = collection.band_hz
@@ -227,7 +228,7 @@ def _image_formation(collection: Collection, tags: dict[str, Any]) -> dict[str, 
         "RcvChanProc": {"NumChanProc": 1, "ChanIndex": [1]},
         "TxRcvPolarizationProc": "UNKNOWN",
         "TStartProc": 0.0,
-        "TEndProc": collection.duration_s,
+        "TEndProc": float(times_s(collection.lines)[-1]),
         "TxFrequencyProc": {"MinProc": lowest_hz, "MaxProc": highest_hz},
         "ImageFormAlgo": "OTHER",
         "STBeamComp": "NO",

@@ -1,4 +1,4 @@
-"""The range lines of an image as SICD describes them: its track, times and spatial frequencies."""
+"""The range lines of an image as SICD describes them: track, times and spatial frequencies."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ import numpy as np
 from numpy.polynomial import Polynomial, polynomial
 from numpy.typing import NDArray
 
-from clsas.core.geometry import bistatic_range_m
 from clsas.core.georeference import Georeference
 from clsas.core.lines import RangeLines
-from clsas.core.wavelengths import cycles_per_m_at, wavelength_m
+from clsas.maps.collection import Collection
 from clsas.maps.sicd_raster import Raster, ecf_m
 from clsas.measures.resolution import half_power_width
-from clsas.signal.spectrum import measure_spectrum, power_spectrum
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.visibility import sines
 
 # Pixels along either side of the grid to which polynomials are fitted, and their highest order:
 # plain choices, with two pixels per coefficient.
@@ -61,126 +57,41 @@ class Axis:
     width_m: float
 
 
-@dataclass(frozen=True, eq=False)
-class Collection:
-    """The range lines of an image, as its pixels receive them.
+def times_s(lines: RangeLines) -> NDArray[np.float64]:
+    """Return the time of every channel, in which pings have equal intervals, [channels]."""
+    return lines.ping_numbers * np.float64(_INTERVAL_S)
 
-    Attributes
-    ----------
-    lines : RangeLines
-    beam : BeamWindow or None
-        Beam with which the image was formed.
-    along : float64 [channels, 3] or None
-        Direction of the track at every channel, to which the beam refers.
-    cycles_per_m, amplitude : float64 [frequencies]
-        Two-way phase per metre of range, cycles, over the band that the lines occupy, ascending;
-        and the amplitude of the lines there.
+
+def track_polynomials(
+    lines: RangeLines, place: Georeference, range_m: float
+) -> NDArray[np.float64]:
+    """Return polynomials of the track's ECF coordinates over time, float64 [orders + 1, 3].
+
+    Raises
+    ------
+    ValueError
+        If polynomials cannot follow the track as seen from a distance, metres.
     """
-
-    lines: RangeLines
-    beam: BeamWindow | None
-    along: NDArray[np.float64] | None
-    cycles_per_m: NDArray[np.float64]
-    amplitude: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, lines: RangeLines, beam: BeamWindow | None) -> Collection:
-        """Return the collection of some lines.
-
-        Raises
-        ------
-        ValueError
-            If the band of the lines reaches 0 Hz.
-        """
-        spectrum = measure_spectrum(lines)
-        frequency, power = power_spectrum(lines)
-        offset = (frequency - spectrum.centre + 0.5) % 1.0 - 0.5
-        order = np.argsort(offset)
-        order = order[np.abs(offset[order]) <= 0.5 / spectrum.oversampling]
-        cycles = cycles_per_m_at(lines, spectrum.centre + offset[order])
-        if not cycles[0] > 0:
-            lowest_hz = cycles[0] * lines.sound_speed_m_s / 2
-            raise ValueError(
-                "lines must have frequencies above 0 Hz with their carrier_hz for SICD, got "
-                f"{lowest_hz:.4g} Hz"
-            )
-        along = None if beam is None else beam.directions(lines)
-        return cls(lines, beam, along, cycles, np.sqrt(power[order]))
-
-    @property
-    def band_hz(self) -> tuple[float, float]:
-        """Lowest and highest frequency of the band that the lines occupy."""
-        lowest_hz, highest_hz = self.cycles_per_m[[0, -1]] * self.lines.sound_speed_m_s / 2
-        return float(lowest_hz), float(highest_hz)
-
-    @property
-    def time_s(self) -> NDArray[np.float64]:
-        """Time of every channel, in which pings have equal intervals, float64 [channels]."""
-        return self.lines.ping_numbers * np.float64(_INTERVAL_S)
-
-    @property
-    def duration_s(self) -> float:
-        """Time of the last ping."""
-        return float(self.time_s[-1])
-
-    def weights(self, point_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the weight of every channel in a pixel, float64 [channels]."""
-        lines = self.lines
-        range_m = bistatic_range_m(point_m, lines.tx_m, lines.rx_m)
-        reached = (range_m >= lines.first_range_m) & (range_m <= lines.last_range_m)
-        if self.beam is None or self.along is None:
-            return reached.astype(np.float64)
-        sine = sines(point_m[None], lines.phase_centres_m, self.along)[:, 0]
-        return reached * self.beam.weights(sine, wavelength_m(lines))
-
-    def track(self, place: Georeference, range_m: float) -> NDArray[np.float64]:
-        """Return polynomials of the track's ECF coordinates over time, float64 [orders + 1, 3].
-
-        Raises
-        ------
-        ValueError
-            If polynomials cannot follow the track as seen from a distance, metres.
-        """
-        position_m = ecf_m(place, self.lines.ping_centres_m)
-        middle_m = position_m.mean(axis=0)  # removed from sums of squares of 1e6 m
-        time_s = _INTERVAL_S * np.arange(len(position_m))
-        deviation_m = np.inf
-        for order in range(1, min(_HIGHEST_OF_TRACK, len(time_s) - 1) + 1):
-            found = [Polynomial.fit(time_s, each, order) for each in (position_m - middle_m).T]
-            fitted_m = np.stack([each(time_s) for each in found], axis=1) + middle_m
-            deviation_m = float(np.linalg.norm(fitted_m - position_m, axis=1).max())
-            if deviation_m <= _DEVIATION * range_m:
-                coefficients = np.zeros((order + 1, 3))
-                for axis, each in enumerate(found):
-                    own = each.convert().coef
-                    coefficients[: len(own), axis] = own
-                coefficients[0] += middle_m
-                return coefficients
-        raise ValueError(
-            "lines must come from one pass in the order of recording, since SICD describes the "
-            f"track by polynomials, which deviate from it by {deviation_m:.3g} m at a range of "
-            f"{range_m:.4g} m"
-        )
-
-    def contributions(
-        self, point_m: NDArray[np.float64], raster: Raster
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the channels that a pixel receives from.
-
-        Returns
-        -------
-        time_s, weight : float64 [channels]
-        steps_m : float64 [2, channels]
-            Change of the range from row to row and from column to column.
-        """
-        weight = self.weights(point_m)
-        used = weight != 0
-        steps_m = np.zeros((2, int(used.sum())))
-        for antenna_m in (self.lines.tx_m[used], self.lines.rx_m[used]):
-            way_m = point_m - antenna_m
-            unit = way_m / np.linalg.norm(way_m, axis=1, keepdims=True)
-            steps_m += np.stack([unit @ raster.row_step_m, unit @ raster.column_step_m]) / 2
-        return self.time_s[used], weight[used], steps_m
+    position_m = ecf_m(place, lines.ping_centres_m)
+    middle_m = position_m.mean(axis=0)  # removed from sums of squares of 1e6 m
+    time_s = _INTERVAL_S * np.arange(len(position_m))
+    deviation_m = np.inf
+    for order in range(1, min(_HIGHEST_OF_TRACK, len(time_s) - 1) + 1):
+        found = [Polynomial.fit(time_s, each, order) for each in (position_m - middle_m).T]
+        fitted_m = np.stack([each(time_s) for each in found], axis=1) + middle_m
+        deviation_m = float(np.linalg.norm(fitted_m - position_m, axis=1).max())
+        if deviation_m <= _DEVIATION * range_m:
+            coefficients = np.zeros((order + 1, 3))
+            for axis, each in enumerate(found):
+                own = each.convert().coef
+                coefficients[: len(own), axis] = own
+            coefficients[0] += middle_m
+            return coefficients
+    raise ValueError(
+        "lines must come from one pass in the order of recording, since SICD describes the "
+        f"track by polynomials, which deviate from it by {deviation_m:.3g} m at a range of "
+        f"{range_m:.4g} m"
+    )
 
 
 def time_and_axes(
@@ -199,23 +110,23 @@ def time_and_axes(
     lengths_m = np.linalg.norm(raster.vectors_m(), axis=1)
     sides = (np.linspace(0, n - 1, _PIXELS) for n in raster.shape)
     index = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
-    band = collection.cycles_per_m[[0, -1]]
+    time_of_channels_s = times_s(collection.lines)
     times, supports, used = [], [], []
     for where, point_m in zip(index, raster.positions_m(index), strict=True):
-        time_s, weight, steps_m = collection.contributions(point_m, raster)
+        channels, weight, changes_m = collection.contributions(point_m, raster.steps_m)
         if weight.sum():
-            times.append(float(time_s @ weight / weight.sum()))
-            supports.append(_support(band, steps_m))
+            times.append(float(time_of_channels_s[channels] @ weight / weight.sum()))
+            supports.append(collection.support(changes_m))
             used.append(where)
     centre_m = raster.positions_m(raster.centre)
-    time_s, weight, steps_m = collection.contributions(centre_m, raster)
+    _, weight, changes_m = collection.contributions(centre_m, raster.steps_m)
     if not weight.sum():
         raise ValueError("lines must reach the middle of the image")
     at_m = (np.array(used) - raster.centre) * lengths_m
     corners_m = (raster.corners - raster.centre) * lengths_m
-    time = _fitted(at_m, np.array(times), _TIME * collection.duration_s)
+    time = _fitted(at_m, np.array(times), _TIME * float(time_of_channels_s[-1]))
     support = np.array(supports) / lengths_m[:, None]  # cycles per metre
-    lowest, highest = (_support(band, steps_m) / lengths_m[:, None]).T
+    lowest, highest = (collection.support(changes_m) / lengths_m[:, None]).T
     axes = []
     for axis, step_m in enumerate(lengths_m):
         extent = float(highest[axis] - lowest[axis])
@@ -227,7 +138,7 @@ def time_and_axes(
         first, last = at_corners.min() - bandwidth / 2, at_corners.max() + bandwidth / 2
         if max(-first, last) > rate / 2:  # the band continues at the other end
             first, last = -rate / 2, rate / 2
-        cycles = np.multiply.outer(steps_m[axis] / step_m, collection.cycles_per_m).ravel()
+        cycles = np.multiply.outer(changes_m[axis] / step_m, collection.cycles_per_m).ravel()
         amplitude = np.multiply.outer(weight, collection.amplitude).ravel()
         amplitude, edges = np.histogram(cycles, _BINS, weights=amplitude)
         width_m = half_power_width((edges[:-1] + edges[1:]) / 2, amplitude)
@@ -248,12 +159,6 @@ def time_and_axes(
             )
         )
     return time, (axes[0], axes[1])
-
-
-def _support(band: NDArray[np.float64], steps_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the lowest and highest cycles per pixel along rows and columns, float64 [2, 2]."""
-    cycles = np.multiply.outer(steps_m, band)
-    return np.stack([cycles.min(axis=(1, 2)), cycles.max(axis=(1, 2))], axis=1)
 
 
 def _fitted(

@@ -27,15 +27,16 @@ class Raster:
     ----------
     orientation : Orientation
         How the pixels of the image are turned.
-    first_m, row_step_m, column_step_m : float64 [3]
-        Position of the raster's pixel [0, 0] and the steps from it, in the image's coordinates.
+    first_m : float64 [3]
+        Position of the raster's pixel [0, 0], in the image's coordinates.
+    steps_m : float64 [2, 3]
+        Steps from row to row and from column to column.
     georeference : Georeference
     """
 
     orientation: Orientation
     first_m: NDArray[np.float64]
-    row_step_m: NDArray[np.float64]
-    column_step_m: NDArray[np.float64]
+    steps_m: NDArray[np.float64]
     georeference: Georeference
 
     @classmethod
@@ -62,15 +63,7 @@ class Raster:
             *(sine * east + cosine * north for east, north in ((a, d), (b, e), (c, f))),
         )
         orientation = Orientation.of((grid.shape[0], grid.shape[1]), turned)
-        first_m, row_step_m, column_step_m = grid.vectors_m
-        if orientation.transposed:
-            row_step_m, column_step_m = column_step_m, row_step_m
-        rows, columns = orientation.shape
-        if orientation.rows_reversed:
-            first_m, row_step_m = first_m + (rows - 1) * row_step_m, -row_step_m
-        if orientation.columns_reversed:
-            first_m, column_step_m = first_m + (columns - 1) * column_step_m, -column_step_m
-        return cls(orientation, first_m, row_step_m, column_step_m, place)
+        return cls(orientation, *orientation.vectors_m(grid), place)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -85,7 +78,7 @@ class Raster:
     @property
     def is_level(self) -> bool:
         """True if the plane is horizontal."""
-        *across, up = np.cross(self.row_step_m, self.column_step_m)
+        *across, up = np.cross(*self.steps_m)
         return bool(np.hypot(*across) <= _LEVEL * abs(up))
 
     @property
@@ -96,7 +89,7 @@ class Raster:
 
     def positions_m(self, index: NDArray) -> NDArray[np.float64]:
         """Return the positions of rows and columns [..., 2], which may be fractions, [..., 3]."""
-        return self.first_m + index @ np.stack([self.row_step_m, self.column_step_m])
+        return self.first_m + index @ self.steps_m
 
     def corners_on_ground(self, track: NDArray[np.float64], time_s: float) -> NDArray[np.float64]:
         """Return latitude and longitude of the corners at the height of the middle, deg [4, 2].

@@ -6,8 +6,9 @@ Every run is killed at a random moment: while it starts, or after some patches. 
 processes are killed, or only the main process, or one worker. After every kill the finished patches
 and their levels must equal those of a mosaic that was never killed. After 10 kills the run may
 finish. The store must then equal the other bit by bit, with all levels, and there must be no
-temporary files. Exports of the finished mosaic as GeoTIFF are killed too: the file before must
-still be there, or the whole new one. In all other cases the exit code is 1.
+temporary files. Exports of the finished mosaic as GeoTIFF and as a viewer, and of a radar image as
+SICD, are killed too: the file or folder before must still be there, or the whole new one. In all
+other cases the exit code is 1.
 """
 
 from __future__ import annotations
@@ -15,16 +16,21 @@ from __future__ import annotations
 import argparse
 import os
 import random
+import re
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import psutil
 from case import PATCHES, command, write_scene
 
+import clsas
 from clsas import Store
 from clsas.mosaics.documents import read_document
 from clsas.mosaics.levels import patch_arrays
@@ -32,6 +38,7 @@ from clsas.mosaics.levels import patch_arrays
 KILLS_PER_STORE = 10
 ORPHANS_S = 60  # after which workers whose main process was killed must have ended
 DEADLINE_S = 600  # for one run
+WRITTEN = re.compile(rb"20\d\d-?\d\d-?\d\dT?\d\d:?\d\d:?\d\d")
 
 
 class Miss(Exception):
@@ -148,7 +155,7 @@ def main() -> None:
         help="numbers of workers; 0 for a single process",
     )
     parser.add_argument(
-        "--exports", type=int, default=100, help="number of kills of exports as GeoTIFF"
+        "--exports", type=int, default=100, help="number of kills of exports of each kind"
     )
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -203,21 +210,41 @@ def attack(folder: Path, workers: int, kills: int, chance: random.Random) -> Non
 
 
 def attack_exports(folder: Path, kills: int, chance: random.Random) -> None:
-    """Kill exports at random moments until there have been `kills` kills."""
+    """Kill exports of each kind until there have been `kills` kills of it."""
     scene, store = write_scene(folder), folder / "exported.zarr"
     subprocess.run(command(scene, store), check=True, capture_output=True)
-    maps = folder / "maps"
+    image, lines = write_radar_image(folder)
+    attack_export(store, folder / "map.tif", ["--crs", "EPSG:32632"], kills, chance)
+    attack_export(store, folder / "viewer", [], kills, chance)
+    attack_export(image, folder / "radar.nitf", ["--lines", str(lines)], kills, chance)
+
+
+def attack_export(
+    source: Path, name: Path, options: list[str], kills: int, chance: random.Random
+) -> None:
+    """Kill exports to one file or folder at random moments."""
+    maps = name.parent / f"{name.name}-alone"
     maps.mkdir()
-    made, old = maps / "map.tif", b"the file before"
-    arguments = [sys.executable, "-m", "clsas", "export", str(store), str(made)]
-    arguments += ["--crs", "EPSG:32632"]
+    made = maps / name.name
+    arguments = [sys.executable, "-m", "clsas", "export", str(source), str(made), *options]
+    others = ["--colour-map", "gray"] if not made.suffix else []
+    subprocess.run([*arguments, *others], check=True, capture_output=True)
+    if made.suffix:
+        made.write_bytes(b"the file before")
+    old = contents(made)
+    kept = maps.parent / f"{name.name}-before"
+    made.rename(kept)
     start = time.monotonic()
     subprocess.run(arguments, check=True, capture_output=True)
     usual_s = time.monotonic() - start
-    whole = made.read_bytes()
+    whole = contents(made)
     done = finished = 0
     while done < kills:
-        made.write_bytes(old)
+        if made.is_dir():
+            shutil.rmtree(made)
+            shutil.copytree(kept, made)
+        else:
+            shutil.copyfile(kept, made)
         process = subprocess.Popen(
             arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
         )
@@ -228,12 +255,43 @@ def attack_exports(folder: Path, kills: int, chance: random.Random) -> None:
         else:
             finished += 1
         process.wait()
-        if made.read_bytes() not in (old, whole):
-            raise Miss("a killed export left a file that is neither the old nor the new one")
+        if contents(made) not in (old, whole):
+            raise Miss(f"a killed export left {name.name} neither as it was nor as it should be")
     subprocess.run(arguments, check=True, capture_output=True)
-    if made.read_bytes() != whole or [each.name for each in maps.iterdir()] != [made.name]:
-        raise Miss("an export after the kills differs, or leaves files behind")
-    print(f"exports: {done} kills, {finished} finished before, each file whole, none left over")
+    if contents(made) != whole or [each.name for each in maps.iterdir()] != [made.name]:
+        raise Miss(f"an export of {name.name} after the kills differs, or leaves files behind")
+    print(
+        f"exports of {name.name}: {done} kills, {finished} finished before, each whole, "
+        "none left over",
+        flush=True,
+    )
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """Return the contents of a file, or of the files in a folder, by their names.
+
+    The times at which a SICD file was written are left out.
+    """
+    files = [each for each in path.rglob("*") if each.is_file()] if path.is_dir() else [path]
+    read = {str(each.relative_to(path)): each.read_bytes() for each in files}
+    return {name: WRITTEN.sub(b"", each) for name, each in read.items()}
+
+
+def write_radar_image(folder: Path) -> tuple[Path, Path]:
+    """Write an image of a radar, 8 MB, and its lines; return their paths."""
+    along_m = np.linspace(-30, 30, 61)
+    track_m = np.stack([along_m, np.full(61, 4000.0), np.full(61, 3000.0)], axis=1)
+    place = clsas.Georeference.local(60.39, 5.32, heading_deg=217)
+    lines = clsas.simulate_lines(
+        track_m, track_m, clsas.PointTargets([[0, 0, 0]]), carrier_hz=9.6e9, bandwidth_hz=100e6,
+        sound_speed_m_s=299_792_458.0,
+    )  # fmt: skip
+    pixels = np.random.default_rng(1).normal(size=(1000, 1000, 2)) @ [1, 1j]
+    grid = clsas.Grid.plane((-450, 450, 1000), (-625, 625, 1000), georeference=place)
+    paths = folder / "radar.h5", folder / "radar-lines.h5"
+    clsas.save(paths[0], clsas.Image(pixels, grid))
+    clsas.save(paths[1], replace(lines, georeference=place))
+    return paths
 
 
 if __name__ == "__main__":

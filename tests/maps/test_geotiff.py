@@ -330,7 +330,7 @@ def test_images_without_a_place_on_a_map_are_refused(tmp_path):
         (image, {"georeference": UTM_NORTH}, "georeference must be left out"),
         (points, {}, "source must be on a plane or height map"),
         (clsas.Image(np.ones((3, 3), complex), upright), {}, "grid must not be vertical"),
-        (image, {"kind": "complex", "north_up": True}, "north_up must be off for complex pixels"),
+        (image, {"kind": "complex", "beam": clsas.BeamWindow(9.0)}, "beam must be left out"),
         (image, {"kind": "complex", "reference": 1.0}, "reference must be left out"),
         (image, {"colour_map": "gray"}, "colour_map must be left out, .* kind 'db'"),
         (image, {"pixel_m": 1.0}, "pixel_m must be left out, .* without north_up"),

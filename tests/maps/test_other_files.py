@@ -61,6 +61,7 @@ def test_netcdf_restores_the_image_and_its_place(place, tmp_path):
         assert data[name].attrs["standard_name"] == standard
     for name in ("amplitude_db", "pixels_real", "pixels_imag"):
         assert "spatial_ref" in (data[name].attrs | data[name].encoding)["grid_mapping"]
+    assert data.spatial_ref.attrs["long_name"] == "Coordinate reference system"
 
 
 @pytest.mark.parametrize("place", [UTM_NORTH, local(217.0)], ids=str)
