@@ -19,11 +19,13 @@ from scipy.ndimage import map_coordinates
 from clsas.core.grid import Grid
 from clsas.core.wavelengths import cycles_per_m_at
 from clsas.interferometry.baseline import Baseline, Lattice, in_pixels
+from clsas.interferometry.coherence import Window
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.result import Heights
 from clsas.signal.spectrum import measure_spectrum
 
 _UP = np.array([0.0, 0.0, 1.0])
+_SMOOTHED = 3.0  # windows along either side, over which slopes are averaged
 _STEPS = 3  # to the middle of the curve; more change displacements of 2 m by less than 1 mm
 # Between points of the lattice that are a fiftieth of the range apart, K errs by 1e-4, which is
 # 1 mrad where heights are displaced by one and a half heights of ambiguity.
@@ -63,6 +65,9 @@ class Displaced:
         The plane above which they were measured.
     sights : Lattice
         K, the tangent in rows and columns, and the phase per radian of roll.
+    m_per_rad : float64 [rows, columns]
+        Change of the height per radian of phase, smoothed: noise of the slopes that it depends on
+        would hide how little phase and roll differ.
     near, far : Elevation
         How the pair sees the nearest and the farthest pixel of the plane.
     """
@@ -70,6 +75,7 @@ class Displaced:
     found: Heights
     plane: Grid
     sights: Lattice
+    m_per_rad: NDArray[np.float64]
     near: Elevation
     far: Elevation
 
@@ -92,7 +98,7 @@ class Displaced:
             Elevation(float(range_m[n]), float(rad_m[n]), float(rolled[n]))
             for n in (range_m.argmin(), range_m.argmax())
         )
-        return cls(found, plane, lattice, near, far)
+        return cls(found, plane, lattice, _smooth_m_per_rad(found, plane), near, far)
 
     def moved_back(
         self,
@@ -129,7 +135,7 @@ class Displaced:
         row, column = row + moved[0], column + moved[1]
         height_m, sd_m, m_per_rad = (
             map_coordinates(values, [row, column], order=1, cval=np.nan)
-            for values in (self.found.height_m, self.found.sd_m, self.found.m_per_rad)
+            for values in (self.found.height_m, self.found.sd_m, self.m_per_rad)
         )
         z_m = self.plane_z_m(row, column) + height_m - rise_m
         return MovedBack(z_m, sd_m, m_per_rad[:, None] * per_error)
@@ -144,6 +150,14 @@ class Displaced:
         """Return the z of the plane, [n]."""
         origin_m, row_step_m, column_step_m = self.plane.vectors_m
         return np.asarray(origin_m[2] + row * row_step_m[2] + column * column_step_m[2])
+
+
+def _smooth_m_per_rad(found: Heights, plane: Grid) -> NDArray[np.float64]:
+    """Return the mean of the valid changes per radian around every pixel; 0 if there are none."""
+    window = Window.of(plane, _SMOOTHED * found.window_m)
+    sums = window.sums(np.where(found.mask, found.m_per_rad, 0.0))
+    valid = window.sums(found.mask.astype(np.float64))
+    return np.divide(sums, valid, out=np.zeros_like(sums), where=valid > 0.5)
 
 
 def _lattice(

@@ -3,7 +3,7 @@
 Windows of neighbouring heights overlap, so their errors are not independent. The correlation of
 the errors of two heights is the share of its window that each has in common with the other, and
 the covariance of the unknowns x = (A'WA)^-1 A'W y is (A'WA)^-1 A'W C W A (A'WA)^-1 with the
-covariance C of the heights.
+covariance C of the heights. Errors that all windows have in common add to it.
 """
 
 from __future__ import annotations
@@ -17,10 +17,13 @@ from numpy.typing import NDArray
 
 from clsas.interferometry.coherence import Window
 
-_ROUNDS = 20  # of each iteration; a handful is usual
+_ROUNDS = 30  # of each iteration; a handful is usual
 _OUTLIER = 4.0  # deviations; Gaussian errors exceed it at one place in 16 000
 _MEDIAN = 0.6745  # median absolute deviation of a Gaussian
 _SETTLED = 0.02  # rms last change of the modelled heights, in their deviations
+# Errors of heights that change slowly over the swath, in deviations: the mean error on simulated
+# dunes. Unlike noise, they do not average out.
+_SYSTEMATIC = 0.05
 _LEAST_RESIDUAL = 0.1  # deviations; smaller residuals have no larger weight in a sum of magnitudes
 
 
@@ -182,4 +185,5 @@ def _described(
         inverse = np.linalg.inv(normal)
         covariance = inverse @ places.correlated(used, scaled) @ inverse
         covariance *= max(misfit, 1.0) ** 2 if left > 1 else 1.0
+        covariance += _SYSTEMATIC**2 * count * inverse
     return Fit(values, covariance, equations, used, samples, misfit)

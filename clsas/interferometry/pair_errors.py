@@ -28,7 +28,7 @@ from clsas.sonar.beam import BeamWindow
 _MOST_SD_RAD = 0.5  # of an error that is observable, as a phase; a plain choice
 # Deviation of an error relative to what it would be if the others were known. The model's own
 # errors of phase, some milliradians that vary over the swath, grow by as much.
-_MOST_AMPLIFICATION = 50.0
+_MOST_AMPLIFICATION = 30.0
 _MRAD = 1e-3
 _UNLIKE = 5.0  # ratio of sensitivities that no slope of the seabed explains
 
@@ -117,7 +117,7 @@ def pair_errors(
     for it.
 
     Phase and roll can be told apart only if the depression varies. An error is held if its
-    deviation exceeds 0.5 rad of phase, or 50 times the one it would have if the others were known.
+    deviation exceeds 0.5 rad of phase, or 30 times the one it would have if the others were known.
 
     A phase and a delay displace heights alike, but on the relief that was found a phase leaves
     phase (1 - f/f0) at the frequency f. It is measured from both halves of the band. Heights
