@@ -6,6 +6,7 @@ enough, else `summary`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
@@ -54,6 +55,17 @@ def quantity(value: float, unit: str) -> str:
         if abs(value) >= least * (1 - 1e-9):
             return f"{value / _SCALES.get(prefixed, 1.0):.{digits}g} {prefixed}"
     return f"{value:.{digits}g} {unit}".rstrip()
+
+
+def with_deviation(value: float, deviation: float, unit: str) -> str:
+    """Return a value and its standard deviation, rounded alike, such as "4.00 ± 0.15 mm"."""
+    if not 0 < deviation < math.inf:
+        return quantity(value, unit)
+    larger = max(abs(value), deviation)
+    shown, prefixed = quantity(larger, unit).split(maxsplit=1)
+    factor = 10.0 ** round(math.log10(larger / float(shown)))
+    digits = max(1 - math.floor(math.log10(deviation / factor)), 0)
+    return f"{value / factor:.{digits}f} ± {deviation / factor:.{digits}f} {prefixed}"
 
 
 def span(low: float, high: float, unit: str) -> str:

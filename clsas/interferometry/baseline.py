@@ -101,6 +101,24 @@ class Baseline:
         """Return the gradients of the difference and of the mean of the ranges, [points, 3]."""
         return self._gradients(points_m, self._weights(points_m))
 
+    def rad_per_roll(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the phase of b per radian by which b is turned about a, rad, [points].
+
+        The turn is right-handed about the direction of the track: the port side rises.
+        """
+        rx_m = self.b.rx_m[self.channels]
+        moves_m = np.cross(self.along, rx_m - self.a.rx_m[self.channels])
+
+        def of(some_m: NDArray[np.float64]) -> NDArray[np.float64]:
+            sight_m = some_m[:, None] - rx_m
+            sight_m /= np.linalg.norm(sight_m, axis=2, keepdims=True)
+            # A receiver that approaches a point by 1 m shortens the range, half the path, by 0.5 m.
+            return np.einsum("pc,pci,ci->p", self._weights(some_m), sight_m, moves_m) / 2
+
+        parts = max(len(points_m) // _POINTS_AT_ONCE, 1)
+        nearer_m = np.concatenate([of(some_m) for some_m in np.array_split(points_m, parts)])
+        return self.rad_per_m * nearer_m
+
     def _weights(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the weights of the channels in points, float64 [points, channels]; sums are 1."""
         if self.beam is None:

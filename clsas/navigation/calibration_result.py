@@ -65,7 +65,7 @@ class Calibration:
         found = []
         for name, value, deviation in zip(self.unknowns, self.values, self.sd, strict=True):
             whole = self.sound_speed_m_s if name == "sound_speed" else float(value)
-            shown = _with_deviation(whole, float(deviation), UNITS[name])
+            shown = reprs.with_deviation(whole, float(deviation), UNITS[name])
             found.append(f"{name.replace('_', ' ')} {shown}")
         found += [f"{name.replace('_', ' ')} held" for name in self.held]
         residual_m = float(np.sqrt(np.nanmean(self.residual_m**2)))
@@ -136,14 +136,3 @@ class Calibration:
     def _value(self, name: str) -> float:
         """Return the correction of an unknown, 0 if it was not solved for."""
         return float(self.values[self.unknowns.index(name)]) if name in self.unknowns else 0.0
-
-
-def _with_deviation(value: float, deviation: float, unit: str) -> str:
-    """Return a value and its standard deviation, rounded alike, such as "4.00 ± 0.15 mm"."""
-    if not 0 < deviation < math.inf:
-        return reprs.quantity(value, unit)
-    larger = max(abs(value), deviation)
-    shown, prefixed = reprs.quantity(larger, unit).split(maxsplit=1)
-    factor = 10.0 ** round(math.log10(larger / float(shown)))
-    digits = max(1 - math.floor(math.log10(deviation / factor)), 0)
-    return f"{value / factor:.{digits}f} ± {deviation / factor:.{digits}f} {prefixed}"
