@@ -44,7 +44,7 @@ _LINEAR_RAD = 0.15  # roughness as a phase, up to which the fit of a plane is al
 # shadow, beyond which a plane would be extrapolated.
 _MOST_GROWTH = 3.0
 # Displacements by curvature are averaged over windows so much larger. Without curvature, the noise
-# of level seabeds then adds 0.7 % to the deviation; 1.4 % with half the value, 0.4 % with 1.5 times.
+# of level seabeds then adds 0.7 % to the deviation; with half the value, 1.4 %.
 _BENDING = 2.0
 # Mean square of `Planes.bend_m` on level seabeds, in variances of the height: 0.23 to 0.25 on the
 # slopes of tests/interferometry. Evenly lit windows would have 0.32.
