@@ -150,9 +150,11 @@ def heights(
     what the remaining phase adds to it, until corrections are below 0.3 deviations. The
     reported deviation is ::
 
-        sd = (1 - m.t) / |K| sqrt((1 - g^2) / (2 L g^2))
+        sd = sqrt((1 - m.t)^2 / K^2 (1 - g^2) / (2 L g^2) + d^2)
 
-    with the coherence g and L independent samples.
+    with the coherence g, L independent samples, and the displacement d of planes in windows within
+    which the seabed bends. A plane that is fitted to the heights found displaces them as it
+    displaced the true ones; d is the rms of that around the pixel, less what noise causes.
 
     Images are coregistered because they are formed in the time domain, and a sway or yaw of the
     track is accounted for like any other motion. The mask leaves out what is not coherent, pixels
@@ -162,9 +164,13 @@ def heights(
     Errors that all pixels have in common are not part of the deviation. A constant phase between
     the banks, as from a delay of one receiver, adds `Heights.m_per_rad` per radian. An error of the
     baseline's roll turns the seabed about the track by as much: 1 mm of height per metre of ground
-    range and mrad. Side lobes of brighter places carry the phase of those places; weight the band
-    in `compress` where the brightness varies strongly. On simulated dunes with an unweighted band,
-    errors were 1.1 times the deviation, and with a Hamming window 1.0 times.
+    range and mrad.
+
+    Side lobes and ambiguities of brighter places carry the phase of those places. Weight the band
+    in `compress` and the directions by `beam` where the brightness varies strongly. On simulated
+    dunes with an unweighted band, errors were 1.1 times the deviation, and with a Hamming window
+    1.0 times. On a rock whose far side is 25 dB darker than the seabed beside it, they were 2.9
+    times the deviation with all directions alike, and 0.9 times with a Hann window of 14 degrees.
 
     The track may sway, but must be close to straight over the channels that see a pixel, since a
     scatterer above an imaged surface appears in one place only then.

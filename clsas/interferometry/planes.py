@@ -43,6 +43,8 @@ class Planes(NamedTuple):
         Variance of the height in the middle, relative to that of a windowed mean.
     roughness_m : float64
         Rms distance of the relief from the plane.
+    bend_m : float64
+        Height in the middle of a plane fitted to the relief itself, above the relief.
     """
 
     height_m: NDArray[np.float64]
@@ -51,6 +53,7 @@ class Planes(NamedTuple):
     coherence: NDArray[np.float64]
     growth: NDArray[np.float64]
     roughness_m: NDArray[np.float64]
+    bend_m: NDArray[np.float64]
 
 
 def fit_planes(
@@ -113,6 +116,8 @@ def _fit(
     r, s = r - row, s - column  # from the middle
     change_m = m_per_rad * np.angle(mean)
     middle_m = of_height + change_m - row_slope_m * r - column_slope_m * s
+    bend_m = of_height - height_m
+    bend_m -= (r * (rh * ss - sh * rs) + s * (sh * rr - rh * rs)) / determinant
     growth = 1 + (r**2 * ss - 2 * r * s * rs + s**2 * rr) / determinant
     squared = means(height_m**2).real - of_height**2 + change_m**2
     squared += row_slope_m * (row_slope_m * rr + 2 * column_slope_m * rs - 2 * rh)
@@ -124,6 +129,7 @@ def _fit(
         np.where(solvable, np.abs(moments.coherence), 0.0),
         np.where(solvable, np.maximum(growth, 1.0), 1.0),
         np.where(solvable, np.sqrt(np.maximum(squared, 0.0)), 0.0),
+        np.where(solvable, bend_m, 0.0),
     )
 
 

@@ -23,8 +23,8 @@ class Heights:
         Height above the plane of the grid, metres along z. NaN outside the mask.
     sd_m : float64 [rows, columns]
         Standard deviation of the height, metres. NaN outside the mask. It contains the noise of
-        the phase, but not errors that all pixels have in common, such as those of the positions of
-        the banks; see `m_per_rad`.
+        the phase and the curvature of the seabed within windows, but not errors that all pixels
+        have in common, such as those of the positions of the banks; see `m_per_rad`.
     coherence : float64 [rows, columns]
         Magnitude of the coherence of both banks on the relief, 0 to 1, without bias.
     mask : bool [rows, columns]

@@ -55,6 +55,19 @@ def test_windows_across_a_step_are_rough():
     assert found.roughness_m[10, 10:-10].max() < 1e-6
 
 
+def test_planes_displace_curved_reliefs():
+    row, column = lattice()
+    relief_m = 1e-3 * (row - 30) ** 2 + 0.01 * column
+    scale = np.full(relief_m.shape, M_PER_RAD)
+    found = fit_planes(images(relief_m, relief_m), relief_m, scale, WINDOW)
+    inside = (slice(5, -5),) * 2
+    displaced_m = 1e-3 * (9**2 - 1) / 12  # mean square of 9 rows from the middle
+    assert np.median(found.bend_m[inside]) == pytest.approx(displaced_m, rel=0.1)
+    assert np.median((found.height_m - relief_m)[inside]) == pytest.approx(displaced_m, rel=0.1)
+    level = fit_planes(images(relief_m, relief_m), 0.01 * column, scale, WINDOW)
+    assert np.abs(level.bend_m[inside]).max() < 1e-3 * displaced_m
+
+
 def test_growth_is_that_of_lit_pixels():
     random = np.random.default_rng(2)
     row, _ = lattice()
