@@ -15,6 +15,7 @@ from clsas.cli.inputs import load_lines, read_beam, read_grid
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, Parsed
 from clsas.core import banks, validate
+from clsas.files.height_files import read_heights
 from clsas.interferometry.checks import checked_coherence
 from clsas.interferometry.heights import LEAST_COHERENCE
 from clsas.processing import numbers
@@ -40,6 +41,12 @@ _SEARCH = Parsed("LOW:HIGH", _heights, "LOW:HIGH, two ascending heights in metre
     type=_SEARCH,
     required=True,
     help="Heights above the grid between which the seabed lies (m).",
+)
+@click.option(
+    "--relief",
+    type=INPUT,
+    help="Heights of the pixels above the plane (CSV or .npy, m), such as a coarse bathymetry. "
+    "--search-m then counts from this relief.",
 )
 @click.option(
     "--window-m",
@@ -73,6 +80,7 @@ def heights(
     output: Path,
     scene: Path | None,
     search_m: tuple[float, float],
+    relief: Path | None,
     window_m: float | None,
     tolerance_db: float,
     least_coherence: float,
@@ -83,13 +91,16 @@ def heights(
     """Measure the heights of a seabed from two receiver banks.
 
     LINES.H5 holds the range lines of both banks, or those of one if B.H5 holds those of the other.
-    The grid, from --scene or from --x, --y and --z, must be a plane. Heights are valid where the
-    banks are coherent, and not in shadow or layover; the others are NaN.
+    The grid, from --scene or from --x, --y and --z, is a plane, or a height map from which the
+    search starts. Heights are above the plane, and valid where the banks are coherent, and not in
+    shadow or layover; the others are NaN.
 
     \b
     Example:  clsas heights lines.h5 --x -2:2:201 --y 30:34:201 --search-m -1:1 -o heights.h5
     """
     described, grid = read_grid(scene, given)
+    if relief is not None:
+        grid = _raised(grid, relief)
     beam = read_beam(described, given)
     if second_file is None:
         lines = load_lines(first_file, None, described)
@@ -119,6 +130,16 @@ def heights(
         file=output,
         **results,
     )
+
+
+def _raised(plane: clsas.Grid, relief: Path) -> clsas.Grid:
+    """Return a plane with the heights in a file; raise an error that names the option."""
+    if not plane.is_planar:
+        raise click.UsageError("--relief requires a plane, but the grid of the scene has heights")
+    try:
+        return plane.with_height(read_heights(relief, plane.shape))
+    except ValueError as error:
+        raise ValueError(f"--relief {error}") from None
 
 
 def in_words(results: dict[str, Any]) -> str:

@@ -16,7 +16,7 @@ line of sight, and negative in layover.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -219,10 +219,22 @@ def lattice_pixels(grid: Grid) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return rows, columns
 
 
+def levels_m(grid: Grid) -> NDArray[np.float64]:
+    """Return a few heights above a grid's plane, from its lowest pixel to its highest one."""
+    if grid.height_m is None:
+        return np.zeros(1)
+    return np.unique(np.linspace(grid.height_m.min(), grid.height_m.max(), _LEVELS))
+
+
 def sight_lattice(baseline: Baseline, grid: Grid, search_m: tuple[float, float]) -> Lattice:
-    """Return K (rad/m) and the tangent, in rows and columns per metre of rise, above a plane."""
+    """Return K (rad/m) and the tangent, in rows and columns per metre of rise, above a plane.
+
+    They extend over the heights of `search_m` above all pixels of the grid.
+    """
     rows, columns = lattice_pixels(grid)
-    offset_m = np.linspace(*search_m, _LEVELS)
+    above_m = levels_m(grid)
+    offset_m = np.linspace(above_m[0] + search_m[0], above_m[-1] + search_m[1], _LEVELS)
+    grid = replace(grid, height_m=None)
     points_m = grid.positions_m()[np.ix_(rows, columns)][..., None, :]
     points_m = points_m + offset_m[:, None] * np.array([0.0, 0.0, 1.0])
     sight = baseline.sight(points_m.reshape(-1, 3))

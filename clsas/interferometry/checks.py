@@ -15,6 +15,7 @@ from clsas.interferometry.baseline import Baseline
 
 _APART = 0.1  # relative change of the distance between banks that waves of the track may cause
 _MOST_CYCLES = 1e3  # of phase within the search; more need more planes than anyone has time for
+_POINTS = 5  # along either side of a grid, whose geometry is checked; arbitrary
 _LEAST_PHASE_RAD = 0.1  # over the whole search; less is not above the noise of usual coherences
 
 
@@ -32,10 +33,12 @@ def checked_coherence(least_coherence: float) -> float:
 
 
 def check_grid(grid: Grid) -> None:
-    """Raise ValueError unless a grid is a plane that heights along z can raise."""
-    if not grid.is_planar:
-        kind = "arbitrary points" if grid.points_m is not None else "a height map"
-        raise ValueError(f"grid must be a plane, above which heights are measured, got {kind}")
+    """Raise ValueError unless a grid is a plane or height map that heights along z can raise."""
+    if grid.points_m is not None:
+        raise ValueError(
+            "grid must be a plane or height map, above which heights are measured, got arbitrary "
+            "points"
+        )
     if min(grid.shape) < 2:
         raise ValueError(f"grid must have at least 2 rows and 2 columns, got {grid.shape}")
     normal = np.cross(*grid.vectors_m[1:])
@@ -101,7 +104,7 @@ def check_geometry(
         Bandwidth over the frequency in its middle.
     least_coherence : float
     """
-    points_m = grid.spread(5)
+    points_m = grid.spread(_POINTS)
     low_m, high_m = search_m
     # These come first: far from the sonar the phase hardly changes, so a search that reaches too
     # far would be reported as a missing baseline.

@@ -87,10 +87,12 @@ def heights(
     a, b : RangeLines
         Range lines of the two banks: the same pings, with receivers at different heights.
     grid : Grid
-        Plane above which heights are measured, along z.
+        Plane above which heights are measured, along z. If the grid is a height map, such as a
+        coarse bathymetry, its relief is where the search starts.
     search_m : (lowest, highest)
-        Heights above the plane between which the seabed lies, metres. The phase repeats with the
-        height of ambiguity: a seabed outside may appear inside, that much too high or too low.
+        Heights above the pixels of the grid between which the seabed lies, metres: above the plane,
+        or above the relief of a height map. The phase repeats with the height of ambiguity: a
+        seabed outside may appear inside, that much too high or too low.
     window_m : float, optional
         Side of the windows in which the coherence is estimated, metres. It is the resolution of the
         heights. By default windows contain about 50 independent samples.
@@ -109,15 +111,16 @@ def heights(
     Returns
     -------
     Heights
+        They are heights above the plane, also if the grid is a height map.
 
     Raises
     ------
     TypeError, ValueError
         If an argument has the wrong type or is outside its limits; if the banks have different
         pings, carriers or range steps, no distance across the line of sight, or one so large that a
-        level seabed is not coherent; if the grid is no plane, or a vertical one; if the search
-        reaches the sonar or lies outside the range of the lines; or if a window contains fewer than
-        4 independent samples.
+        level seabed is not coherent; if the grid consists of points, or its plane is vertical; if
+        the search reaches the sonar or lies outside the range of the lines; or if a window contains
+        fewer than 4 independent samples.
     DeviceError
         If the device does not exist.
 
@@ -232,7 +235,7 @@ def measure(
     # Rays are exact on the relief that is refined. A sweep needs no more than nearly right ones.
     straight = pair.straightened(grid)
     task = _task(straight, grid, search_m, least_coherence)
-    images = straight.images(grid)
+    images = straight.images(task.level)
     window_m = _default_window_m(images, grid) if window_m is None else window_m
     window = Window.of(grid, window_m)
     looks = effective_looks(images, window)
@@ -285,7 +288,7 @@ def _first_relief(
 ) -> Relief:
     """Return the relief that a sweep over heights finds, from some rows and columns of the grid.
 
-    `images` are those on the plane, which show how many independent samples there are.
+    `images` are those on a level surface, which show how many independent samples there are.
     """
     every = max(min(Window.of(task.grid, window_m).sides) // _SWEPT_PIXELS, 1)
     few = slice(None, None, every)

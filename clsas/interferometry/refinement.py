@@ -95,25 +95,27 @@ def refine(
     ----------
     task : Task
     relief : Relief
-        Heights that the sweep found.
+        Heights above the grid that the sweep found.
     sights : Lattice
         K and the tangent of the curves, from `sight_lattice`.
     window : Window
     looks : float
-        Effective number of looks of a window on the plane. They must not be measured on a relief:
-        its small errors shift the phase of neighbouring pixels, which then seem uncorrelated.
+        Effective number of looks of a window on a level surface. They must not be measured on a
+        relief: its small errors shift the phase of neighbouring pixels, which then seem
+        uncorrelated.
     progress : callable
         Called with the number of passes done.
     """
-    grid = task.grid
+    grid, start_m = task.plane, task.start_m
     found_once = relief.surfaces == 1
     # The sweep misses single curves. Where a window reaches known heights, it decides by itself.
     known = binary_dilation(found_once, np.ones(window.sides)) & (relief.surfaces < 2)
     # A slope that faces the sonar is imaged with more pixels per independent sample.
-    _, level = sensitivity(grid, np.zeros(grid.shape), np.zeros((2, *grid.shape)), sights)
+    level_m = np.full(grid.shape, task.level_m)
+    _, level = sensitivity(grid, level_m, np.zeros((2, *grid.shape)), sights)
     level_growth = edge_growth(window, grid.shape)
     looks_on_plane = looks * window.fullness(grid.shape) / level
-    relief_m = first_m = filled(relief.offset_m, found_once)
+    relief_m = first_m = start_m + filled(relief.offset_m, found_once)
     slope_m = np.array(np.gradient(relief_m))
     for done in range(1, PASSES + 1):
         on_relief = grid.with_height(relief_m)
@@ -144,7 +146,7 @@ def refine(
         progress(done)
         if found.converged:
             break
-        relief_m = filled(planes.height_m, usable)
+        relief_m = start_m + filled(planes.height_m - start_m, usable)
         slope_m = np.stack([planes.row_slope_m, planes.column_slope_m])
     return found
 

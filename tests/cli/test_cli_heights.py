@@ -44,6 +44,36 @@ def test_command_saves_what_the_library_finds(files, tmp_path):
     assert "height of ambiguity 2.0" in text
 
 
+def test_the_search_may_start_from_a_relief(files, tmp_path):
+    output, relief = tmp_path / "heights.h5", tmp_path / "relief.npy"
+    heights_m = np.full((51, 51), 0.3) + np.linspace(0, 0.1, 51)
+    np.save(relief, heights_m)
+    below = (*GRID, "--z", -0.3)
+    given = *files, "--search-m", "-0.3:0.3", "--window-m", 0.2, "-o", output
+    run("heights", *given, *below, "--relief", relief)
+    found = clsas.load(output)
+    plane = clsas.Grid.plane((-0.5, 0.5, 51), (31.5, 32.5, 51), z=-0.3)
+    start = plane.with_height(heights_m)
+    expected = clsas.heights(*flat_banks(), start, search_m=(-0.3, 0.3), window_m=0.2)
+    assert np.array_equal(found.height_m, expected.height_m, equal_nan=True)
+    assert np.nanmedian(found.height_m) == pytest.approx(0.3, abs=0.01)
+
+    np.save(relief, heights_m[1:])
+    wrong = run("heights", *given, *below, "--relief", relief, code=1)
+    assert "--relief must hold 51 x 51 heights" in wrong.stderr
+    np.save(relief, heights_m)
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        "[grid]\nx = { start_m = -0.5, stop_m = 0.5, count = 51 }\n"
+        "y = { start_m = 31.5, stop_m = 32.5, count = 51 }\n"
+        'z_m = -0.3\nheight_file = "relief.npy"\n'
+    )
+    run("heights", *given, "--scene", scene)
+    assert np.array_equal(clsas.load(output).height_m, found.height_m, equal_nan=True)
+    twice = run("heights", *given, "--scene", scene, "--relief", relief, code=2)
+    assert "the grid of the scene has heights" in twice.stderr
+
+
 def test_mistakes_are_reported(files, tmp_path):
     output = "-o", tmp_path / "heights.h5"
     crossed = run("heights", *files, *GRID, "--search-m", "1:-1", *output, code=2)

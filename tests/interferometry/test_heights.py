@@ -183,6 +183,49 @@ def test_relief_of_several_heights_of_ambiguity():
 
 
 @pytest.mark.slow
+def test_a_coarse_relief_narrows_the_search():
+    """The relief is seven heights of ambiguity high, and the search is one high."""
+
+    def coarse(x, y):
+        return 1.0 * np.sin(2 * np.pi * (y - 32) / 12) + 0.05 + 0 * x
+
+    def fine(x, y):
+        return coarse(x, y) + 0.08 * np.sin(2 * np.pi * y / 3) * np.cos(np.pi * x)
+
+    grid = clsas.Grid.plane((-0.5, 0.5, 51), (29, 35, 301), z=-20)
+    lines = banks(fine, snr_db=10, extent_m=((-0.9, 0.9), (27.5, 36.5)), baseline_m=1.5)
+    start = grid.with_height(truth(coarse, grid) + 20)
+    found = heights(*lines, start, search_m=(-0.15, 0.15), window_m=0.18)
+    plane = clsas.Grid.plane((-0.5, 0.5, 51), (29, 35, 301))
+    wide = heights(*lines, plane, search_m=(-1.3, 1.3), window_m=0.18)
+    error_m = found.height_m - (truth(fine, grid) + 20)
+    ambiguity_m = 2 * np.pi * np.median(np.abs(found.m_per_rad))
+    assert np.ptp(truth(coarse, grid)) > 6.5 * ambiguity_m
+    some = coherent(found)
+    assert some.mean() > 0.7
+    assert np.mean(np.abs(error_m[found.mask]) > ambiguity_m / 2) < 0.005
+    rms_m, predicted_m = (np.sqrt(np.mean(each[some] ** 2)) for each in (error_m, found.sd_m))
+    assert rms_m < 1.3 * predicted_m
+    both = found.mask & wide.mask
+    assert both.mean() > 0.97 * wide.mask.mean()
+    apart = (found.height_m - 20 - wide.height_m)[both] / wide.sd_m[both]
+    assert np.sqrt(np.mean(apart**2)) < 0.3
+
+
+def test_a_level_relief_is_a_plane_at_its_height():
+    lines = flat_banks()
+    low = clsas.Grid.plane((-0.8, 0.8, 81), (30.8, 33.2, 121), z=-0.4)
+    start = low.with_height(np.full(low.shape, 0.4))
+    raised = heights(*lines, start, search_m=(-0.5, 0.5), window_m=WINDOW_M)
+    plane = heights(*lines, GRID, search_m=(-0.5, 0.5), window_m=WINDOW_M)
+    assert np.mean(raised.mask == plane.mask) > 0.999
+    both = raised.mask & plane.mask
+    apart_m = np.abs(raised.height_m - 0.4 - plane.height_m)[both]
+    assert apart_m.max() < 0.01 * np.median(plane.sd_m[both])
+    assert raised.image.grid.vectors_m[0][2] == -0.4
+
+
+@pytest.mark.slow
 def test_the_tolerance_adds_little_to_the_deviation():
     lines = banks(dunes, snr_db=17)
     device = open_device()
@@ -341,11 +384,15 @@ class TestBadInput:
         self.refused("search_m must have shape", search_m=(1, 2, 3))
         self.refused("search_m must be finite", search_m=(np.nan, 1))
 
+    def test_search_from_a_relief(self):
+        high = GRID.with_height(np.full(GRID.shape, 11.8))
+        self.refused("must end below the sonar, which is 0.2 m above the grid", grid=high)
+        deep = GRID.with_height(np.full(GRID.shape, -60.0))
+        self.refused("within the range of the lines", grid=deep)
+
     def test_grids(self):
-        raised = GRID.with_height(np.zeros(GRID.shape))
-        self.refused("grid must be a plane.*a height map", grid=raised)
         points = clsas.Grid.points(GRID.positions_m())
-        self.refused("grid must be a plane.*arbitrary points", grid=points)
+        self.refused("grid must be a plane or height map.*arbitrary points", grid=points)
         upright = clsas.Grid.oriented([-1, 32, -1], [0, 0, 0.02], [0.02, 0, 0], (99, 99))
         self.refused("a vertical one", grid=upright)
         narrow = clsas.Grid.plane((0, 1, 51), (32, 32, 1))
