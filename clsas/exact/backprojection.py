@@ -16,7 +16,7 @@ from clsas.exact.preparation import Preparation
 from clsas.exact.run import execute
 from clsas.opencl.device import Device, open_device
 from clsas.signal.ambiguity import BEST_DB, ambiguity
-from clsas.signal.refraction import homogeneous
+from clsas.signal.refraction import Homogeneous, homogeneous
 from clsas.signal.spectrum import OUTSIDE, line_energy, measure_spectrum, occupied_band
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches
@@ -165,19 +165,21 @@ def prepare(
     upsampling: float | None = None,
     beam: BeamWindow | None = None,
     full_model: bool = False,
+    water: Homogeneous | None = None,
 ) -> Preparation:
     """Check the input of `backproject` and decide how to form the image.
 
     Parameters and errors are those of `backproject`. Effects far below `accuracy_db` are left out
     unless `full_model` is set, or `taps` and `upsampling` are both given, so that `accuracy_db` has
-    no effect.
+    no effect. `water` is the homogeneous water of the scene if planning has found it, and warned of
+    its error.
     """
     accuracy_db = check_input(lines, grid, beam, accuracy_db, BEST_ACCURACY_DB)
     grid = placed(lines, grid)
     fixed = taps is not None and upsampling is not None
     allowed_db = None if fixed or full_model else accuracy_db
-    water = homogeneous(lines, grid, beam, allowed_db)
-    model = simplify(water.lines(lines), water.grid, beam, allowed_db)
+    water = water or homogeneous(lines, grid, beam, allowed_db)
+    model = simplify(water.lines(lines), water.grid, water.beam, allowed_db)
     along = None if model.beam is None else model.beam.directions(model.lines)
     device = open_device(device)
     energy = line_energy(model.lines.samples)

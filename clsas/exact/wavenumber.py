@@ -136,7 +136,7 @@ def wavenumber(
         water = homogeneous(lines, grid, beam, None)
         if not water.grid.is_planar:
             raise ValueError("grid must be level for lines with a profile of the sound speed")
-        lines = water.lines(lines)
+        lines, beam = water.lines(lines), water.beam
     band = band_of(lines)
     track = straighten(lines, grid, beam, motion_compensation)
     aspects = aspects_of(lines, track, beam, band)

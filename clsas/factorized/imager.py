@@ -77,7 +77,7 @@ class FactorizedImager:
     ) -> None:
         self._water = known.water or homogeneous(lines, grid, plan.beam, plan.tolerance_db)
         model = known.model or leave_out(
-            self._water.lines(lines), self._water.grid, plan.beam, plan.left_out
+            self._water.lines(lines), self._water.grid, self._water.beam, plan.left_out
         )
         self.grid, self.plan, self.device = grid, plan, device.for_stages()
         self._model, self._warned = model, warned

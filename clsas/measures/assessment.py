@@ -150,7 +150,7 @@ def assess(
     start, water = time.perf_counter(), None
     if lines.sound_speed is not None:
         water = homogeneous(lines, grid, beam, None)
-        lines, grid = water.lines(lines), water.grid
+        lines, grid, beam = water.lines(lines), water.grid, water.beam
     refraction_s = time.perf_counter() - start
     survey = Survey(lines, grid, beam, sonar, track, pointing, element_pattern, ends, water)
     device = open_device(device)

@@ -197,7 +197,7 @@ def autofocus(
     straight = water.lines(bank)
     readout = Readout.of(_of_unit_level(straight), READ_DB)
     passage = Passage.of(straight, names, mean_wavelength_m(readout))
-    focus = _Focus(readout, water.grid, passage, beam, open_device(device), progress)
+    focus = _Focus(readout, water.grid, passage, water.beam, open_device(device), progress)
     focus.check_geometry(names)
     return _of_given(focus.result(), straight, lines)
 

@@ -37,6 +37,8 @@ def former(
     """
     if isinstance(plan.method, ExactImage):
         accuracy_db = plan.method.accuracy_db
-        preparation = prepare(lines, grid, accuracy_db=accuracy_db, beam=plan.beam, device=device)
+        preparation = prepare(
+            lines, grid, accuracy_db=accuracy_db, beam=plan.beam, device=device, water=known.water
+        )
         return ExactImager(preparation, warned=warned)
     return FactorizedImager(lines, grid, plan, device, known=known, warned=warned)

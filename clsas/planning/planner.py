@@ -197,7 +197,7 @@ class Planned:
     ----------
     plan : Plan
     known : Known
-        Results for a factorization; none for an exact image.
+        Results for a factorization; only the homogeneous water for an exact image.
     """
 
     plan: Plan
@@ -211,7 +211,7 @@ def planned(request: Request) -> Planned:
     water = homogeneous(
         given.lines, given.grid, given.beam, None if given.full_model else given.tolerance_db
     )
-    request = given.with_scene(water.lines(given.lines), water.grid)
+    request = given.with_scene(water.lines(given.lines), water.grid, water.beam)
     scene = _simplified(request)
     model = model_of(
         scene.lines, scene.grid, scene.beam, OUTSIDE * power(request.tolerance_db or 0.0)
@@ -230,7 +230,7 @@ def planned(request: Request) -> Planned:
         warn_unreached(request.lines, request.grid, request.beam, model.channels_along)
     chosen = _completed(found, given, scene, water, model, costs)
     if chosen.is_exact or not isinstance(model, VisibilityModel):
-        return Planned(chosen)
+        return Planned(chosen, Known(water=water))
     return Planned(chosen, Known(scene, track, model.surface, water))
 
 

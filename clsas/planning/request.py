@@ -89,11 +89,11 @@ class Request:
         if self.memory_bytes is not None:
             self._set("memory_bytes", validate.count("memory_bytes", self.memory_bytes))
 
-    def with_scene(self, lines: RangeLines, grid: Grid) -> Request:
-        """Return the same request for other lines and another grid, which are not checked again."""
+    def with_scene(self, lines: RangeLines, grid: Grid, beam: BeamWindow | None) -> Request:
+        """Return the same request for another scene, which is not checked again."""
         other = copy.copy(self)
-        other._set("lines", lines)
-        other._set("grid", grid)
+        for name, value in (("lines", lines), ("grid", grid), ("beam", beam)):
+            other._set(name, value)
         return other
 
     def _set(self, name: str, value: object) -> None:

@@ -31,6 +31,7 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.sound_speed import check_reaches
 from clsas.signal.apparent_antennas import Change
+from clsas.signal.apparent_beam import apparent_beam
 from clsas.signal.apparent_pixels import apparent_grid
 from clsas.signal.ray_delays import RaySample, at_speed, sample_points_m, straight_m
 from clsas.sonar.beam import BeamWindow
@@ -89,6 +90,8 @@ class Homogeneous:
     ----------
     grid : Grid
         Pixels, at apparent positions if they do not lie on a level plane.
+    beam : BeamWindow or None
+        Beam whose weights are those of the rays' directions at the antennas.
     sound_speed_m_s : float
         Speed of the homogeneous water; 0 if the lines have no profile.
     change : Change or None
@@ -100,6 +103,7 @@ class Homogeneous:
     """
 
     grid: Grid
+    beam: BeamWindow | None = None
     sound_speed_m_s: float = 0.0
     change: Change | None = None
     error: float = 0.0
@@ -162,26 +166,28 @@ def homogeneous(
     """
     profile = lines.sound_speed
     if profile is None:
-        return Homogeneous(grid)
+        return Homogeneous(grid, beam)
     low, high = grid.bounds_m
     check_reaches(profile, np.array([low[2], high[2]]), "the grid's pixels")
     sample = RaySample.of(lines, grid, beam)
     if not sample.visible.any():
         middle = profile.mean_m_s(float(lines.tx_m[0, 2]), float((low[2] + high[2]) / 2))
-        return Homogeneous(grid, middle)
+        return Homogeneous(grid, beam, middle)
     straight = StraightRays.of(sample)
     mean_m_s, mean_error = straight.sound_speed_m_s, straight.error
     allowed = 0.0 if allowed_db is None else power(allowed_db)
     if mean_error <= SHARE * allowed:
-        return Homogeneous(grid, mean_m_s, None, mean_error, straight)
+        found = Homogeneous(grid, beam, mean_m_s, None, mean_error, straight)
+        return _with_beam(found, lines, sample)
     change = Change.of(lines, sample, allowed_db, sample.middle_m)
-    best = Homogeneous(grid, change.sound_speed_m_s, change, change.error(sample), straight)
+    best = Homogeneous(grid, beam, change.sound_speed_m_s, change, change.error(sample), straight)
     if best.error > SHARE * allowed and not _is_level(grid):
         change = Change.of(lines, sample, allowed_db, sample.middles_m(lines))
         moved = apparent_grid(grid, lines, sample, change)
         error = change.error(sample, sample_points_m(moved))
         if error < best.error:
             best = replace(best, grid=moved, change=change, error=error)
+    best = _with_beam(best, lines, sample)
     best = replace(best, error=best.error + power(change.accuracy_db))
     if allowed and best.error > allowed / 2:
         validate.warn(
@@ -194,3 +200,16 @@ def homogeneous(
 def _is_level(grid: Grid) -> bool:
     low, high = grid.bounds_m
     return bool(high[2] - low[2] <= _LEVEL_M)
+
+
+def _with_beam(water: Homogeneous, lines: RangeLines, sample: RaySample) -> Homogeneous:
+    """Return homogeneous water with the apparent beam, and its error."""
+    if water.beam is None:
+        return water
+    if water.change is None:
+        straight = at_speed(sample.lines, water.sound_speed_m_s)
+    else:
+        straight = water.change.antennas(sample.lines, sample.channels)
+    points_m = sample_points_m(water.grid)
+    beam, error = apparent_beam(water.beam, lines, sample, straight, points_m)
+    return replace(water, beam=beam, error=water.error + error)
