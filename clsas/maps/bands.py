@@ -57,6 +57,19 @@ class Band:
         mean = np.divide(total, weight, out=np.full(total.shape, self.no_data), where=seen)
         return (np.sqrt(mean) if self.is_amplitude else mean).astype(np.float32)
 
+    def halved(self, values: NDArray) -> NDArray[np.float32]:
+        """Return the means of 2 x 2 pixels, of those that have data."""
+        summands, known = self.summands(values)
+        return self.mean(_summed(summands), _summed(known.astype(np.uint8)), 1)
+
+
+def _summed(values: NDArray) -> NDArray:
+    """Return the sums of 2 x 2 values; fewer at the last row and column of odd shapes."""
+    odd = [n % 2 for n in values.shape]
+    even = np.pad(values, [(0, n) for n in odd]) if any(odd) else values
+    rows = even[::2] + even[1::2]
+    return rows[:, ::2] + rows[:, 1::2]
+
 
 def bands_of(source: Source, kind: str) -> tuple[Band, ...]:
     """Return the bands of a raster that shows a source.

@@ -317,8 +317,7 @@ def _check_phase(grid: Grid, lines: RangeLines | None) -> None:
     if lines is None:
         raise ValueError(
             "lines must be given for complex pixels with north_up, since the phase between pixels "
-            "follows from them; without them, form the image on the grid of Georeference.north_up, "
-            "or export it rotated"
+            "follows from them; without them, export the image rotated"
         )
     check_lines(lines, grid)
 

@@ -10,7 +10,6 @@ are averaged themselves. Memory is bounded by the window.
 from __future__ import annotations
 
 import errno
-import itertools
 import math
 import os
 import shutil
@@ -24,7 +23,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import reprs
 from clsas.core.atomic import assembling
 from clsas.core.extras import needed
 from clsas.core.lines import RangeLines
@@ -33,6 +31,7 @@ from clsas.maps.bands import Band, bands_of
 from clsas.maps.carrier import Carrier
 from clsas.maps.collection import Collection
 from clsas.maps.encoding import Encoding, colour_table
+from clsas.maps.geotiff_checks import FULL_BYTES, check_space, check_whole
 from clsas.maps.interpolation import Interpolation
 from clsas.maps.orientation import Orientation
 from clsas.maps.resampling import Resampling, north_up, steps_m
@@ -51,7 +50,6 @@ _COMPRESSION: dict[str, dict[str, str]] = {
     "8bit": {"COMPRESS": "DEFLATE", "PREDICTOR": "NO"},
 }
 
-_FULL_BYTES = 1 << 24  # free space of a disk on which a write failed because it is full
 # Free space per pixel and band that an export needs at least, in bytes: the file, its overviews
 # and, for complex pixels, which are not compressed, their copy.
 _SPACE_BYTES = {"complex": 21, "db": 9, "8bit": 6}
@@ -114,7 +112,7 @@ def write(
     colours = colour_table(options.colour_map) if options.kind == "8bit" else None
     with assembling(path) as folder, rasterio.Env(GDAL_CACHEMAX=_CACHE_MB):
         bands = bands_of(source, options.kind)
-        _check_space(folder, len(bands) * _SPACE_BYTES[options.kind] * source.grid.size)
+        check_space(folder, len(bands) * _SPACE_BYTES[options.kind] * source.grid.size)
         try:
             _Export(folder, source, bands, options, progress).write(
                 folder / path.name, tags, colours
@@ -123,21 +121,10 @@ def write(
             if not type(error).__module__.startswith("rasterio"):
                 raise
             # GDAL prints the cause of a failed write, but does not report it.
-            if shutil.disk_usage(folder).free < _FULL_BYTES:
+            if shutil.disk_usage(folder).free < FULL_BYTES:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
             raise OSError(errno.EIO, f"GDAL cannot write the file ({error})") from error
         source.check_unchanged()
-
-
-def _check_space(folder: Path, least_bytes: int) -> None:
-    """Raise OSError if a folder has too little space. GDAL's own message would be less clear."""
-    free_bytes = shutil.disk_usage(folder).free
-    if free_bytes < least_bytes:
-        raise OSError(
-            errno.ENOSPC,
-            f"the export needs {reprs.quantity(least_bytes, 'bytes')} of free space in the folder "
-            f"of the file, which has {reprs.quantity(free_bytes, 'bytes')}",
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +203,7 @@ class _Export:
         encoding = Encoding(self._options.kind, reference, self._options.dynamic_range_db)
         base = self._levels(first, encoding, tags | self._more_tags, colours)
         self._copy(base, path)
-        _check_whole(path)
+        check_whole(path)
 
     def _read(self, path: Path, dtype: Any) -> None:
         """Write the numbers of all bands in the order of the raster."""
@@ -229,7 +216,7 @@ class _Export:
                         self._largest = max(self._largest, float(np.abs(values).max()))
                     self._put(file, window, self._turned.turned(values), number)
                 self._steps.add(values.size)
-        _check_whole(path)
+        check_whole(path)
 
     def _resampled(self, given: Path) -> Path:
         """Write the numbers on the axes of the map; return the file."""
@@ -242,17 +229,17 @@ class _Export:
             )
         shape, affine = north_up(self._shape, self._affine, pixel_m)
         path = self._folder / "north_up.tif"
-        share = self._source.grid.size / (shape[0] * shape[1])
         with _opened(given) as file:
             side, values_at = self._resampler(file, affine)
             self._shape, self._affine = shape, affine
+            share = self._source.grid.size / (shape[0] * shape[1])
             with self._created(path, shape, file.dtypes[0]) as new:
                 for rows, columns in windows_of(shape, (side, side)):
                     for number in range(1, len(self._bands) + 1):
                         self._put(new, (rows, columns), values_at(rows, columns, number), number)
                     pixels = (rows.stop - rows.start) * (columns.stop - columns.start)
                     self._steps.add(int(pixels * share))
-        _check_whole(path)
+        check_whole(path)
         given.unlink()
         return path
 
@@ -313,11 +300,11 @@ class _Export:
                         pixels = encoding.encode(values) if band.is_amplitude else values
                         self._put(encoded, window, pixels, number)
                     if smaller is not None:
-                        self._put(smaller, halves, _halved(values, band), number)
+                        self._put(smaller, halves, band.halved(values), number)
                 self._steps.add(values.size * 3 // 4)
         for written in (level.path, None if below is None else below.numbers):
             if written is not None:
-                _check_whole(written)
+                check_whole(written)
 
     def _describe(
         self, path: Path, encoding: Encoding, tags: dict[str, str], colours: dict | None
@@ -355,7 +342,7 @@ class _Export:
 
         tiles = math.prod(math.ceil(n / _TILE) for n in shape)
         bands = len(self._bands)
-        _check_space(self._folder, bands * tiles * _TILE**2 * np.dtype(dtype).itemsize)
+        check_space(self._folder, bands * tiles * _TILE**2 * np.dtype(dtype).itemsize)
         tiled = {"tiled": True, "blockxsize": _TILE, "blockysize": _TILE, "BIGTIFF": "YES"}
         return rasterio.open(
             path, "w", driver="GTiff", height=shape[0], width=shape[1], count=bands, dtype=dtype,
@@ -391,37 +378,3 @@ def _description(band: Band, encoding: Encoding) -> str:
     if encoding.kind == "complex":
         return "Complex pixels"
     return f"{band.name} (dB re {encoding.reference:.9g})"
-
-
-def _halved(values: NDArray, band: Band) -> NDArray[np.float32]:
-    """Return the means of 2 x 2 pixels, of those that have data."""
-    summands, known = band.summands(values)
-    return band.mean(_summed(summands), _summed(known.astype(np.uint8)), 1)
-
-
-def _summed(values: NDArray) -> NDArray:
-    """Return the sums of 2 x 2 values; fewer at the last row and column of odd shapes."""
-    odd = [n % 2 for n in values.shape]
-    even = np.pad(values, [(0, n) for n in odd]) if any(odd) else values
-    rows = even[::2] + even[1::2]
-    return rows[:, ::2] + rows[:, 1::2]
-
-
-def _check_whole(path: Path) -> None:
-    """Raise OSError if a file or an overview in it lacks a tile.
-
-    GDAL does not report a full disk if it notices that only when a file is closed.
-    """
-    size_bytes = path.stat().st_size
-    with _opened(path) as file:
-        for band in range(1, file.count + 1):
-            for level in (None, *range(len(file.overviews(band)))):
-                factor = 1 if level is None else 2 ** (level + 1)
-                down, across = (math.ceil(n / factor / _TILE) for n in file.shape)
-                for row, column in itertools.product(range(down), range(across)):
-                    place, length = (
-                        int(file.get_tag_item(f"{name}_{column}_{row}", "TIFF", band, level) or 0)
-                        for name in ("BLOCK_OFFSET", "BLOCK_SIZE")
-                    )
-                    if not place or place + length > size_bytes:
-                        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -35,7 +35,9 @@ _BETA = float(signal.kaiser_beta(_STOP_DB))  # of the Kaiser window that has it
 _BLOCK = 256  # pixels along either side of the blocks whose spectrum is measured
 _MOST_BLOCKS = 32  # of them along either side of the image: a plain choice
 _USED = 0.4  # half the band over the sample rate at which images are interpolated well
-_WINDOW = 1024  # of pixels as large as those of the image: 100 MB with what they depend on
+# Rows and columns of new pixels as large as those of the image that are interpolated at once. They
+# take 200 MB with the pixels around them and their spectrum: a plain choice.
+_WINDOW = 1024
 _ACCURACY = 1e-5  # of the non-uniform FFT
 
 Reader = Callable[[slice, slice], NDArray[np.complex64]]
@@ -88,8 +90,8 @@ class Interpolation:
         best = good[0] if good else int(np.argmin(errors_db))
         if errors_db[best] > MOST_ERROR_DB:
             raise ValueError(
-                f"north_up would change complex pixels by up to {errors_db[best]:.1f} dB, at most "
-                f"{MOST_ERROR_DB:g} dB is allowed: {_remedy(carrier, steps_m(affine))}"
+                f"north_up would cause an error of up to {errors_db[best]:.1f} dB in complex "
+                f"pixels, more than {MOST_ERROR_DB:g} dB: {_remedy(carrier, steps_m(affine))}"
             )
         return cls(carrier, affine, onto, guards[best], errors_db[best])
 

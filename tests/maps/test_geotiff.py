@@ -335,6 +335,7 @@ def test_images_without_a_place_on_a_map_are_refused(tmp_path):
         (image, {"colour_map": "gray"}, "colour_map must be left out, .* kind 'db'"),
         (image, {"pixel_m": 1.0}, "pixel_m must be left out, .* without north_up"),
         (image, {"north_up": True, "pixel_m": 100.0}, "pixel_m must be at most 16 times"),
+        (image, {"north_up": True, "pixel_m": 1e300}, "pixel_m must be at most 16 times"),
         (image, {"kind": "8bit", "colour_map": "none such"}, "colour_map must be"),
         (image, {"kind": "float"}, "kind must be"),
         (image, {"reference": 0.0}, "reference must be"),

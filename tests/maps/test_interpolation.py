@@ -104,6 +104,21 @@ def test_it_is_the_image_formed_on_the_axes_of_the_map(name, tmp_path):
 
 
 @pytest.mark.slow
+def test_the_carrier_is_that_of_moving_arrays_and_squinted_beams(tmp_path):
+    place = local(217.0)
+    lines, grid = lines_of(place, "points"), grid_of(place, 0.0125)
+    apart_m = 0.04 * (np.arange(lines.channels) % 10)[:, None] * [1, 0, 0]
+    # Samples of another geometry are as good: they defocus the image.
+    lines = replace(lines, rx_m=lines.tx_m + apart_m, rx_velocity_m_s=[2.0, 0, 0])
+    beam = clsas.BeamWindow(10.0, "hann", squint_deg=8.0, along=[1, 0, 0])
+    image = clsas.backproject(lines, grid, beam=beam, accuracy_db=-80)
+    found, stated_db = resampled(image, tmp_path / "a.tif", lines=lines, beam=beam)
+    expected = clsas.backproject(lines, place.north_up(grid), beam=beam, accuracy_db=-80).pixels
+    assert stated_db < -60
+    assert error_db(found, expected) < 10 * np.log10(10 ** (stated_db / 10) + 4e-8)
+
+
+@pytest.mark.slow
 def test_a_beam_that_ends_abruptly_states_its_error_or_is_refused(tmp_path):
     place = local(217.0)
     lines, grid = lines_of(place, "speckle"), grid_of(place, 0.0125)
@@ -245,11 +260,12 @@ def test_what_cannot_be_resampled_is_refused(tmp_path):
         (image, {"lines": far, "beam": BEAM}, "lines must reach the image within the beam"),
         (tiny, {"lines": lines, "beam": BEAM}, "source must have at least 26 rows and columns"),
         (image, {"lines": lines, "pixel_m": 2.0}, "pixel_m must be at most 16 times"),
+        (image, {"lines": lines, "pixel_m": 1e300}, "pixel_m must be at most 16 times"),
         (
             image, {"lines": lines, "beam": BEAM},
-            r"north_up would change complex pixels by up to .* dB, at most -40 dB is allowed: form "
-            r"the image on the grid of Georeference.north_up, or with rows at most 0.01\d* m and "
-            r"columns at most 0.0\d* m apart \(they are 0.05 m and 0.05 m\)",
+            r"north_up would cause an error of up to .* dB in complex pixels, more than -40 dB: "
+            r"form the image on the grid of Georeference.north_up, or with rows at most 0.01\d* m "
+            r"and columns at most 0.0\d* m apart \(they are 0.05 m and 0.05 m\)",
         ),
         (
             noise(grid_of(place, 0.01)), {"lines": lines, "beam": BEAM},

@@ -1,0 +1,51 @@
+"""Checks of GeoTIFF files for a full disk, which GDAL does not always report."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import math
+import os
+import shutil
+from pathlib import Path
+
+from clsas.core import reprs
+
+FULL_BYTES = 1 << 24
+"""Free space of a disk on which a write failed because it is full."""
+
+
+def check_space(folder: Path, least_bytes: int) -> None:
+    """Raise OSError if a folder has too little space. GDAL's own message would be less clear."""
+    free_bytes = shutil.disk_usage(folder).free
+    if free_bytes < least_bytes:
+        raise OSError(
+            errno.ENOSPC,
+            f"the export needs {reprs.quantity(least_bytes, 'bytes')} of free space in the folder "
+            f"of the file, which has {reprs.quantity(free_bytes, 'bytes')}",
+        )
+
+
+def check_whole(path: Path) -> None:
+    """Raise OSError if a file or an overview in it lacks a tile.
+
+    GDAL does not report a full disk if it notices that only when a file is closed.
+    """
+    import rasterio
+
+    size_bytes = path.stat().st_size
+    with rasterio.open(path) as file:
+        for band in range(1, file.count + 1):
+            for level in (None, *range(len(file.overviews(band)))):
+                factor = 1 if level is None else 2 ** (level + 1)
+                down, across = (
+                    math.ceil(n / factor / side)
+                    for n, side in zip(file.shape, file.block_shapes[band - 1], strict=True)
+                )
+                for row, column in itertools.product(range(down), range(across)):
+                    place, length = (
+                        int(file.get_tag_item(f"{name}_{column}_{row}", "TIFF", band, level) or 0)
+                        for name in ("BLOCK_OFFSET", "BLOCK_SIZE")
+                    )
+                    if not place or place + length > size_bytes:
+                        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
