@@ -110,11 +110,12 @@ def pair_errors(
         psi = phase - 2 pi f0 delay + roll k u.(v x B)
 
     with the direction u from the receivers to the scatterer, the direction v of the track, and the
-    baseline B from a to b. For a vertical baseline B, this is phase + roll k B cos(depression).
+    baseline B from a to b. With B vertical and the seabed to port, the last term is
+    -roll k B cos(depression): if the port side is up, the seabed seems lower.
     The phase and the roll that bring heights closest to those expected are found by least squares,
     weighted by the deviations of the heights, without heights that differ by more than 4
-    deviations. Windows of neighbouring heights overlap; the deviations of the estimates account
-    for it.
+    deviations. The deviations of the estimates account for windows of neighbouring heights that
+    overlap, and for 0.05 deviations of error that heights have in common over the swath.
 
     Phase and roll can be told apart only if the depression varies. An error is held if its
     deviation exceeds 0.5 rad of phase, or 30 times the one it would have if the others were known.
@@ -126,7 +127,7 @@ def pair_errors(
 
     Two tracks show the differences of their displacements only. Those are not constant where the
     tracks see a place at different ranges. On opposite tracks that look at the strip between them
-    at the ground ranges y and Y - y, the difference is phase (R1 - R2)/(k B) + roll (2 y - Y).
+    at the ground ranges y and Y - y, the difference is phase (R1 - R2)/(k B) - roll (2 y - Y).
 
     Examples
     --------
@@ -173,7 +174,8 @@ def pair_errors(
     _check_measured(a, b, found, "found")
     if other is not None:
         measured.append(_checked_other(other, a))
-    pairs = [Pair(*lines, tolerance_db, None, beam, open_device(device)) for *lines, _ in measured]
+    opened = open_device(device)
+    pairs = [Pair(low, high, tolerance_db, None, beam, opened) for low, high, _ in measured]
     surfaces = [
         Displaced.of(pair, heights) for pair, (_, _, heights) in zip(pairs, measured, strict=True)
     ]
@@ -245,16 +247,17 @@ def _checked_other(
         raise ValueError(f"other must be (a, b, found) of another track, got {len(parts)} entries")
     for part, kind in zip(parts, kinds, strict=True):
         validate.instance("every entry of other", part, kind)
+    low, high, found = parts
     try:
-        _check_measured(*parts, "found")
+        _check_measured(low, high, found, "found")
     except ValueError as error:
         raise ValueError(f"other: {error}") from None
-    if not math.isclose(parts[0].carrier_hz, a.carrier_hz, rel_tol=1e-9):
+    if not math.isclose(low.carrier_hz, a.carrier_hz, rel_tol=1e-9):
         raise ValueError(
             "other must be lines of the same sonar, with the same carrier_hz, got "
-            f"{parts[0].carrier_hz:.9g} and {a.carrier_hz:.9g} Hz"
+            f"{low.carrier_hz:.9g} and {a.carrier_hz:.9g} Hz"
         )
-    return parts[0], parts[1], parts[2]
+    return low, high, found
 
 
 def _check_belongs(surface: Displaced, name: str) -> None:
@@ -336,8 +339,8 @@ def _unobservable(
     sd_rad = float(np.sqrt(fit.covariance[0, 0])) * (comparison.roll_rad if column else 1.0)
     return ValueError(
         f"{name} is not observable from these heights: its standard deviation would be "
-        f"{sd_rad:.2g} rad of phase, more than {_MOST_SD_RAD:g} rad. Heights on two tracks show it "
-        "where the tracks are at different ranges"
+        f"{sd_rad:.2g} rad of phase, more than {_MOST_SD_RAD:g} rad. More places or a smaller "
+        "known_sd_m show it, or two tracks at different ranges"
     )
 
 
