@@ -126,6 +126,7 @@ def heights(
     See Also
     --------
     interferogram : Phase and coherence of two images.
+    pair_errors : Phase, delay and roll of the banks, from known heights.
 
     Notes
     -----
@@ -157,9 +158,10 @@ def heights(
     Errors that all pixels have in common are not part of the deviation. A constant phase between
     the banks, as from a delay of one receiver, adds `Heights.m_per_rad` per radian. An error of the
     baseline's roll turns the seabed about the track by as much: 1 mm of height per metre of ground
-    range and mrad. Side lobes of brighter places carry the phase of those places; weight the band
-    in `compress` where the brightness varies strongly. On simulated dunes with an unweighted band,
-    errors were 1.1 times the deviation, and with a Hamming window 1.0 times.
+    range and mrad. `pair_errors` estimates both. Side lobes of brighter places carry the phase of
+    those places; weight the band in `compress` where the brightness varies strongly. On simulated
+    dunes with an unweighted band, errors were 1.1 times the deviation, and with a Hamming window
+    1.0 times.
 
     The track may sway, but must be close to straight over the channels that see a pixel, since a
     scatterer above an imaged surface appears in one place only then.

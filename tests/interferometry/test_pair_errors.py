@@ -53,8 +53,7 @@ def deviations(errors, true):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("name", ERRORS)
+@pytest.mark.parametrize(("name", "seed"), [*((name, 1) for name in ERRORS), ("all", 2)])
 def test_errors_are_recovered_and_removed(name, seed):
     lines, errors = estimated(name, seed)
     assert errors.unknowns == ("phase", "delay", "roll")
@@ -76,30 +75,26 @@ def test_errors_are_recovered_and_removed(name, seed):
 def test_deviations_are_honest():
     found = [
         deviations(estimated("all", seed, flat if seed % 2 else dunes)[1], ERRORS["all"])
-        for seed in range(1, 11)
+        for seed in range(1, 9)
     ]
     rms = np.sqrt(np.mean(np.square(found), axis=0))
-    # 95 % of the rms values of 10 Gaussian samples lie between 0.57 and 1.43.
+    # 95 % of the rms values of 8 Gaussian samples lie between 0.52 and 1.48.
     assert np.all(rms > 0.45)
-    assert np.all(rms < 1.43)
+    assert np.all(rms < 1.48)
 
 
 @pytest.mark.slow
 def test_two_tracks_show_the_errors_without_known_heights():
     true = ERRORS["all"]
-    here, there = (
-        swaths.banks(dunes, 1, track_y_m=y_m, heading=heading, **true)
-        for y_m, heading in ((0.0, 1), (60.0, -1))
-    )
-    other = (*there, measured(there))
-    errors = clsas.pair_errors(*here, measured(here), other=other)
+    here, there = (swaths.banks(flat, 1, track_y_m=y_m, **true) for y_m in (0.0, -10.0))
+    found, other = measured(here), (*there, measured(there))
+    errors = clsas.pair_errors(*here, found, other=other)
     assert errors.unknowns == ("phase", "delay", "roll")
     assert np.abs(deviations(errors, true)).max() < 2
-    # The heights of both tracks now agree, and by more than their sum was shown.
-    corrected = here[0], errors.corrected(*here)
-    right = measured(corrected)
-    error_m = (right.height_m - reliefs.truth(dunes, swaths.GRID))[right.mask]
-    assert abs(error_m.mean()) < 3 * max(errors.height_sd_m)
+    right = measured((here[0], errors.corrected(*here)))
+    before_m, after_m = (each.height_m[each.mask] for each in (found, right))
+    assert abs(before_m.mean()) > 0.3
+    assert abs(after_m.mean()) < 2 * max(errors.height_sd_m) < 0.03
 
 
 @pytest.mark.slow
