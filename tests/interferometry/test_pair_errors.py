@@ -11,7 +11,11 @@ from reliefs import flat_banks
 
 import clsas
 from clsas.core.validate import ClsasWarning
+from clsas.interferometry import pair_errors
+from clsas.interferometry.misregistration import ConstantPhase, constant_phase
+from clsas.interferometry.pair import Pair
 from clsas.interferometry.pair_errors_result import PairErrors, turned
+from clsas.opencl.device import open_device
 
 CYCLE_S = 1 / reliefs.CARRIER_HZ
 UNITS = {"phase": "phase_rad", "delay": "delay_s", "roll": "roll_rad"}
@@ -168,6 +172,27 @@ def test_phase_and_delay_are_told_apart_by_the_band():
     assert np.abs(deviations(errors, {"phase_rad": 0.5})).max() < 2.5
     assert errors.sd[0] < 0.1
     assert errors.correlation[0, 1] > 0.9
+
+
+@pytest.mark.parametrize(("known_m", "held"), [(0.0, "delay"), (1.3, "phase")])
+def test_a_band_too_narrow_leaves_phase_or_delay_alone(monkeypatch, known_m, held):
+    first, second, found = narrow()
+    monkeypatch.setattr(pair_errors, "constant_phase", lambda *_: ConstantPhase(0.0, np.inf))
+    with pytest.warns(ClsasWarning, match=f"{held} is not observable here, because the band"):
+        errors = clsas.pair_errors(
+            first, second, found, known_height_m=known_m, unknowns=("phase", "delay")
+        )
+    # More than half a cycle displaces heights only if it is a delay.
+    assert errors.held == (held,)
+    assert errors.values[0] > 0
+
+
+def test_a_single_window_shows_no_slope_over_the_band():
+    first, second, found = narrow()
+    mask = np.zeros_like(found.mask)
+    mask[11:22, 11:22] = True
+    pair = Pair(first, second, -40.0, None, None, open_device())
+    assert constant_phase(pair, replace(found, mask=mask)).sd_rad == np.inf
 
 
 def test_control_points_and_heights_between_nan():
