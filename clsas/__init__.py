@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from clsas.inspection.result import Inspection, PhaseSign
     from clsas.interferometry.heights import heights
     from clsas.interferometry.interferogram import Interferogram, interferogram
+    from clsas.interferometry.pair_errors import PairErrors, pair_errors
     from clsas.interferometry.result import Heights
     from clsas.maps.exporting import export
     from clsas.measures.assessment import assess, survey_lines
@@ -88,6 +89,7 @@ __all__ = [
     "Limits",
     "Micronavigation",
     "Mosaic",
+    "PairErrors",
     "Patch",
     "PhaseSign",
     "Plan",
@@ -126,6 +128,7 @@ __all__ = [
     "micronavigate",
     "mosaic",
     "multilook",
+    "pair_errors",
     "plan",
     "plot",
     "process",
@@ -171,6 +174,7 @@ _MODULES = {
     "inspection.result": "Inspection PhaseSign",
     "interferometry.heights": "heights",
     "interferometry.interferogram": "Interferogram interferogram",
+    "interferometry.pair_errors": "PairErrors pair_errors",
     "interferometry.result": "Heights",
     "maps.exporting": "export",
     "measures.assessment": "assess survey_lines",

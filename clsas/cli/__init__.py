@@ -32,6 +32,7 @@ _GROUPS = {
         ),
         "navigate": ("navigation", "Correct the track of an array by micronavigation."),
         "focus": ("navigation", "Correct a track by autofocus on bright responses."),
+        "pair-errors": ("pair_errors", "Correct phase, delay and roll of two receiver banks."),
     },
     "Images": {
         "process": ("processing", "Take a recording to a focused image, step by step."),

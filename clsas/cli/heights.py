@@ -11,10 +11,10 @@ import numpy as np
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load_lines, read_beam, read_grid
+from clsas.cli.inputs import load_banks, load_lines, read_beam, read_grid
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, Parsed
-from clsas.core import banks, validate
+from clsas.core import validate
 from clsas.files.height_files import read_heights
 from clsas.interferometry.checks import checked_coherence
 from clsas.interferometry.heights import LEAST_COHERENCE
@@ -103,16 +103,8 @@ def heights(
         grid = _raised(grid, relief)
     beam = read_beam(described, given)
     if second_file is None:
-        lines = load_lines(first_file, None, described)
-        if lines.banks != 2:
-            raise ValueError(
-                f"{first_file} must hold range lines of 2 receiver banks, got {lines.banks}: give "
-                "the lines of the other bank as a second file"
-                if lines.banks == 1
-                else f"{first_file} must hold range lines of 2 receiver banks, got {lines.banks}: "
-                "take two of them by clsas convert --bank"
-            )
-        first, second = (lines.bank(number) for number in banks.present(lines.bank_numbers))
+        lines, numbers_of_banks = load_banks(first_file, described)
+        first, second = (lines.bank(number) for number in numbers_of_banks)
     else:
         first, second = (load_lines(each, None, described) for each in (first_file, second_file))
     with progress_bar("measuring heights") as progress:

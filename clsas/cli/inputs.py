@@ -11,7 +11,7 @@ import click
 import clsas
 from clsas.cli.outputs import warn
 from clsas.cli.parameters import keep_apart, need_matplotlib, written_to
-from clsas.core import validate
+from clsas.core import banks, validate
 from clsas.files import scene_files as config
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS
@@ -52,6 +52,23 @@ def load_lines(
         return lines.bank(bank)
     except ValueError as error:
         raise ValueError(f"{path}: {str(error).replace('number', '--bank', 1)}") from None
+
+
+def load_banks(
+    path: Path, described: SceneFile | None = None
+) -> tuple[clsas.RangeLines, tuple[int, int]]:
+    """Return the range lines of a file that holds two receiver banks, and the banks' numbers."""
+    lines = load_lines(path, None, described)
+    if lines.banks != 2:
+        raise ValueError(
+            f"{path} must hold range lines of 2 receiver banks, got {lines.banks}: give "
+            "the lines of the other bank as a second file"
+            if lines.banks == 1
+            else f"{path} must hold range lines of 2 receiver banks, got {lines.banks}: "
+            "take two of them by clsas convert --bank"
+        )
+    first, second = banks.present(lines.bank_numbers)
+    return lines, (int(first), int(second))
 
 
 def read_scene(path: Path) -> SceneFile:

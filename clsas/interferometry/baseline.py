@@ -17,7 +17,7 @@ line of sight, and negative in layover.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,27 +28,11 @@ from clsas.core.lines import RangeLines, some_channels
 from clsas.core.wavelengths import wavelength_m
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.directions import track_directions
+from clsas.sonar.elevation import Sight, sight_along
 
 _POINTS_AT_ONCE = 64
-_LEAST_RISE = 1e-3  # of the tangent; directly below a track, no scatterer changes its height
 _LATTICE = 9  # points along either side of a grid; 5 and 17 change heights by at most 1 mm
 _LEVELS = 5  # heights of a lattice; 3 and 9 give the same heights
-
-
-class Sight(NamedTuple):
-    """How two banks see some points.
-
-    Attributes
-    ----------
-    rad_m : float64 [points]
-        Change K of the phase per metre of height along the curves of equal range; 0 where the
-        curve does not rise.
-    tangent : float64 [points, 2]
-        x and y of the curve's tangent, per metre of rise.
-    """
-
-    rad_m: NDArray[np.float64]
-    tangent: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +73,7 @@ class Baseline:
     def _sight(self, points_m: NDArray[np.float64]) -> Sight:
         weight = self._weights(points_m)
         difference, mean = self._gradients(points_m, weight)
-        tangent = np.cross(weight @ self.along, mean)
-        rise = tangent[:, 2]
-        rises = np.abs(rise) > _LEAST_RISE * np.linalg.norm(tangent, axis=1)
-        tangent = np.where(rises[:, None], tangent / np.where(rises, rise, 1)[:, None], 0)
-        return Sight(self.rad_per_m * np.einsum("pi,pi->p", difference, tangent), tangent[:, :2])
+        return sight_along(weight @ self.along, mean, difference, self.rad_per_m)
 
     def gradients(
         self, points_m: NDArray[np.float64]

@@ -16,7 +16,7 @@ from clsas.interferometry.coherence import Window
 from clsas.interferometry.displaced import Displaced
 from clsas.interferometry.error_fit import Equations, Places
 
-_PER_WINDOW = 3  # pixels compared along each side of a window; neighbours show hardly more
+_PER_WINDOW = 3  # pixels compared along each side of a window; twice as many show hardly more
 
 
 @dataclass(frozen=True, eq=False)

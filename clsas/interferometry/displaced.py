@@ -145,7 +145,9 @@ class Displaced:
         return in_pixels(self.plane, places_m - self.plane.vectors_m[0][:2])
 
     def plane_z_m(
-        self, row: NDArray[np.float64], column: NDArray[np.float64]
+        self,
+        row: NDArray[np.float64] | NDArray[np.int64],
+        column: NDArray[np.float64] | NDArray[np.int64],
     ) -> NDArray[np.float64]:
         """Return the z of the plane, [n]."""
         origin_m, row_step_m, column_step_m = self.plane.vectors_m

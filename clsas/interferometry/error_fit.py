@@ -157,8 +157,7 @@ def _robust_step(equations: Equations) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 def _least_squares(design: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-    solution: NDArray[np.float64] = np.linalg.lstsq(design, wanted, rcond=None)[0]
-    return solution
+    return np.asarray(np.linalg.lstsq(design, wanted, rcond=None)[0], np.float64)
 
 
 def _described(

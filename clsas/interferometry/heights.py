@@ -134,6 +134,7 @@ def heights(
     See Also
     --------
     interferogram : Phase and coherence of two images.
+    pair_errors : Phase, delay and roll of the banks, from known heights.
 
     Notes
     -----
@@ -167,7 +168,7 @@ def heights(
     Errors that all pixels have in common are not part of the deviation. A constant phase between
     the banks, as from a delay of one receiver, adds `Heights.m_per_rad` per radian. An error of the
     baseline's roll turns the seabed about the track by as much: 1 mm of height per metre of ground
-    range and mrad.
+    range and mrad. `pair_errors` estimates both.
 
     Side lobes and ambiguities of brighter places carry the phase of those places. Weight the band
     in `compress` and the directions by `beam` where the brightness varies strongly. On simulated

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from clsas.core import validate
 from clsas.core.lines import RangeLines
 from clsas.core.wavelengths import cycles_per_m_at
 from clsas.interferometry.checks import check_pair
-from clsas.interferometry.comparisons import Comparison, at_pixels, at_points, in_overlap
+from clsas.interferometry.comparisons import at_pixels, at_points, in_overlap
 from clsas.interferometry.displaced import Displaced
-from clsas.interferometry.error_fit import Equations, Fit, fitted
+from clsas.interferometry.estimate import MOST_SD_RAD, Estimate, estimated
 from clsas.interferometry.misregistration import ConstantPhase, constant_phase
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.pair_errors_result import UNKNOWNS, PairErrors
@@ -25,10 +24,6 @@ from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
 from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow
 
-_MOST_SD_RAD = 0.5  # of an error that is observable, as a phase; a plain choice
-# Deviation of an error relative to what it would be if the others were known. The model's own
-# errors of phase, some milliradians that vary over the swath, grow by as much.
-_MOST_AMPLIFICATION = 30.0
 _MRAD = 1e-3
 _UNLIKE = 5.0  # ratio of sensitivities that no slope of the seabed explains
 
@@ -110,11 +105,12 @@ def pair_errors(
         psi = phase - 2 pi f0 delay + roll k u.(v x B)
 
     with the direction u from the receivers to the scatterer, the direction v of the track, and the
-    baseline B from a to b. For a vertical baseline B, this is phase + roll k B cos(depression).
+    baseline B from a to b. With B vertical and the seabed to port, the last term is
+    -roll k B cos(depression): if the port side is up, the seabed seems lower.
     The phase and the roll that bring heights closest to those expected are found by least squares,
     weighted by the deviations of the heights, without heights that differ by more than 4
-    deviations. Windows of neighbouring heights overlap; the deviations of the estimates account
-    for it.
+    deviations. The deviations of the estimates account for windows of neighbouring heights that
+    overlap, and for 0.05 deviations of error that heights have in common over the swath.
 
     Phase and roll can be told apart only if the depression varies. An error is held if its
     deviation exceeds 0.5 rad of phase, or 30 times the one it would have if the others were known.
@@ -126,7 +122,7 @@ def pair_errors(
 
     Two tracks show the differences of their displacements only. Those are not constant where the
     tracks see a place at different ranges. On opposite tracks that look at the strip between them
-    at the ground ranges y and Y - y, the difference is phase (R1 - R2)/(k B) + roll (2 y - Y).
+    at the ground ranges y and Y - y, the difference is phase (R1 - R2)/(k B) - roll (2 y - Y).
 
     Examples
     --------
@@ -151,10 +147,10 @@ def pair_errors(
     >>> print(f"{errors.phase_rad:.1f} rad")
     0.5 rad
     >>> right = clsas.heights(lower, errors.corrected(lower, upper), grid, search_m=(-0.5, 0.5))
-    >>> print(f"{np.median(found.height_m[found.mask]):.2f} m before")
-    0.12 m before
-    >>> print(f"{abs(np.median(right.height_m[right.mask])):.2f} m after")
-    0.00 m after
+    >>> print(f"{np.median(found.height_m[found.mask]):.1f} m before")
+    0.1 m before
+    >>> print(f"{abs(np.median(right.height_m[right.mask])):.1f} m after")
+    0.0 m after
     """
     unknowns = _checked_unknowns(unknowns)
     tolerance_db = validate.number(
@@ -173,7 +169,8 @@ def pair_errors(
     _check_measured(a, b, found, "found")
     if other is not None:
         measured.append(_checked_other(other, a))
-    pairs = [Pair(*lines, tolerance_db, None, beam, open_device(device)) for *lines, _ in measured]
+    opened = open_device(device)
+    pairs = [Pair(low, high, tolerance_db, None, beam, opened) for low, high, _ in measured]
     surfaces = [
         Displaced.of(pair, heights) for pair, (_, _, heights) in zip(pairs, measured, strict=True)
     ]
@@ -186,7 +183,7 @@ def pair_errors(
     else:
         assert known_height_m is not None
         comparison = at_pixels(surfaces[0], known_height_m, known_sd_m)
-    estimate = _estimate(comparison, unknowns, names[0])
+    estimate = estimated(comparison, unknowns, names[0])
     constant = None
     if {"phase", "delay"} <= set(unknowns) and 0 in estimate.columns:
         constant = _mean_phase(
@@ -196,28 +193,6 @@ def pair_errors(
     for sentence in errors.held_in_words():
         validate.warn(sentence)
     return errors
-
-
-@dataclass(frozen=True, eq=False)
-class _Estimate:
-    """A phase, a roll or both.
-
-    Attributes
-    ----------
-    columns : list of int
-        Which were estimated: 0 for the phase, 1 for the roll.
-    values, covariance : float64 [2], [2, 2]
-        Both errors, 0 where they were not estimated.
-    absorbed : float
-        Phase that an estimate of the phase alone would absorb per radian of roll.
-    fit : Fit
-    """
-
-    columns: list[int]
-    values: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    absorbed: float
-    fit: Fit
 
 
 def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
@@ -245,16 +220,17 @@ def _checked_other(
         raise ValueError(f"other must be (a, b, found) of another track, got {len(parts)} entries")
     for part, kind in zip(parts, kinds, strict=True):
         validate.instance("every entry of other", part, kind)
+    low, high, found = parts
     try:
-        _check_measured(*parts, "found")
+        _check_measured(low, high, found, "found")
     except ValueError as error:
         raise ValueError(f"other: {error}") from None
-    if not math.isclose(parts[0].carrier_hz, a.carrier_hz, rel_tol=1e-9):
+    if not math.isclose(low.carrier_hz, a.carrier_hz, rel_tol=1e-9):
         raise ValueError(
             "other must be lines of the same sonar, with the same carrier_hz, got "
-            f"{parts[0].carrier_hz:.9g} and {a.carrier_hz:.9g} Hz"
+            f"{low.carrier_hz:.9g} and {a.carrier_hz:.9g} Hz"
         )
-    return parts[0], parts[1], parts[2]
+    return low, high, found
 
 
 def _check_belongs(surface: Displaced, name: str) -> None:
@@ -267,78 +243,6 @@ def _check_belongs(surface: Displaced, name: str) -> None:
             f"{name} must be measured from the lines given, in the same order: its m_per_rad is "
             f"{expected * ratio:.3g} m, and that of the lines about {expected:.3g} m"
         )
-
-
-def _estimate(comparison: Comparison, unknowns: tuple[str, ...], given: str) -> _Estimate:
-    """Return the errors of phase and roll; those that are not observable are left out."""
-    columns = list(dict.fromkeys(int(name == "roll") for name in unknowns))
-    while True:
-        fit = _fit(comparison, columns)
-        if fit is None:
-            raise _incomparable(comparison, given)
-        if _is_observable(fit.covariance, columns, comparison.roll_rad):
-            break
-        if len(columns) == 1:
-            raise _unobservable(fit, unknowns, columns[0], comparison)
-        columns = columns[:-1]
-    both = comparison.equations_at(_embedded(fit.values, columns))
-    phase, roll = (both.per_unknown_m[fit.used] / both.sd_m[fit.used, None]).T
-    absorbed = float(phase @ roll / (phase @ phase)) if 0 in columns else 0.0
-    spread = np.eye(2)[:, columns]
-    return _Estimate(
-        columns, spread @ fit.values, spread @ fit.covariance @ spread.T, absorbed, fit
-    )
-
-
-def _fit(comparison: Comparison, columns: list[int]) -> Fit | None:
-    def equations_at(values: NDArray[np.float64]) -> Equations:
-        full = comparison.equations_at(_embedded(values, columns))
-        return full._replace(per_unknown_m=full.per_unknown_m[:, columns])
-
-    return fitted(equations_at, len(columns), comparison.places)
-
-
-def _embedded(values: NDArray[np.float64], columns: list[int]) -> NDArray[np.float64]:
-    full = np.zeros(2)
-    full[columns] = values
-    return full
-
-
-def _is_observable(covariance: NDArray[np.float64], columns: list[int], roll_rad: float) -> bool:
-    """Return whether all estimates are accurate, and not because errors of several cancel."""
-    if not np.isfinite(covariance).all():
-        return False
-    scale = np.array([1.0, roll_rad])[columns]
-    sd_rad = scale * np.sqrt(np.diag(covariance))
-    amplification = np.sqrt(np.diag(covariance) * np.diag(np.linalg.inv(covariance)))
-    return bool((sd_rad <= _MOST_SD_RAD).all() and (amplification <= _MOST_AMPLIFICATION).all())
-
-
-def _incomparable(comparison: Comparison, given: str) -> ValueError:
-    equations = comparison.equations_at(np.zeros(2))
-    some = equations.usable
-    if not some.any():
-        return ValueError(
-            f"{given} must share places with the valid heights: no valid height lies at "
-            f"{comparison.what}"
-        )
-    typical_m = float(np.median(np.abs(equations.residual_m[some])))
-    return ValueError(
-        f"{given} must lie close enough to the heights for errors of the pair to explain the "
-        f"difference, which is {typical_m:.3g} m"
-    )
-
-
-def _unobservable(
-    fit: Fit, unknowns: tuple[str, ...], column: int, comparison: Comparison
-) -> ValueError:
-    name = next(each for each in unknowns if (each == "roll") == bool(column))
-    sd_rad = float(np.sqrt(fit.covariance[0, 0])) * (comparison.roll_rad if column else 1.0)
-    return ValueError(
-        f"{name} is not observable from these heights: its standard deviation would be "
-        f"{sd_rad:.2g} rad of phase, more than {_MOST_SD_RAD:g} rad. Heights on two tracks show it "
-        "where the tracks are at different ranges"
-    )
 
 
 def _mean_phase(each: list[ConstantPhase]) -> ConstantPhase:
@@ -357,7 +261,7 @@ def _middle_hz(lines: RangeLines) -> float:
 
 
 def _errors(
-    estimate: _Estimate,
+    estimate: Estimate,
     unknowns: tuple[str, ...],
     constant: ConstantPhase | None,
     middle_hz: float,
@@ -367,7 +271,7 @@ def _errors(
     held = {"roll"} & set(unknowns) if 1 not in estimate.columns else set()
     if 0 not in estimate.columns:
         held |= {"phase", "delay"} & set(unknowns)
-    elif constant is not None and constant.sd_rad > _MOST_SD_RAD:
+    elif constant is not None and constant.sd_rad > MOST_SD_RAD:
         # Heights that are off by more than half a cycle followed a delay.
         shifted = abs(estimate.values[0]) > math.pi
         held.add(

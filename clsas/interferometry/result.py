@@ -45,6 +45,7 @@ class Heights:
     See Also
     --------
     heights : Function that returns this result.
+    pair_errors : Errors that the heights of all pixels have in common.
     """
 
     height_m: NDArray[np.float64]

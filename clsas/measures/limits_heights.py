@@ -12,6 +12,7 @@ from clsas.core.grid import Grid
 from clsas.measures.limits_common import NO_GRID, Result, result
 from clsas.measures.limits_geometry import Survey
 from clsas.measures.limits_result import shown
+from clsas.sonar.elevation import sight_along
 from clsas.sonar.system import Sonar
 from clsas.sonar.track import Track, channels
 
@@ -81,11 +82,8 @@ def phase_per_height(
 ) -> NDArray[np.float64]:
     """Return how fast the phase between two receivers changes with height, rad/m, [points].
 
-    An echo tells its range, not its height. The height therefore changes along a curve of constant
-    range, that is, a point that rises also moves away. With unit vectors u and v from the receivers
-    and w from the transmitter to the point, the phase changes by 2 pi/lambda (v - u) . t along the
-    vector t that rises by 1, lies in the vertical plane through the point, and is perpendicular to
-    2 w + u + v.
+    The track is taken to pass at right angles to the vertical plane through the transmitter and
+    the point.
 
     Parameters
     ----------
@@ -95,11 +93,5 @@ def phase_per_height(
     """
     ways_m = [points_m - each_m for each_m in (tx_m, low_m, high_m)]
     w, u, v = (way_m / np.linalg.norm(way_m, axis=1, keepdims=True) for way_m in ways_m)
-    outward = ways_m[0] * [1.0, 1.0, 0.0]
-    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), np.finfo(float).tiny)
-    gradient = 2 * w + u + v
-    across = np.einsum("pi,pi->p", gradient, outward)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        moves = -gradient[:, 2] / across  # outward per metre of height
-        turned = (v - u)[:, 2] + moves * np.einsum("pi,pi->p", v - u, outward)
-    return 2 * np.pi / wavelength_m * np.nan_to_num(turned, nan=0.0, posinf=0.0, neginf=0.0)
+    along = np.cross(ways_m[0], [0.0, 0.0, 1.0])
+    return sight_along(along, (2 * w + u + v) / 4, (v - u) / 2, 4 * np.pi / wavelength_m).rad_m

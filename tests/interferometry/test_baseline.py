@@ -1,5 +1,7 @@
 """Sensitivities against the ranges themselves, along curves of equal range found by a solver."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from reliefs import GRID, flat_banks
@@ -53,6 +55,17 @@ def test_phase_changes_along_curves_of_equal_range(baseline):
                    (point_m, above_m)]  # fmt: skip
         change_rad = 2 * np.pi * CYCLES_PER_M * (apart_m[1] - apart_m[0])[0]
         assert sight.rad_m[0] == pytest.approx(change_rad / 0.05, rel=5e-3)
+
+
+def test_roll_turns_the_second_bank_about_the_first(baseline):
+    a, b = flat_banks()
+    points_m = np.array([[0.0, 32.0, 0.0], [0.7, 31.0, 0.5], [0.0, -20.0, 1.0]])
+    arm_m = np.array([0.0, -0.25e-4, 0.25])  # the port side, at positive y, rises by 0.1 mrad
+    turned = replace(b, rx_m=a.rx_m + arm_m)
+    nearer_m = ranges_m(b, points_m)[0] - ranges_m(turned, points_m)[0]
+    change_rad = 2 * np.pi * CYCLES_PER_M * nearer_m / 1e-4
+    assert baseline.rad_per_roll(points_m) == pytest.approx(change_rad, rel=1e-3)
+    assert change_rad[0] < 0 < change_rad[2]  # the bank moves away from what lies to port
 
 
 def test_curves_keep_the_range(baseline):

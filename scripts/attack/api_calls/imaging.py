@@ -313,6 +313,22 @@ def navigation(folder: Path) -> dict[str, Call]:
         )
         for up_m in (0.0, 0.2)
     )  # fmt: skip
+    found = clsas.heights(lower, upper, s.grid, search_m=(-0.3, 0.4), window_m=0.3)
+    pair = {
+        "a": lower,
+        "b": upper,
+        "found": found,
+        "known_sd_m": 0.01,
+        "unknowns": ("phase",),
+        "tolerance_db": -30.0,
+        "beam": None,
+        "device": 0,
+    }
+    of_pair: dict[str, Any] = {
+        "kinds": {"device": "device"},
+        "names": {"a": ("b", "found"), "b": ("a", "found"), "found": ("mask",)},
+        "accepts": {"beam": ("None", "a BeamWindow")},
+    }
     return {
         "micronavigate": Call(
             clsas.micronavigate,
@@ -367,10 +383,29 @@ def navigation(folder: Path) -> dict[str, Call]:
             | {"beam": ("None", "a BeamWindow")},
             may_be_nan=True,
         ),
-        "Heights": Call(
-            clsas.Heights,
-            fields(clsas.heights(lower, upper, s.grid, search_m=(-0.3, 0.4), window_m=0.3)),
-            may_be_nan=True,
+        "Heights": Call(clsas.Heights, fields(found), may_be_nan=True),
+        "pair_errors": Call(
+            clsas.pair_errors,
+            pair | {"known_height_m": 0.0},
+            **of_pair,
+        ),
+        "pair_errors:points": Call(
+            clsas.pair_errors,
+            pair | {"points_m": [[0.0, 15.0, 0.0], [0.2, 14.8, 0.0]]},
+            **of_pair,
+        ),
+        "PairErrors.corrected": Call(
+            clsas.pair_errors(
+                lower, upper, found, known_height_m=0.0, unknowns=("phase",)
+            ).corrected,
+            {"a": lower, "b": upper},
+            names={"a": ("b",), "b": ("a",)},
+        ),
+        "PairErrors.describe": Call(
+            clsas.pair_errors(
+                lower, upper, found, known_height_m=0.0, unknowns=("phase",)
+            ).describe,
+            {},
         ),
         "autofocus": Call(
             clsas.autofocus,

@@ -21,7 +21,7 @@ from clsas.planning.costs import Costs
 RESULTS = (
     "Assessment", "Autofocus", "Calibration", "Effect", "Finding", "Inspection", "Limit", "Limits",
     "Micronavigation",
-    "Mosaic", "Patch", "PhaseSign", "Plan", "Processed", "Tradeoff",
+    "Mosaic", "PairErrors", "Patch", "PhaseSign", "Plan", "Processed", "Tradeoff",
 )  # fmt: skip
 """Classes whose constructors check nothing, since only clsas calls them."""
 

@@ -1,0 +1,55 @@
+"""How the phase between two receivers changes with height.
+
+An echo tells its range, not its height. A point that rises while its range and its position along
+the track stay the same moves along a circle about the track. The tangent of that circle is
+perpendicular to the track and to the gradient of the range.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+_LEAST_RISE = 1e-3  # of the tangent; directly below a track, no scatterer changes its height
+
+
+class Sight(NamedTuple):
+    """How two receivers, or two banks of them, see some points.
+
+    Attributes
+    ----------
+    rad_m : float64 [points]
+        Change K of the phase per metre of height along the curves of equal range; 0 where the
+        curve does not rise.
+    tangent : float64 [points, 2]
+        x and y of the curve's tangent, per metre of rise.
+    """
+
+    rad_m: NDArray[np.float64]
+    tangent: NDArray[np.float64]
+
+
+def sight_along(
+    along: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    difference: NDArray[np.float64],
+    rad_per_m: float,
+) -> Sight:
+    """Return how points are seen, from the gradients of their ranges.
+
+    Parameters
+    ----------
+    along : float64 [points, 3]
+        Direction of the track.
+    mean, difference : float64 [points, 3]
+        Gradients of the mean of the two ranges, and of the first range minus the second.
+    rad_per_m : float
+        Two-way phase per metre of range.
+    """
+    tangent = np.cross(along, mean)
+    rise = tangent[:, 2]
+    rises = np.abs(rise) > _LEAST_RISE * np.linalg.norm(tangent, axis=1)
+    tangent = np.where(rises[:, None], tangent / np.where(rises, rise, 1)[:, None], 0)
+    return Sight(rad_per_m * np.einsum("pi,pi->p", difference, tangent), tangent[:, :2])

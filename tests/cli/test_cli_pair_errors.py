@@ -1,0 +1,80 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from reliefs import flat_banks
+
+import clsas
+from clsas import cli
+
+GRID = clsas.Grid.plane((-0.5, 0.5, 51), (31.5, 32.5, 51))
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Files of both banks, of which the second has a phase of 0.5 rad, and of their heights."""
+    folder = tmp_path_factory.mktemp("banks")
+    low, high = flat_banks()
+    high = high.weighted(np.full(high.channels, np.exp(0.5j)))
+    arrays = {
+        name: np.concatenate([getattr(low, name), getattr(high, name)])
+        for name in ("samples", "first_range_m", "tx_m", "rx_m")
+    }
+    both = replace(low, **arrays, bank_numbers=np.repeat([1, 3], low.channels))
+    clsas.save(folder / "lines.h5", both)
+    clsas.save(folder / "low.h5", low)
+    found = clsas.heights(low, high, GRID, search_m=(-0.5, 0.5), window_m=0.2)
+    clsas.save(folder / "heights.h5", found)
+    return folder
+
+
+def run(*args, code=0):
+    result = CliRunner().invoke(cli.main, [str(arg) for arg in args], prog_name="clsas")
+    assert result.exit_code == code, (result.output, result.exception)
+    return result
+
+
+def test_command_corrects_the_second_bank(files, tmp_path):
+    output = tmp_path / "corrected.h5"
+    given = files / "lines.h5", files / "heights.h5", "--known-height-m", 0, "--unknown", "phase"
+    results = json.loads(run("pair-errors", *given, "-o", output, "--json").stdout)
+    lines, corrected = clsas.load(files / "lines.h5"), clsas.load(output)
+    pair = lines.bank(1), lines.bank(3)
+    expected = clsas.pair_errors(
+        *pair, clsas.load(files / "heights.h5"), known_height_m=0.0, unknowns=["phase"]
+    )
+    assert results["values"] == expected.values.tolist()
+    assert results["unknowns"] == ["phase"]
+    assert np.array_equal(corrected.bank(3).samples, expected.corrected(*pair).samples)
+    assert np.array_equal(corrected.bank(1).samples, pair[0].samples)
+    assert np.array_equal(corrected.bank_numbers, lines.bank_numbers)
+    text = run("pair-errors", *given, "-o", output).stdout
+    assert expected.describe().splitlines()[0] in text
+    assert "mm in heights at" in text
+
+
+def test_control_points_and_warnings(files, tmp_path):
+    output = tmp_path / "corrected.h5"
+    points = "--point", "0,32", "--point", "0.3,31.8,0.0"
+    given = files / "lines.h5", files / "heights.h5", *points, "-o", output
+    result = run("pair-errors", *given, "--unknown", "phase", "--unknown", "roll", "--json")
+    assert json.loads(result.stdout)["held"] == ["roll"]
+    assert "roll is not observable here" in result.stderr
+
+
+def test_mistakes_are_reported(files, tmp_path):
+    given = files / "lines.h5", files / "heights.h5", "-o", tmp_path / "corrected.h5"
+    none = run("pair-errors", *given, code=2)
+    assert "give one of --known-height-m, --point and --other, got none" in none.stderr
+    two = run("pair-errors", *given, "--known-height-m", 0, "--point", "0,32", code=2)
+    assert "got --known-height-m and --point" in two.stderr
+    other = "--other", files / "lines.h5", files / "heights.h5"
+    same = run("pair-errors", *given, *other, "--unknown", "phase", code=1)
+    assert "phase is not observable from these heights" in same.stderr
+    one = run("pair-errors", files / "low.h5", *given[1:], "--known-height-m", 0, code=1)
+    assert "must hold range lines of 2 receiver banks, got 1" in one.stderr
+    no = run("pair-errors", given[0], given[0], *given[2:], "--known-height-m", 0, code=1)
+    assert "must hold Heights (clsas heights makes them), got RangeLines" in no.stderr
+    assert not (tmp_path / "corrected.h5").exists()
