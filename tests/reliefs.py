@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
@@ -16,14 +17,22 @@ ALTITUDE_M = 12.0
 GRID = Grid.plane((-0.8, 0.8, 81), (30.8, 33.2, 121))
 
 
-def track(pings=120, aperture_m=10.0, sway_m=0.0, roll_rad=0.0, baseline_m=0.25):
-    """Positions of the transmitter and of the receivers of both banks, [channels, 3] each."""
+def track(
+    pings=120, aperture_m=10.0, sway_m=0.0, roll_rad=0.0, yaw_rad=0.0, baseline_m=0.25, arms_m=None
+):
+    """Positions of the transmitter and of the receivers of both banks, [channels, 3] each.
+
+    Roll and yaw turn `arms_m` about the transmitter: where the receivers of both banks are when the
+    platform is level and on course. By default, the lower one is where the transmitter is.
+    """
     along_m = np.linspace(-aperture_m / 2, aperture_m / 2, pings)
     wave = np.sin(2 * np.pi * along_m / 6)
     tx_m = np.stack([along_m, sway_m * wave, ALTITUDE_M + 0 * along_m], axis=1)
     roll = roll_rad * np.cos(2 * np.pi * along_m / 4)
-    arm_m = baseline_m * np.stack([0 * roll, np.sin(roll), np.cos(roll)], axis=1)
-    return tx_m, tx_m, tx_m + arm_m
+    yaw = yaw_rad * np.cos(2 * np.pi * along_m / 5)
+    turned = Rotation.from_euler("ZYX", np.stack([yaw, 0 * yaw, roll], axis=1))
+    lower_m, upper_m = arms_m or ((0, 0, 0), (0, 0, baseline_m))
+    return tx_m, tx_m + turned.apply(lower_m), tx_m + turned.apply(upper_m)
 
 
 def banks(relief, *, snr_db, seed=1, extent_m=None, density_m2=2500.0, **of_track):

@@ -40,6 +40,7 @@ from clsas.interferometry.interferogram import window_within
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.refinement import PASSES, Refined, filled, refine
 from clsas.interferometry.result import Heights
+from clsas.interferometry.shadows import in_shadow
 from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, sweep
 from clsas.interferometry.task import Task
 from clsas.opencl.device import Device, open_device
@@ -257,11 +258,12 @@ def measure(
     )
     report(total, total)
     _warn(refined)
+    hidden = in_shadow(grid, refined.offset_m, refined.sd_m, refined.valid, sights, window)
     return Heights(
         refined.offset_m,
         refined.sd_m,
         refined.coherence,
-        refined.valid,
+        refined.valid & ~hidden,
         refined.looks,
         refined.m_per_rad,
         refined.image,

@@ -53,6 +53,9 @@ def step(x, y):
 # The far side of the rock is 25 dB darker than the seabed beside it, and full of its side lobes.
 LOW_SIDE_LOBES = clsas.BeamWindow(14.0, "hann")
 
+# Receivers ahead of the transmitter, the upper bank a little more, which yaw moves across the track.
+AHEAD_M = ((0.5, 0.1, 0.0), (0.55, 0.05, 0.25))
+
 SCENES = {
     "flat": (flat, {}),
     "facing": (facing, {}),
@@ -62,6 +65,7 @@ SCENES = {
     "rock": (rock, {}),
     "step": (step, {}),
     "sway and roll": (dunes, {"sway_m": 0.1, "roll_rad": 0.05}),
+    "sway and yaw": (dunes, {"sway_m": 0.1, "yaw_rad": 0.05, "arms_m": AHEAD_M}),
 }
 
 
