@@ -63,11 +63,13 @@ def overview_of(store: Store, most: int, rows: slice, columns: slice) -> Heights
         factor *= 2
     if factor == 1:
         return window_of(store, rows, columns)
-    # A level serves if the part begins at one of its pixels.
+    # A level serves if the part begins and ends with one of its pixels.
     finest = max(
         level
         for level in (1, *store.levels)
-        if level <= factor and not any(start % level for start in first)
+        if level <= factor
+        and not any(start % level for start in first)
+        and all(n % level == 0 or n == most for n, most in zip(last, grid.shape, strict=True))
     )
     shape = level_shape(part.shape, factor)
     found = {name: np.empty(shape, np.float32) for name in (*LAYERS, _POWER)}
