@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from clsas.measures.survey_limits import limits
     from clsas.measures.tradeoff import tradeoff
     from clsas.measures.tradeoff_result import Tradeoff
+    from clsas.mosaics.height_mosaic import mosaic_heights
     from clsas.mosaics.mosaic import Mosaic, Patch, mosaic
     from clsas.mosaics.store import Store
     from clsas.navigation.autofocus import Autofocus, autofocus
@@ -127,6 +128,7 @@ __all__ = [
     "measure_point",
     "micronavigate",
     "mosaic",
+    "mosaic_heights",
     "multilook",
     "pair_errors",
     "plan",
@@ -185,6 +187,7 @@ _MODULES = {
     "measures.survey_limits": "limits",
     "measures.tradeoff": "tradeoff",
     "measures.tradeoff_result": "Tradeoff",
+    "mosaics.height_mosaic": "mosaic_heights",
     "mosaics.mosaic": "Mosaic Patch mosaic",
     "mosaics.store": "Store",
     "navigation.autofocus": "Autofocus autofocus",

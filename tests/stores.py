@@ -1,6 +1,7 @@
 """A small store with heights, for tests that damage it."""
 
 import json
+import os
 
 import numpy as np
 from cases import along_x, lines_over
@@ -41,3 +42,25 @@ def change_metadata(path, name, **entries):
     """Change entries of an array's metadata."""
     document = json.loads((path / name / "zarr.json").read_text())
     (path / name / "zarr.json").write_text(json.dumps({**document, **entries}))
+
+
+class Killed(BaseException):
+    """Stands for a signal that ends the process."""
+
+
+def killed_at(monkeypatch, step, work):
+    """Do some work until a file is about to get its name for the `step`-th time; or return."""
+    rename, count = os.replace, iter(range(step))
+
+    def replace(source, target):
+        if next(count, None) is None:
+            raise Killed
+        rename(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", replace)
+        try:
+            work()
+        except Killed:
+            return True
+    return False

@@ -12,13 +12,18 @@ import numpy as np
 import clsas
 from clsas.cli import options
 from clsas.cli.inputs import load_banks, load_lines, read_beam, read_grid
+from clsas.cli.mosaics import described_flags
 from clsas.cli.outputs import printable, progress_bar, report
-from clsas.cli.parameters import INPUT, Parsed
+from clsas.cli.parameters import INPUT, File, Output, Parsed, Store, keep_out
 from clsas.core import validate
+from clsas.files.hdf5 import SUFFIXES
 from clsas.files.height_files import read_heights
 from clsas.interferometry.checks import checked_coherence
 from clsas.interferometry.heights import LEAST_COHERENCE
 from clsas.processing import numbers
+
+STORE_SUFFIX = ".zarr"
+"""Suffix of the stores of mosaics."""
 
 
 def _heights(text: str) -> tuple[float, float]:
@@ -28,13 +33,31 @@ def _heights(text: str) -> tuple[float, float]:
     return low, high
 
 
+class _Target(File):
+    """An HDF5 file, or a Zarr store, which is a folder."""
+
+    written = True
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Path:
+        """Return the path; a usage error if nothing can be written there."""
+        is_store = Path(value).suffix.lower() == STORE_SUFFIX
+        kind = Store() if is_store else Output(*SUFFIXES)
+        return kind.convert(value, param, ctx)
+
+
 _SEARCH = Parsed("LOW:HIGH", _heights, "LOW:HIGH, two ascending heights in metres, such as -1:2")
 
 
 @click.command()
 @click.argument("first_file", metavar="LINES.H5", type=INPUT)
 @click.argument("second_file", metavar="[B.H5]", type=INPUT, required=False)
-@options.output("Heights")
+@click.option(
+    "-o",
+    "--output",
+    type=_Target(),
+    required=True,
+    help="Heights to write: an HDF5 file, or a Zarr store that is measured patch by patch.",
+)
 @options.grid
 @click.option(
     "--search-m",
@@ -71,6 +94,12 @@ _SEARCH = Parsed("LOW:HIGH", _heights, "LOW:HIGH, two ascending heights in metre
     callback=options.checked(checked_coherence),
     help="Smallest coherence of a valid height.",
 )
+@click.option(
+    "--patch-m",
+    type=float,
+    callback=options.checked(partial(validate.positive, "patch_m", unit="m")),
+    help="Approximate side of the patches of a .zarr (m). [default: 1024 pixels]",
+)
 @options.beam
 @options.device
 @options.as_json
@@ -84,6 +113,7 @@ def heights(
     window_m: float | None,
     tolerance_db: float,
     least_coherence: float,
+    patch_m: float | None,
     device: str | None,
     as_json: bool,
     **given: Any,
@@ -95,23 +125,39 @@ def heights(
     search starts. Heights are above the plane, and valid where the banks are coherent, and not in
     shadow or layover; the others are NaN.
 
+    If the name of the output ends in .zarr, heights are measured patch by patch, and may be larger
+    than memory. After an interruption, the same command continues.
+
     \b
     Example:  clsas heights lines.h5 --x -2:2:201 --y 30:34:201 --search-m -1:1 -o heights.h5
     """
-    described, grid = read_grid(scene, given)
+    is_mosaic = output.suffix.lower() == STORE_SUFFIX
+    if patch_m is not None and not is_mosaic:
+        raise click.UsageError(f"--patch-m requires an output that ends in {STORE_SUFFIX}")
+    described, grid = read_grid(scene, given, memory=not is_mosaic)
     if relief is not None:
         grid = _raised(grid, relief)
     beam = read_beam(described, given)
+    request = {
+        "search_m": search_m, "window_m": window_m, "tolerance_db": tolerance_db,
+        "least_coherence": least_coherence, "beam": beam, "device": device,
+    }  # fmt: skip
+    if is_mosaic:
+        keep_out("LINES.H5", first_file, "the store", output)
+        with progress_bar("measuring heights") as progress:
+            store = clsas.mosaic_heights(
+                first_file, second_file, grid, output, **request, patch_m=patch_m,
+                progress=progress,
+            )  # fmt: skip
+        _report_store(store, output, as_json)
+        return
     if second_file is None:
         lines, numbers_of_banks = load_banks(first_file, described)
         first, second = (lines.bank(number) for number in numbers_of_banks)
     else:
         first, second = (load_lines(each, None, described) for each in (first_file, second_file))
     with progress_bar("measuring heights") as progress:
-        found = clsas.heights(
-            first, second, grid, search_m=search_m, window_m=window_m, tolerance_db=tolerance_db,
-            least_coherence=least_coherence, beam=beam, device=device, progress=progress,
-        )  # fmt: skip
+        found = clsas.heights(first, second, grid, **request, progress=progress)
     clsas.save(output, found)
     results = numbers.of_heights(found)
     report(
@@ -122,6 +168,24 @@ def heights(
         file=output,
         **results,
     )
+
+
+def _report_store(store: clsas.Store, output: Path, as_json: bool) -> None:
+    """Report the valid share of a mosaic of heights, and the patches with defects."""
+    records, (rows, columns) = store.records(), store.patch_shape or (0, 0)
+    found = store.overview_heights()
+    results = numbers.of_heights(found)
+    counts = [1 + max(each) for each in zip(*records, strict=True)]
+    flagged = {index: record.flags for index, record in records.items() if record.flags}
+    lines = [
+        f"{printable(output)}: {counts[0]} x {counts[1]} patches of {rows} x {columns} pixels",
+        f"  at {found.mask.shape[0]} x {found.mask.shape[1]} pixels, {in_words(results)}",
+        *described_flags(flagged),
+    ]
+    report(
+        as_json, "\n".join(lines), file=output, patches=counts, patch_shape=(rows, columns),
+        flags={f"{row},{column}": flags for (row, column), flags in flagged.items()}, **results,
+    )  # fmt: skip
 
 
 def _raised(plane: clsas.Grid, relief: Path) -> clsas.Grid:

@@ -245,7 +245,7 @@ def _results(
         words.append("; all pixels are zero")
     elif worst is not None:
         words.append(f"; predicted error at most {worst:.1f} dB")
-    words += [f"\n{line}" for line in _described_flags(flagged)]
+    words += [f"\n{line}" for line in described_flags(flagged)]
     return words, {
         "shape": formed.grid.shape,
         "patches": formed.shape,
@@ -258,7 +258,7 @@ def _results(
     }
 
 
-def _described_flags(flagged: dict[tuple[int, int], tuple[str, ...]]) -> list[str]:
+def described_flags(flagged: dict[tuple[int, int], tuple[str, ...]]) -> list[str]:
     """Return one line for every flag, with the patches that have it."""
     alike: dict[str, list[str]] = {}
     for (row, column), flags in flagged.items():

@@ -159,6 +159,8 @@ def _check_options(shown: Shown, given: set[str]) -> None:
         refused, what = given, "an interferogram"
     elif isinstance(shown, clsas.Heights):
         refused, what = given - {"--colour-map"}, "heights"
+    elif isinstance(shown, clsas.Store) and shown.layers:
+        refused, what = given - {"--colour-map", "--near", "--extent-m"}, "a mosaic of heights"
     elif isinstance(shown, clsas.RangeLines | clsas.Echoes):
         refused, what = given & {"--near", "--extent-m", *_MARKS}, "range lines or echoes"
     elif isinstance(shown, clsas.Image) and shown.grid.points_m is not None:
@@ -190,8 +192,12 @@ def _drawn(
     if isinstance(shown, clsas.Heights):
         chosen = {name: levels[name] for name in levels if name == "colour_map"}
         return plot.heights(shown, **chosen, title=title), repr(shown)
+    if isinstance(shown, clsas.Store) and shown.layers:
+        found = shown.overview_heights(_MOST_PIXELS, *_window(shown, near, extent_m))
+        chosen = {name: levels[name] for name in levels if name == "colour_map"}
+        return plot.heights(found, **chosen, title=title), repr(found)
     if isinstance(shown, clsas.Store):
-        shown = _overview(shown, near, extent_m)
+        shown = shown.overview(_MOST_PIXELS, *_window(shown, near, extent_m))
     elif isinstance(shown, clsas.Image) and shown.grid.points_m is None:
         shown = _part(shown, near, extent_m)
     values = shown.pixels if isinstance(shown, clsas.Image) else shown.samples
@@ -208,14 +214,13 @@ def _drawn(
     return figure, repr(shown)
 
 
-def _overview(
+def _window(
     store: clsas.Store, near: tuple[float, ...] | None, extent_m: float | None
-) -> clsas.Image:
-    """Return a mosaic, or the part around a position, at the pixels of a picture."""
+) -> tuple[slice, ...]:
+    """Return the rows and columns around a position; none, which stands for all, without one."""
     from clsas.plot.windows import window_around
 
-    window = () if near is None else window_around(store.grid, near, extent_m)
-    return store.overview(_MOST_PIXELS, *window)
+    return () if near is None else window_around(store.grid, near, extent_m)
 
 
 def _part(

@@ -12,6 +12,7 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, antennas_of
 from clsas.interferometry.baseline import Baseline
+from clsas.interferometry.errors import UnmeasurableError
 
 _APART = 0.1  # relative change of the distance between banks that waves of the track may cause
 _MOST_CYCLES = 1e3  # of phase within the search; more need more planes than anyone has time for
@@ -77,6 +78,10 @@ def check_pair(a: RangeLines, b: RangeLines) -> None:
             "a and b must contain the same pings in the same order: their phase centres are "
             f"{usual_m:.3g} m apart in most channels, and {apart_m[worst]:.3g} m in channel {worst}"
         )
+
+
+def check_echoes(a: RangeLines, b: RangeLines) -> None:
+    """Raise ValueError if the samples of a bank are all zero."""
     for name, lines in (("a", a), ("b", b)):
         if not lines.samples.any():
             raise ValueError(f"{name} must contain echoes, got samples that are all zero")
@@ -93,7 +98,7 @@ def check_geometry(
     relative_band: float,
     least_coherence: float,
 ) -> float:
-    """Return the height of ambiguity, metres; raise ValueError unless heights can be measured.
+    """Return the height of ambiguity, metres; raise UnmeasurableError if there are no heights.
 
     Parameters
     ----------
@@ -116,20 +121,20 @@ def check_geometry(
     usual_rad_m = float(np.median(np.abs(rad_m)))
     if usual_rad_m * (high_m - low_m) < _LEAST_PHASE_RAD:
         apart_m = float(np.median(np.linalg.norm(_separation_m(baseline), axis=1)))
-        raise ValueError(
+        raise UnmeasurableError(
             "a and b must be apart across the line of sight: their phase centres are "
             f"{apart_m:.3g} m apart, and the phase between them changes by "
             f"{usual_rad_m * (high_m - low_m):.2g} rad over search_m, less than "
             f"{_LEAST_PHASE_RAD:g} rad"
         )
     if (rad_m > 0).any() and (rad_m < 0).any():
-        raise ValueError(
+        raise UnmeasurableError(
             "a and b must see all of the grid and search_m from one side: the sign of the phase "
             "changes within them. Divide the grid at the track's nadir"
         )
     ambiguity_m = 2 * math.pi / usual_rad_m
     if high_m - low_m > _MOST_CYCLES * ambiguity_m:
-        raise ValueError(
+        raise UnmeasurableError(
             f"search_m must span at most {_MOST_CYCLES:g} heights of ambiguity "
             f"({ambiguity_m:.3g} m each), got {high_m - low_m:g} m"
         )
@@ -145,18 +150,18 @@ def _separation_m(baseline: Baseline) -> NDArray[np.float64]:
 def _check_below(
     baseline: Baseline, points_m: NDArray[np.float64], search_m: tuple[float, float]
 ) -> None:
-    """Raise ValueError if heights to search reach the antennas."""
+    """Raise UnmeasurableError if heights to search reach the antennas."""
     some = baseline.channels
     antennas_m = np.concatenate([baseline.a.tx_m[some], baseline.a.rx_m[some]])
     lowest_m = float(antennas_m[:, 2].min() - points_m[:, 2].max())
     highest_m = float(antennas_m[:, 2].max() - points_m[:, 2].min())
     if lowest_m > 0 and search_m[1] >= lowest_m:
-        raise ValueError(
+        raise UnmeasurableError(
             f"search_m must end below the sonar, which is {lowest_m:.4g} m above the grid, got "
             f"{search_m[1]:g} m"
         )
     if highest_m < 0 and search_m[0] <= highest_m:
-        raise ValueError(
+        raise UnmeasurableError(
             f"search_m must begin above the sonar, which is {-highest_m:.4g} m below the grid, got "
             f"{search_m[0]:g} m"
         )
@@ -165,14 +170,14 @@ def _check_below(
 def _check_ranges(
     baseline: Baseline, points_m: NDArray[np.float64], search_m: tuple[float, float]
 ) -> None:
-    """Raise ValueError if no line reaches the ends of the search anywhere on the grid."""
+    """Raise UnmeasurableError if no line reaches the ends of the search anywhere on the grid."""
     some = baseline.channels
     first_m, last_m = baseline.a.first_range_m[some], baseline.a.last_range_m[some]
     for offset_m in search_m:
         raised_m = points_m + [0.0, 0.0, offset_m]
         range_m = pairwise_range_m(raised_m, *antennas_of(baseline.a, some))
         if not ((range_m >= first_m) & (range_m <= last_m)).any():
-            raise ValueError(
+            raise UnmeasurableError(
                 f"search_m must lie within the range of the lines, {first_m.min():.5g} to "
                 f"{last_m.max():.5g} m: at {offset_m:g} m the grid is at {range_m.min():.5g} to "
                 f"{range_m.max():.5g} m"
@@ -186,7 +191,7 @@ def _check_decorrelation(
     relative_band: float,
     least_coherence: float,
 ) -> None:
-    """Raise ValueError if the banks are so far apart that a level seabed is not coherent.
+    """Raise UnmeasurableError if the banks are so far apart that a level seabed is not coherent.
 
     From another elevation, one frequency samples another wavenumber of the seabed. The shift,
     relative to the carrier, is |D|/|g| with D and g the horizontal gradients of the difference and
@@ -199,7 +204,7 @@ def _check_decorrelation(
     left = 1 - float(shift) / relative_band
     if left < least_coherence:
         apart_m = float(np.median(np.linalg.norm(_separation_m(baseline), axis=1)))
-        raise ValueError(
+        raise UnmeasurableError(
             f"a and b must be closer together: at {2 * apart_m:.3g} m between the banks, the "
             f"height of ambiguity is {ambiguity_m:.2g} m and a level seabed has a coherence of at "
             f"most {max(left, 0):.2f}, less than least_coherence = {least_coherence:g}"

@@ -26,6 +26,7 @@ from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
 from clsas.core.grid import Grid
+from clsas.interferometry.errors import UnmeasurableError
 
 UNIFORM_SD_RAD = math.pi / math.sqrt(3)
 """Standard deviation of a phase that is uniform over a cycle, as without any coherence."""
@@ -198,9 +199,9 @@ def noise_coherence(looks: NDArray | float, probability: float) -> NDArray[np.fl
 
 
 def check_looks(window_m: float, looks: float) -> None:
-    """Raise ValueError if a window contains too few looks to estimate a coherence."""
+    """Raise UnmeasurableError if a window has too few looks to estimate a coherence."""
     if looks < LEAST_LOOKS:
-        raise ValueError(
+        raise UnmeasurableError(
             f"window_m must contain at least {LEAST_LOOKS:g} independent samples of the images, "
             f"got {window_m:g} m, which contains {looks:.1f}"
         )

@@ -24,6 +24,7 @@ from clsas.core.lines import RangeLines
 from clsas.core.wavelengths import cycles_per_m_at
 from clsas.interferometry.baseline import Baseline, sight_lattice
 from clsas.interferometry.checks import (
+    check_echoes,
     check_geometry,
     check_grid,
     check_pair,
@@ -208,6 +209,7 @@ def heights(
     0.20 m
     """
     check_pair(a, b)
+    check_echoes(a, b)
     validate.instance("grid", grid, Grid)
     check_grid(grid)
     grid = placed(b, placed(a, grid))
@@ -234,6 +236,26 @@ def measure(
     progress: Callable[[int, int], None] | None,
 ) -> Heights:
     """Return the heights that a pair of banks shows; parameters are those of `heights`."""
+    found, refined = measured(pair, grid, search_m, window_m, least_coherence, progress)
+    _warn(refined)
+    return found
+
+
+def measured(
+    pair: Pair,
+    grid: Grid,
+    search_m: tuple[float, float],
+    window_m: float | None,
+    least_coherence: float,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[Heights, Refined]:
+    """Return heights, and how they were refined, without warnings.
+
+    Raises
+    ------
+    UnmeasurableError
+        If the geometry or the images do not show heights.
+    """
     # Rays are exact on the relief that is refined. A sweep needs no more than nearly right ones.
     straight = pair.straightened(grid)
     task = _task(straight, grid, search_m, least_coherence)
@@ -257,9 +279,8 @@ def measure(
         lambda done: report(len(heights_m) + done, total),
     )
     report(total, total)
-    _warn(refined)
     hidden = in_shadow(grid, refined.offset_m, refined.sd_m, refined.valid, sights, window)
-    return Heights(
+    found = Heights(
         refined.offset_m,
         refined.sd_m,
         refined.coherence,
@@ -269,10 +290,37 @@ def measure(
         refined.image,
         window_m,
     )
+    return found, refined
+
+
+def windows(
+    pair: Pair,
+    grid: Grid,
+    search_m: tuple[float, float],
+    window_m: float | None,
+    least_coherence: float,
+) -> tuple[float, Window, Window]:
+    """Return the windows with which heights of a grid, or of one like it, are measured.
+
+    Returns
+    -------
+    window_m : float
+        The given one, or the default.
+    window, large : Window
+        Windows of the heights, and those that decide between cycles of the phase.
+    """
+    straight = pair.straightened(grid)
+    task = _task(straight, grid, search_m, least_coherence)
+    images = straight.images(task.level)
+    window_m = _default_window_m(images, grid) if window_m is None else window_m
+    window = Window.of(grid, window_m)
+    looks = effective_looks(images, window)
+    check_looks(window_m, looks)
+    return window_m, window, _large_window(looks, window, task.relative_band, least_coherence)
 
 
 def _task(pair: Pair, grid: Grid, search_m: tuple[float, float], least_coherence: float) -> Task:
-    """Return the task; raise ValueError unless the geometry allows heights to be measured."""
+    """Return the task; raise UnmeasurableError unless the geometry shows heights."""
     spectrum = measure_spectrum(pair.a)
     cycles_per_m = float(cycles_per_m_at(pair.a, spectrum.centre))
     band_cycles_per_m = 1 / (spectrum.oversampling * pair.a.range_step_m)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +31,16 @@ class Band:
     is_amplitude : bool
         True for amplitudes or complex pixels, whose mean is that of their power, and which
         `Encoding` turns into pixels of a file. Other numbers are averaged and written as they are.
+    is_deviation : bool
+        True for standard deviations, whose squares are averaged. The result is that of the height
+        of one pixel. The mean of several heights deviates less.
     """
 
     name: str
     unit: str
     read: Callable[[slice, slice], NDArray]
     is_amplitude: bool = False
+    is_deviation: bool = False
 
     @property
     def no_data(self) -> float:
@@ -47,7 +52,8 @@ class Band:
         if self.is_amplitude:
             return np.abs(values).astype(np.float64) ** 2, values != 0
         known = ~np.isnan(values)
-        return np.where(known, values.real, 0.0).astype(np.float64), known
+        numbers = np.where(known, values.real, 0.0).astype(np.float64)
+        return np.square(numbers) if self.is_deviation else numbers, known
 
     def mean(
         self, total: NDArray[np.float64], weight: NDArray, least: float
@@ -55,7 +61,8 @@ class Band:
         """Return the means of sums of `summands`; no data where the weight is less than `least`."""
         seen = weight >= least
         mean = np.divide(total, weight, out=np.full(total.shape, self.no_data), where=seen)
-        return (np.sqrt(mean) if self.is_amplitude else mean).astype(np.float32)
+        is_square = self.is_amplitude or self.is_deviation
+        return (np.sqrt(mean) if is_square else mean).astype(np.float32)
 
     def halved(self, values: NDArray) -> NDArray[np.float32]:
         """Return the means of 2 x 2 pixels, of those that have data."""
@@ -82,12 +89,14 @@ def bands_of(source: Source, kind: str) -> tuple[Band, ...]:
         One of `clsas.maps.encoding.KINDS`: pixels of the amplitude. 8-bit levels stand alone,
         without the heights of a height map. Heights have no amplitude.
     """
-    heights = source.heights
-    if heights is not None:
+    if source.has_heights:
+        height, deviation, coherence = (
+            partial(source.read_layer, name) for name in ("height_m", "sd_m", "coherence")
+        )
         return (
-            _height(source.grid, heights.height_m),
-            _of_array("Standard deviation", "m", heights.sd_m),
-            _of_array("Coherence", "", np.where(heights.mask, heights.coherence, np.nan)),
+            _height(source.grid, height),
+            Band("Standard deviation", "m", deviation, is_deviation=True),
+            Band("Coherence", "", coherence),
         )
 
     def amplitude(rows: slice, columns: slice) -> NDArray[np.float32]:
@@ -97,10 +106,11 @@ def bands_of(source: Source, kind: str) -> tuple[Band, ...]:
     bands = (Band("Amplitude", "", read, is_amplitude=True),)
     if source.grid.height_m is None or kind == "8bit":
         return bands
-    return (*bands, _height(source.grid, source.grid.height_m))
+    height_m = source.grid.height_m
+    return (*bands, _height(source.grid, lambda rows, columns: height_m[rows, columns]))
 
 
-def _height(grid: Grid, height_m: NDArray[np.float64]) -> Band:
+def _height(grid: Grid, above_m: Callable[[slice, slice], NDArray]) -> Band:
     """Return the band of heights above the plane of a grid, on the vertical axis of the map."""
     origin_m, *steps_m = grid.vectors_m
     place = grid.georeference
@@ -109,10 +119,6 @@ def _height(grid: Grid, height_m: NDArray[np.float64]) -> Band:
 
     def read(rows: slice, columns: slice) -> NDArray[np.float64]:
         plane_m = first_m + np.add.outer(down_m[rows], right_m[columns])
-        return plane_m + height_m[rows, columns]
+        return plane_m + above_m(rows, columns)
 
     return Band("Height", "m", read)
-
-
-def _of_array(name: str, unit: str, values: NDArray[np.float64]) -> Band:
-    return Band(name, unit, lambda rows, columns: values[rows, columns])

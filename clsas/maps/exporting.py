@@ -147,7 +147,9 @@ def export(
     and complex pixels of a height map have the heights as their second band.
 
     `Heights` have three bands in float32: height (m), standard deviation (m) and coherence. They
-    are NaN outside the mask, and means in overviews leave out such pixels.
+    are NaN outside the mask, and means in overviews leave out such pixels. Deviations in overviews
+    are the root of the mean square: those of one pixel of the heights, not of their mean. A mosaic
+    of heights has the same bands, and may be larger than memory; a folder shows its image.
 
     Heights in both cases are those of the seabed on the vertical axis of the map: the height above
     the plane of the grid, plus z of the plane, plus the height of the origin of a local
@@ -192,7 +194,10 @@ def export(
     validate.instance("georeference", georeference, Georeference, type(None))
     validate.progress(progress)
     opened = _opened(source)
-    of_heights = isinstance(opened, Heights)
+    # A folder shows the image of a mosaic of heights.
+    of_heights = isinstance(opened, Heights) or (
+        isinstance(opened, Store) and bool(suffix) and bool(opened.layers)
+    )
     if of_heights and suffix not in HEIGHT_SUFFIXES:
         raise ValueError(
             f"path must end in {' or '.join(HEIGHT_SUFFIXES)} for heights, got "
@@ -201,8 +206,9 @@ def export(
     options.check_used(suffix, of_heights=of_heights)
     if suffix and suffix not in PICTURES:
         _write_data(path, _finished(opened, georeference), options, progress)
-    elif isinstance(opened, Heights):
-        save_picture(heights_picture(_placed_heights(opened, georeference), **options.given), path)
+    elif of_heights:
+        shown = _placed_heights(opened, georeference)
+        save_picture(heights_picture(shown, **options.given), path)
     elif suffix:
         world_files.write_picture(path, _placed(opened, georeference), options.given)
     else:
@@ -335,7 +341,7 @@ def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
         "ACCURACY_DB": inputs.get("accuracy_db"),
         "PREDICTED_ERROR_DB": max((e for e in errors if e is not None), default=None),
         "PATCHES": len(source.records) or None,
-        "WINDOW_M": None if source.heights is None else source.heights.window_m,
+        "WINDOW_M": source.window_m,
     }
     if lines is not None:
         known |= {"CARRIER_HZ": lines.carrier_hz, "SOUND_SPEED_M_S": lines.sound_speed_m_s}
@@ -373,6 +379,9 @@ def _placed(source: Image | Store, georeference: Georeference | None) -> Image:
     return Image(shown.pixels, replace(shown.grid, georeference=found.grid.georeference))
 
 
-def _placed_heights(heights: Heights, georeference: Georeference | None) -> Heights:
+def _placed_heights(source: Any, georeference: Georeference | None) -> Heights:
     """Return the heights that a picture shows, with the georeference of the export."""
+    if isinstance(source, Store):
+        _finished(source, georeference).check_unchanged()
+    heights = source.overview_heights() if isinstance(source, Store) else source
     return replace(heights, image=_placed(heights.image, georeference))

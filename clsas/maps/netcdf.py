@@ -45,10 +45,10 @@ def write(path: Path, source: Source, tags: dict[str, Any]) -> None:
     with needed("netCDF files"):
         import h5netcdf  # noqa: F401  xarray's message would not say how to install it
         import xarray  # noqa: F401
-    if source.heights is not None and source.grid.points_m is not None:
+    if source.has_heights and source.grid.points_m is not None:
         raise ValueError("source must be on a plane to have heights, got points")
     validate.memory("the pixels as netCDF", _BYTES * source.grid.size)
-    data = _of_image(source) if source.heights is None else _of_heights(source)
+    data = _of_heights(source) if source.has_heights else _of_image(source)
     data = _described(data, source.grid, tags)
     source.check_unchanged()
     # HDF5 does not recover from a full disk, so the file is assembled in memory.

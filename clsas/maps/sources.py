@@ -35,7 +35,7 @@ class Source:
     records : dict
         Records of the patches of the store when the export began.
     heights : Heights or None
-        Heights, if they are exported; `image` is then the image on their relief.
+        Heights in memory, if they are exported; `image` is then the image on their relief.
     """
 
     grid: Grid
@@ -104,6 +104,27 @@ class Source:
             return self.image.pixels[rows, columns]
         assert self.store is not None
         return self.store.read(rows, columns)
+
+    @property
+    def has_heights(self) -> bool:
+        """True if heights are exported, from memory or from a store."""
+        return self.heights is not None or (self.store is not None and bool(self.store.layers))
+
+    @property
+    def window_m(self) -> float | None:
+        """Side of the windows of the heights, metres; None for images."""
+        return self.inputs.get("window_m") if self.heights is None else self.heights.window_m
+
+    def read_layer(self, name: str, rows: slice, columns: slice) -> NDArray[np.floating]:
+        """Return a window of what `Heights` has by a name, NaN outside the mask."""
+        if self.heights is not None:
+            mask = self.heights.mask[rows, columns]
+            return np.where(mask, getattr(self.heights, name)[rows, columns], np.nan)
+        assert self.store is not None
+        values = self.store.read_layer(name, rows, columns)
+        if name == "height_m":
+            return values
+        return np.where(np.isnan(self.store.read_layer("height_m", rows, columns)), np.nan, values)
 
     def check_finished(self) -> None:
         """Raise ValueError if patches of the store are missing or damaged."""

@@ -20,6 +20,7 @@ from clsas.core.grid import Grid
 from clsas.mosaics.documents import (
     DIGESTS,
     FORMAT,
+    HEIGHTS_VERSION,
     VECTORS,
     VERSION,
     DamageError,
@@ -33,8 +34,11 @@ from clsas.mosaics.durable import DurableStore
 from clsas.mosaics.levels import (
     CHUNK_SHAPE,
     IN_DB,
+    LAYERS,
     LEVELS,
+    WINDOW,
     Levels,
+    PixelArray,
     chunk_side,
     factors_of,
     levels_of,
@@ -57,7 +61,11 @@ _COPIES = 3  # copies of coordinates or heights in memory: Zarr's, the grid's, o
 
 
 def create_store(
-    path: Path, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]
+    path: Path,
+    inputs: dict[str, Any],
+    grid: Grid,
+    patch_shape: tuple[int, int],
+    window: tuple[int, int] | None,
 ) -> None:
     """Create the store of a mosaic in one step, so that a killed process leaves no partial store.
 
@@ -75,13 +83,15 @@ def create_store(
     levels = levels_of(grid.shape, patch_shape)
     attributes = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": VERSION if window is None else HEIGHTS_VERSION,
         "patch_shape": list(patch_shape),
         CHUNK_SHAPE: list(map(chunk_side, patch_shape, grid.shape)),
         LEVELS: levels.json(),
         "grid": plane,
         "inputs": inputs,
     } | multiscales(levels)
+    if window is not None:
+        attributes[WINDOW] = list(window)
     with creating(path) as temporary:
         _create_arrays(temporary, grid, attributes)
         digests = _digests(temporary, attributes, grid.height_m is not None)
@@ -274,6 +284,16 @@ def _map_of(grid: Grid | None) -> dict[str, Any]:
     return {"_CRS": {"wkt": place.crs}} if "[" in place.crs else {}
 
 
+def _meaning(array: PixelArray) -> dict[str, Any]:
+    """Return unit and meaning of the numbers of an array, as xarray shows them."""
+    if array.name == IN_DB:
+        return {"units": "dB", "long_name": "amplitude"}
+    if array.kind not in LAYERS:
+        return {}
+    units, meaning = LAYERS[array.kind]
+    return {"units": units, "long_name": meaning} if units else {"long_name": meaning}
+
+
 def _create_arrays(path: Path, grid: Grid | None, attributes: dict[str, Any]) -> None:
     """Create the groups and arrays of a mosaic: pixels, all zero, levels, coordinates, heights."""
     files = DurableStore(path)
@@ -308,7 +328,7 @@ def _create_arrays(path: Path, grid: Grid | None, attributes: dict[str, Any]) ->
             dimension_names=[f"overview_{n}" for n in names]
             if in_db and array.factor > 1
             else names,
-            attributes={"units": "dB", "long_name": "amplitude"} if in_db else {},
+            attributes=_meaning(array),
         )
     coordinates: dict[str, tuple[tuple[str, ...], NDArray[np.float64]]] = {}
     if grid is not None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,16 @@ from clsas.mosaics.documents import (
     with_checksum,
     write_attributes,
 )
-from clsas.mosaics.levels import LEVELS, PixelArray, mosaic_arrays, patch_arrays
-from clsas.mosaics.pyramid import Level, coarser, covered
+from clsas.mosaics.levels import (
+    LAYERS,
+    LEVELS,
+    WINDOW,
+    PixelArray,
+    layers_of,
+    mosaic_arrays,
+    patch_arrays,
+)
+from clsas.mosaics.pyramid import Level, coarser, coarser_layers, covered
 from clsas.mosaics.record import Checksums, PatchIndex
 
 _KEPT = 4  # patches that are kept while levels are computed: those around a corner
@@ -40,8 +48,11 @@ _CHUNKS = "chunks_crc32c"  # attribute with the checksums of the chunks, by the 
 
 
 def digest_of_patches(checksums: dict[PatchIndex, Checksums]) -> str:
-    """Return a digest of the pixels of the finished patches."""
-    pixels = {"{}.{}".format(*index): each["pixels"] for index, each in checksums.items()}
+    """Return a digest of the pixels and layers of the finished patches."""
+    pixels: dict[str, Any] = {}
+    for (row, column), each in checksums.items():
+        layers = [each[name] for name in LAYERS if name in each]
+        pixels[f"{row}.{column}"] = [each["pixels"], *layers] if layers else each["pixels"]
     return hashlib.sha256(canonical(pixels)).hexdigest()[:16]
 
 
@@ -88,7 +99,7 @@ def complete(
     path: Path,
     attributes: dict[str, Any],
     digest: str,
-    read: Callable[[slice, slice], NDArray[np.complex64]],
+    read: Callable[[str, slice, slice], NDArray],
     progress: Callable[[int, int], object] | None,
 ) -> None:
     """Compute the levels of a mosaic that mix patches, and write their record.
@@ -102,7 +113,7 @@ def complete(
     digest : str
         Digest of the finished patches.
     read : callable
-        Called as read(rows, columns) with slices; returns pixels of the mosaic.
+        Called as read(name, rows, columns) with slices; returns pixels or a layer of the mosaic.
     progress : callable or None
         Called as progress(chunks computed so far, number of chunks).
     """
@@ -118,11 +129,12 @@ def complete(
         for factor in sorted({array.factor for array in arrays})
     }
     work = [(factor, chunk) for factor, same in by_factor.items() for chunk in _in_order(same[0])]
-    read = _by_patches(read, patch_arrays(attributes)[0])
+    read_pixels = _by_patches(partial(read, "pixels"), patch_arrays(attributes)[0])
     for done, (factor, chunk) in enumerate(work, 1):
         same = by_factor[factor]
         window = _window(same[0], chunk)
-        level = _level(path, attributes, factor, window, read)
+        level = _level(path, attributes, factor, window, read_pixels)
+        level = level._replace(layers=_layers(path, attributes, factor, window, read))
         for array in same:
             write_values(path, attributes, array.name, window, level.values_of(array))
         if progress is not None:
@@ -144,10 +156,7 @@ def _level(
         return Level(np.abs(pixels), pixels)
     shape = attributes["inputs"]["pixels"]
     before = factor // 2
-    finer = [
-        slice(2 * part.start, min(2 * part.stop, -(-count // before)))
-        for part, count in zip(window, shape, strict=True)
-    ]
+    finer = _finer(window, before, shape)
     weights = [
         covered(part.start, part.stop - part.start, before, count)
         for part, count in zip(finer, shape, strict=True)
@@ -157,13 +166,43 @@ def _level(
         pixels = read(rows, columns)
         level = Level(np.abs(pixels), pixels)
     else:
-        level = Level(
-            *(
-                np.asarray(open_array(path, attributes, f"{before}x/{kind}")[rows, columns])
-                for kind in ("amplitude", "pixels")
-            )
+        amplitude, pixels = (
+            np.asarray(open_array(path, attributes, f"{before}x/{kind}")[rows, columns])
+            for kind in ("amplitude", "pixels")
         )
+        level = Level(amplitude, pixels)
     return coarser(level, weights[0], weights[1])
+
+
+def _layers(
+    path: Path,
+    attributes: dict[str, Any],
+    factor: int,
+    window: tuple[slice, slice],
+    read: Callable[[str, slice, slice], NDArray],
+) -> dict[str, NDArray[np.float32]]:
+    """Return a part of the layers of a level, computed from the level before or from the layers."""
+    if factor == 1:
+        return {}
+    before = factor // 2
+    found: dict[str, NDArray[np.float32]] = {}
+    rows, columns = _finer(window, before, attributes["inputs"]["pixels"])
+    for name in layers_of(attributes):
+        if before == 1:
+            values = read(name, rows, columns)
+        else:
+            values = np.asarray(open_array(path, attributes, f"{before}x/{name}")[rows, columns])
+        found |= coarser_layers({name: values}, factor, attributes[WINDOW])
+    return found
+
+
+def _finer(window: tuple[slice, slice], before: int, shape: tuple[int, int]) -> tuple[slice, slice]:
+    """Return the pixels of the level before, of factor `before`, that a window is made of."""
+    rows, columns = (
+        slice(2 * part.start, min(2 * part.stop, -(-count // before)))
+        for part, count in zip(window, shape, strict=True)
+    )
+    return rows, columns
 
 
 def _by_patches(

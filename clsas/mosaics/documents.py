@@ -19,14 +19,17 @@ from clsas.core.atomic import make_folders, replacing
 from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.reading import parse_json, read_bytes
-from clsas.mosaics.levels import are_levels
+from clsas.mosaics.levels import WINDOW, are_levels
 
 CHECKSUM = "crc32"
 """Attribute with the checksum of all others."""
 
 FORMAT = "clsas mosaic"
 VERSION = 3
-READABLE = (2, 3)  # version 1 had no checksums, and version 2 no levels
+READABLE = (2, 3, 4)  # version 1 had no checksums, version 2 no levels, and version 3 no heights
+
+HEIGHTS_VERSION = 4
+"""Version of mosaics of heights. Those of images are of version 3 still."""
 
 DIGESTS = "metadata"
 """Attribute with a digest of every array's metadata. Stores of early versions lack it."""
@@ -137,7 +140,7 @@ def read_document(path: Path) -> dict[str, Any]:
     if attributes.get("version") not in READABLE:
         raise ValueError(
             f"{path} is a mosaic of version {attributes.get('version')}, but this clsas works "
-            f"with versions {' and '.join(map(str, READABLE))}: choose another path"
+            f"with versions {READABLE[0]} to {READABLE[-1]}: choose another path"
         )
     if not is_intact(attributes):
         raise ValueError(f"{path} is damaged: its attributes do not match their checksum")
@@ -194,6 +197,7 @@ def _is_complete(attributes: dict[str, Any]) -> bool:
         _is_shape(attributes.get("patch_shape"))
         and isinstance(attributes.get(DIGESTS, {}), dict)
         and (grid is None or (isinstance(grid, dict) and grid.keys() == set(VECTORS)))
+        and (WINDOW not in attributes or (grid is not None and _is_shape(attributes[WINDOW])))
     ):
         return False
     try:

@@ -81,6 +81,16 @@ class Job:
             return None
         return tolerance_in_db(*(self.request.get(name) for name in REQUESTS[:2]))
 
+    def on(self, visibility: SurveyVisibility, in_process: bool) -> Job:
+        """Return the settings with the present survey."""
+        if in_process:
+            return replace(self, local=visibility)
+        return replace(self, files=stamped_files(visibility.survey))
+
+    def form(self, window: PatchWindow) -> tuple[Record, Image | None]:
+        """Form a patch; see `form_patch`."""
+        return form_patch(self, window)
+
     def visibility(self) -> SurveyVisibility:
         """Return the survey. A worker process opens the files again if their number has changed.
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,21 @@ COARSEST_SIDE = 1024
 
 IN_DB = "amplitude_db"
 """Name of the array with the coarsest level in dB, which programs can plot as it is."""
+
+LAYERS = {
+    "height_m": ("m", "height above the plane of the grid"),
+    "sd_m": ("m", "standard deviation of the height"),
+    "coherence": ("", "coherence of the receiver banks"),
+    "looks": ("", "effective number of independent samples"),
+    "m_per_rad": ("m", "change of the height per radian of phase between the banks"),
+}
+"""Arrays of a mosaic of heights beside the pixels, with units and meaning, and all of its levels.
+
+They have the names and the meaning of the attributes of `clsas.Heights`.
+"""
+
+WINDOW = "window"
+"""Attribute of mosaics of heights: rows and columns of the window behind each height."""
 
 LEVELS = "levels"
 """Attribute that lists the levels, and name of the group that records those of the mosaic."""
@@ -98,6 +113,8 @@ class PixelArray:
     shape, chunk_shape : (rows, columns)
     patch_shape : (rows, columns)
         Size of a patch, in pixels of the mosaic.
+    has_gaps : bool
+        True if NaN stands for pixels without a value, False if all numbers are finite.
     """
 
     name: str
@@ -106,11 +123,17 @@ class PixelArray:
     shape: tuple[int, int]
     chunk_shape: tuple[int, int]
     patch_shape: tuple[int, int]
+    has_gaps: bool = False
 
     @property
     def fill_value(self) -> complex | float:
         """Value where nothing has been written."""
-        return math.nan if self.name == IN_DB else 0
+        return math.nan if self.has_gaps else 0
+
+    @property
+    def kind(self) -> str:
+        """What the numbers are: "pixels", "amplitude", `IN_DB` or one of `LAYERS`."""
+        return self.name.rpartition("/")[2]
 
     def window(self, index: tuple[int, int]) -> tuple[slice, slice]:
         """Return the pixels of this array that belong to a patch."""
@@ -210,6 +233,11 @@ def stored_levels(attributes: Mapping[str, Any]) -> Levels:
     return Levels(tuple(stored["of_patches"]), tuple(stored["of_mosaic"]))
 
 
+def layers_of(attributes: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the layers in the attributes of a store: `LAYERS` for a mosaic of heights."""
+    return tuple(LAYERS) if WINDOW in attributes else ()
+
+
 def are_levels(attributes: Mapping[str, Any]) -> bool:
     """Return whether chunks and levels in the attributes of a store are as clsas writes them.
 
@@ -250,8 +278,12 @@ def patch_arrays(attributes: Mapping[str, Any]) -> list[PixelArray]:
     chunk_shape = tuple(attributes.get(CHUNK_SHAPE, attributes["patch_shape"]))
     shape, patch_shape = tuple(attributes["inputs"]["pixels"]), tuple(attributes["patch_shape"])
     pixels = PixelArray("pixels", 1, "complex64", shape, chunk_shape, patch_shape)
+    layers = [
+        replace(pixels, name=name, data_type="float32", has_gaps=True)
+        for name in layers_of(attributes)
+    ]
     levels = stored_levels(attributes)
-    return [pixels, *_level_arrays(attributes, levels, levels.of_patches)]
+    return [pixels, *layers, *_level_arrays(attributes, levels, levels.of_patches)]
 
 
 def mosaic_arrays(attributes: Mapping[str, Any]) -> list[PixelArray]:
@@ -273,11 +305,20 @@ def _level_arrays(
         else:
             chunks = tuple(chunk_side(count, count) for count in reduced)
         kinds = {f"{factor}x/pixels": "complex64", f"{factor}x/amplitude": "float32"}
+        kinds |= {f"{factor}x/{name}": "float32" for name in layers_of(attributes)}
         names = kinds if factor > 1 else {}
         if factor == levels.coarsest:
             names = names | {IN_DB: "float32"}
         found += [
-            PixelArray(name, factor, data_type, reduced, (chunks[0], chunks[1]), patch_shape)
+            PixelArray(
+                name,
+                factor,
+                data_type,
+                reduced,
+                (chunks[0], chunks[1]),
+                patch_shape,
+                has_gaps=name.rpartition("/")[2] in (IN_DB, *LAYERS),
+            )
             for name, data_type in names.items()
         ]
     return found

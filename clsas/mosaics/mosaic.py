@@ -27,7 +27,7 @@ from clsas.mosaics.devices import open_devices
 from clsas.mosaics.forming import Job
 from clsas.mosaics.patches import Layout, choose_patch_shape, patch_shape_of
 from clsas.mosaics.provenance import inputs_of
-from clsas.mosaics.record import PatchIndex, Record, describe_damage
+from clsas.mosaics.record import PatchIndex, Record
 from clsas.mosaics.scheduling import Run, form_patches, wait_for_first_file
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import open_survey
@@ -394,16 +394,6 @@ def _still_finished(
     """Return the records of intact patches to which no channel added since then contributes."""
     return {
         index: record
-        for index, record in _undamaged(store).items()
+        for index, record in store.undamaged_records().items()
         if not visibility.any_channel_from(record.survey_channels, layout.window(index).grid)
     }
-
-
-def _undamaged(store: Store) -> dict[PatchIndex, Record]:
-    """Return the records of a store's intact patches; warn of damaged ones."""
-    damage = store.damage()
-    if damage:
-        validate.warn(
-            f"{store.path} is damaged; these patches are formed again: {describe_damage(damage)}"
-        )
-    return {index: record for index, record in store.records().items() if index not in damage}

@@ -1,12 +1,21 @@
-"""Arithmetic of levels: means of power and of complex pixels over blocks of pixels.
+"""Arithmetic of levels: means of power, of complex pixels and of layers over blocks of pixels.
 
 Sums are in double precision, so that neither the power of small amplitudes nor that of large ones
 leaves the range of numbers. Stored is the root of the mean power, which has the range of the
 pixels.
+
+Layers are means of the pixels that have a value, level by level. A deviation is that of the mean of
+the heights. Heights of neighbouring pixels share most of their windows: those that are d pixels
+apart along an axis have the correlation 1 - d/w with w pixels in the window. The mean of s pixels
+of variance v along an axis then has the variance
+
+    v c(s),   c(s) = sum_ij max(1 - |i - j|/w, 0) / s^2.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -24,12 +33,16 @@ class Level(NamedTuple):
     """Root of the mean power."""
     pixels: NDArray[np.complex64]
     """Mean of the complex pixels."""
+    layers: Mapping[str, NDArray[np.float32]] = MappingProxyType({})
+    """Means of the layers, by name."""
 
     def values_of(self, array: PixelArray) -> NDArray[np.float32] | NDArray[np.complex64]:
-        """Return the values of an array of the level: amplitudes, pixels, or amplitudes in dB."""
+        """Return the values of an array of the level."""
+        if array.kind in self.layers:
+            return self.layers[array.kind]
         if array.name == IN_DB:
             return _in_db(self.amplitude)
-        return self.pixels if array.name.endswith("/pixels") else self.amplitude
+        return self.pixels if array.kind == "pixels" else self.amplitude
 
 
 class _Sums(NamedTuple):
@@ -78,9 +91,74 @@ def levels(pixels: NDArray[np.complex64], factors: tuple[int, ...]) -> dict[int,
             sums, factor = sums.halved(), 2 * factor
         bands[factor].append(sums.level())
     return {
-        factor: Level(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+        factor: Level(
+            np.concatenate([each.amplitude for each in found]),
+            np.concatenate([each.pixels for each in found]),
+        )
         for factor, found in bands.items()
     }
+
+
+def layer_levels(
+    layers: Mapping[str, NDArray[np.float32]],
+    factors: tuple[int, ...],
+    window: tuple[int, int] | None,
+) -> dict[int, dict[str, NDArray[np.float32]]]:
+    """Return the layers of a patch and of its levels, by factor and name.
+
+    Parameters
+    ----------
+    layers : dict of str to float32 [rows, columns]
+    factors : tuple of int
+        1, 2, 4 and so on, as for `levels`; with 1 or without.
+    window : (rows, columns)
+        Pixels of the window behind each height; None without layers.
+    """
+    found, factor = {1: dict(layers)}, 1
+    while factor < max(factors, default=1):
+        factor *= 2
+        found[factor] = coarser_layers(found[factor // 2], factor, window)
+    return found
+
+
+def coarser_layers(
+    layers: Mapping[str, NDArray[np.float32]], factor: int, window: tuple[int, int] | None
+) -> dict[str, NDArray[np.float32]]:
+    """Return the layers of the level with a factor from those with half of it."""
+    found = {}
+    for name, values in layers.items():
+        if name == "sd_m":
+            assert window is not None  # of the heights with these deviations
+            less = deviation_ratio(factor, window) / deviation_ratio(factor // 2, window)
+            found[name] = np.float32(less) * np.sqrt(mean_of_four(np.square(values)))
+        else:
+            found[name] = mean_of_four(values)
+    return found
+
+
+def deviation_ratio(side: int, window: tuple[int, int]) -> float:
+    """Return the deviation of the mean of side x side heights relative to that of one of them."""
+    return float(np.sqrt(np.prod([_mean_correlation(side, n) for n in window])))
+
+
+def _mean_correlation(count: int, window: int) -> float:
+    """Return the mean correlation of all pairs of pixels in a row of `count` of them."""
+    apart = np.arange(1, count)
+    return (count + 2 * float(np.sum((count - apart) * np.maximum(1 - apart / window, 0)))) / (
+        count**2
+    )
+
+
+def mean_of_four(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return means of 2 x 2 pixels, of those that are not NaN; NaN if all are."""
+    known = ~np.isnan(values)
+    sums, counts = (
+        _pairs_of_columns(_pairs(each.astype(np.float64)))
+        for each in (np.where(known, values, 0), known)
+    )
+    mean = np.full(sums.shape, np.nan)
+    np.divide(sums, counts, out=mean, where=counts > 0)
+    return mean.astype(np.float32)
 
 
 def coarser(level: Level, rows: NDArray[np.float64], columns: NDArray[np.float64]) -> Level:

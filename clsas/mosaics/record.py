@@ -60,6 +60,10 @@ class Record:
         an exact image or an empty patch.
     has_pixels : bool
         True if any pixel is not 0.
+    heights : dict or None
+        How the heights were measured: the share of `valid` pixels, the median of `looks`, the
+        height of ambiguity `ambiguity_m`, and `converged`; or the `reason` why there are none.
+        None for images.
     """
 
     channels: int
@@ -76,6 +80,7 @@ class Record:
     driver: str = ""
     plan: dict[str, Any] | None = None
     has_pixels: bool = False
+    heights: dict[str, Any] | None = None
 
     __repr__ = reprs.of_fields
 
@@ -94,6 +99,10 @@ class Record:
             found.append(f"{self.missing_channels} of {self.channels} channels have no samples")
         if self.gap_m:
             found.append(f"a gap of {self.gap_m:.3g} m between pings")
+        if self.heights is not None and "reason" in self.heights:
+            found.append(f"no heights: {self.heights['reason']}")
+        elif self.heights is not None and not self.heights["converged"]:
+            found.append("heights still changed in the last pass")
         return tuple(found)
 
     def attributes(self, checksums: Checksums) -> dict[str, Any]:
@@ -102,7 +111,10 @@ class Record:
         stored = {PIXELS_CHECKSUM: checksums["pixels"]} | (
             {LEVELS_CHECKSUMS: levels} if levels else {}
         )
-        return with_checksum(asdict(self) | stored)
+        own = asdict(self)
+        if self.heights is None:  # of an image
+            del own["heights"]
+        return with_checksum(own | stored)
 
     @classmethod
     def read(cls, folder: Path) -> tuple[Record, Checksums] | None:

@@ -5,19 +5,20 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from clsas.core.image import Image
 from clsas.core.threads import uninterrupted, wait
 from clsas.mosaics.devices import device_threads
-from clsas.mosaics.forming import Job, form_patch, stamped_files
-from clsas.mosaics.patches import Layout
+from clsas.mosaics.patches import Layout, PatchWindow
 from clsas.mosaics.record import PatchIndex, Record
+from clsas.mosaics.store import Store
 from clsas.mosaics.survey import files_of, has_ended, open_files
 from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import Device
+from clsas.sonar.beam import BeamWindow
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -43,6 +44,30 @@ class Growth:
     idle_s: float
 
 
+class PatchJob(Protocol):
+    """Settings by which patches are formed: `clsas.mosaics.forming.Job`, or those of heights."""
+
+    @property
+    def store(self) -> Path | None:
+        """The store."""
+
+    @property
+    def beam(self) -> BeamWindow | None:
+        """Weights of the channels."""
+
+    def on(self, visibility: SurveyVisibility, in_process: bool) -> PatchJob:
+        """Return the settings with the present survey."""
+
+    def form(self, window: PatchWindow) -> tuple[Record, Image | None]:
+        """Form a patch and write it to the store."""
+
+    def opened_store(self) -> Store | None:
+        """Return the store, or None if there is none."""
+
+    def complete_levels(self) -> None:
+        """Compute the levels of the store that mix patches."""
+
+
 @dataclass(frozen=True, eq=False)
 class Run:
     """Everything needed to form a mosaic.
@@ -50,7 +75,7 @@ class Run:
     Attributes
     ----------
     layout : Layout
-    job : Job
+    job : PatchJob
         Settings of the patches, still without the survey.
     inputs : dict
         Inputs of the mosaic, as stored with it.
@@ -64,7 +89,7 @@ class Run:
     """
 
     layout: Layout
-    job: Job
+    job: PatchJob
     inputs: dict[str, Any]
     visibility: SurveyVisibility
     devices: tuple[Device, ...]
@@ -91,11 +116,9 @@ class Run:
             return self.client.get_executor(pure=False)
         return device_threads(self.workers, self.devices)
 
-    def job_on(self, visibility: SurveyVisibility) -> Job:
+    def job_on(self, visibility: SurveyVisibility) -> PatchJob:
         """Return the settings of the patches, with the present survey."""
-        if self.client is None:
-            return replace(self.job, local=visibility)
-        return replace(self.job, files=stamped_files(visibility.survey))
+        return self.job.on(visibility, self.client is None)
 
 
 class _GrowingSurvey:
@@ -173,7 +196,7 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Form
                 todo.remove(index)
                 with uninterrupted():
                     job = run.job_on(survey.visibility)
-                    running[executor.submit(form_patch, job, layout.window(index))] = index
+                    running[executor.submit(job.form, layout.window(index))] = index
                 known[index] = survey.channels
             if not running and not todo and survey.has_ended:
                 run.job.complete_levels()

@@ -8,11 +8,11 @@ the disk.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +24,8 @@ from clsas.core.digests import grid_digest
 from clsas.core.extras import needed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
+from clsas.interferometry.result import Heights
+from clsas.mosaics import stored_heights
 from clsas.mosaics.documents import (
     DIGESTS,
     DamageError,
@@ -37,12 +39,14 @@ from clsas.mosaics.documents import (
 )
 from clsas.mosaics.levels import (
     LEVELS,
+    WINDOW,
+    layers_of,
     stored_levels,
 )
 from clsas.mosaics.metadata import GROUP, has_height
 from clsas.mosaics.overview import Reading, reduced, step_of
 from clsas.mosaics.provenance import OtherInputsError, differences
-from clsas.mosaics.pyramid import levels
+from clsas.mosaics.pyramid import Level, layer_levels, levels
 from clsas.mosaics.record import (
     PatchIndex,
     Record,
@@ -122,6 +126,11 @@ class Store:
         return self._arrays.pixels
 
     @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the arrays that `read_layer` can read, empty unless the mosaic has heights."""
+        return layers_of(read_document(self.path))
+
+    @property
     def levels(self) -> tuple[int, ...]:
         """Factors of the levels that `read_level` can read, ascending, such as (2, 4, 8).
 
@@ -181,7 +190,13 @@ class Store:
         found = self._compared()[1]
         return self._level_damage() | found
 
-    def begin(self, inputs: dict[str, Any], grid: Grid, patch_shape: tuple[int, int]) -> None:
+    def begin(
+        self,
+        inputs: dict[str, Any],
+        grid: Grid,
+        patch_shape: tuple[int, int],
+        window: tuple[int, int] | None = None,
+    ) -> None:
         """Create the store, or check that the one at the path was made with the same inputs.
 
         Parameters
@@ -192,6 +207,8 @@ class Store:
             Grid of the mosaic.
         patch_shape : (rows, columns)
             Number of pixels of a patch.
+        window : (rows, columns), optional
+            Pixels of the window behind each height, for a mosaic of heights.
 
         Raises
         ------
@@ -210,7 +227,7 @@ class Store:
         patch_shape = validate.sides("patch_shape", patch_shape)
         check_place(self.path)
         if not is_there(self.path):
-            arrays.create_store(self.path, inputs, grid, patch_shape)
+            arrays.create_store(self.path, inputs, grid, patch_shape, window)
         stored = read_document(self.path)
         if found := differences(stored, inputs, patch_shape):
             ways = "choose another path or repeat the inputs"
@@ -260,6 +277,15 @@ class Store:
                 found[index] = record
         return found
 
+    def undamaged_records(self) -> dict[PatchIndex, Record]:
+        """Return the records of intact patches after reading all; warn of damaged ones."""
+        damage = self.damage()
+        if damage:
+            validate.warn(
+                f"{self.path} is damaged; these patches are formed again: {describe_damage(damage)}"
+            )
+        return {index: record for index, record in self.records().items() if index not in damage}
+
     def damage(self, progress: Callable[[int, int], object] | None = None) -> dict[PatchIndex, str]:
         """Read every finished patch, and return those that are damaged.
 
@@ -291,6 +317,7 @@ class Store:
         columns: slice,
         pixels: NDArray[np.complex64],
         record: Record,
+        layers: Mapping[str, NDArray[np.float32]] = MappingProxyType({}),
     ) -> None:
         """Write a patch with its levels and then its record, and wait until they are on the disk.
 
@@ -304,11 +331,13 @@ class Store:
             Pixels of the mosaic that belong to the patch.
         pixels : complex64 [rows, columns]
         record : Record
+        layers : dict of str to float32 [rows, columns]
+            Heights and what belongs to them, by the names of `layers`; NaN where there is none.
 
         Raises
         ------
         ValueError
-            If `rows` or `columns` are not those of the patch.
+            If `rows` or `columns` are not those of the patch, or `layers` not those of the store.
         OSError
             If the disk is full or the store is not writable.
         """
@@ -330,6 +359,11 @@ class Store:
         shape = tuple(part.stop - part.start for part in own)
         pixels = validate.array("pixels", pixels, np.complex64, shape)
         validate.instance("record", record, Record)
+        if set(layers) != set(self.layers):
+            raise ValueError(
+                f"layers must be {', '.join(self.layers) or 'left out'} for {self.path}, got "
+                f"{', '.join(layers) or 'none'}"
+            )
         folder = self._arrays.files.folder((row, column))
         check_own(self.path, folder)
         # Remove the old record first, so that it never stands beside pixels of the new patch.
@@ -339,9 +373,13 @@ class Store:
         attributes = read_document(self.path)
         first, *others = self._arrays.files.arrays
         zarr_arrays().write_values(self.path, attributes, first.name, (rows, columns), pixels)
-        found = levels(pixels, stored_levels(attributes).of_patches)
+        factors = stored_levels(attributes).of_patches
+        found = {1: Level(np.abs(pixels), pixels)} | levels(pixels, factors)
+        of_layers = layer_levels(layers, factors, attributes.get(WINDOW))
         for array in others:
-            window, values = array.window((row, column)), found[array.factor].values_of(array)
+            window = array.window((row, column))
+            level = found[array.factor]._replace(layers=of_layers[array.factor])
+            values = level.values_of(array)
             zarr_arrays().write_values(self.path, attributes, array.name, window, values)
         write_attributes(folder, record.attributes(self._arrays.files.checksums((row, column))))
 
@@ -371,7 +409,7 @@ class Store:
         if not self._arrays.of_mosaic or self._is_complete():
             return False
         digest = self._digest()
-        _completing().complete(self.path, read_document(self.path), digest, self.read, progress)
+        _completing().complete(self.path, read_document(self.path), digest, self._read, progress)
         return True
 
     def add_levels(self, progress: Callable[[int, int], object] | None = None) -> bool:
@@ -421,7 +459,47 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        return self._arrays.read(self._arrays.files.pixels, rows, columns)
+        return self._read("pixels", rows, columns)
+
+    def read_layer(
+        self,
+        name: str,
+        rows: slice = slice(None),
+        columns: slice = slice(None),
+        *,
+        factor: int = 1,
+    ) -> NDArray[np.float32]:
+        """Return a window of a layer of a mosaic of heights, by default all of it.
+
+        Parameters
+        ----------
+        name : str
+            One of `layers`.
+        rows, columns : slice
+            Pixels of the mosaic, or of the level.
+        factor : int
+            1, or one of `levels`, whose values are means of the pixels that have one; `sd_m` is the
+            standard deviation of the mean of the heights.
+
+        Returns
+        -------
+        float32 [rows, columns]
+            NaN where there is no value.
+
+        Raises
+        ------
+        ValueError
+            If there is no such layer or level, or a finished patch among the pixels is damaged.
+        OSError
+            If a file cannot be read.
+        """
+        if name not in self.layers:
+            raise ValueError(
+                f"name must be that of a layer of {self.path} "
+                f"({', '.join(self.layers) or 'none: it has no heights'}), got {name!r}"
+            )
+        factor = self._checked_factor(factor) if factor != 1 else 1
+        return self._read(f"{factor}x/{name}" if factor > 1 else name, rows, columns)
 
     def read_level(
         self,
@@ -454,18 +532,14 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        factor = validate.count("factor", factor)
+        factor = self._checked_factor(factor)
         validate.flag("coherent", coherent)
-        if factor not in (found := self.levels):
-            known = ", ".join(map(str, found)) or "none: clsas mosaic --add-levels adds them"
-            raise ValueError(
-                f"factor must be that of a level of {self.path} ({known}), got {factor}"
-            )
-        array = self._arrays.named(f"{factor}x/{'pixels' if coherent else 'amplitude'}")
-        return self._arrays.read(array, rows, columns)
+        return self._read(f"{factor}x/{'pixels' if coherent else 'amplitude'}", rows, columns)
 
     def image(self, rows: slice = slice(None), columns: slice = slice(None)) -> Image:
         """Return the pixels of a window, by default all, as an image.
+
+        The image of a mosaic of heights is that of the first bank on the relief, as in `heights`.
 
         Raises
         ------
@@ -474,8 +548,51 @@ class Store:
         OSError
             If a file cannot be read.
         """
+        if self.layers:
+            return self.heights(rows, columns).image
         window = self.grid.window(rows, columns)
         return Image(self.read(rows, columns), window)
+
+    def heights(self, rows: slice = slice(None), columns: slice = slice(None)) -> Heights:
+        """Return the heights in a window of a mosaic of heights, by default all.
+
+        Heights of the relief outside the mask, where the image needs some, are those of the nearest
+        valid pixel in the window.
+
+        Raises
+        ------
+        ValueError
+            If the mosaic is one of images, a finished patch in the window is damaged, or the
+            heights do not fit into memory.
+        OSError
+            If a file cannot be read.
+        """
+        return stored_heights.window_of(self, rows, columns)
+
+    def overview_heights(
+        self,
+        most: int = _OVERVIEW,
+        rows: slice = slice(None),
+        columns: slice = slice(None),
+    ) -> Heights:
+        """Return the heights at fewer pixels, each with the mean of those that it covers.
+
+        Parameters
+        ----------
+        most : int
+            Largest number of pixels along the longer side. The overview has the pixels of a level,
+            2, 4, 8, ... times as far apart as those of the mosaic.
+        rows, columns : slice
+            Part of the mosaic, without steps; by default all of it.
+
+        Raises
+        ------
+        ValueError
+            If the mosaic is one of images, nothing is selected, or a finished patch is damaged.
+        OSError
+            If a file cannot be read.
+        """
+        return stored_heights.overview_of(self, validate.count("most", most), rows, columns)
 
     def overview(
         self,
@@ -533,6 +650,19 @@ class Store:
             factor * side for side in self._arrays.files.pixels.patch_shape
         )
         return reduced(part, Reading(read, factor, (rows_at_once, columns_at_once)), step)
+
+    def _read(self, name: str, rows: slice, columns: slice) -> NDArray:
+        return self._arrays.read(self._arrays.named(name), rows, columns)
+
+    def _checked_factor(self, factor: int) -> int:
+        """Return the factor of a level; raise ValueError if there is none."""
+        factor = validate.count("factor", factor)
+        if factor not in (found := self.levels):
+            known = ", ".join(map(str, found)) or "none: clsas mosaic --add-levels adds them"
+            raise ValueError(
+                f"factor must be that of a level of {self.path} ({known}), got {factor}"
+            )
+        return factor
 
     def _compared(self) -> tuple[Grid | None, dict[str, str]]:
         attributes = read_document(self.path)

@@ -92,7 +92,7 @@ class StoredArrays:
             if not found and array.name == "pixels":
                 reason = str(error)
             raise ValueError(f"{self.path} is damaged: {reason}{REPAIR}") from error
-        if not np.isfinite(values).all():
+        if not (np.isfinite(values) | (array.has_gaps & np.isnan(values))).all():
             raise ValueError(
                 f"{self.path} must have finite numbers, but its {array.name} contain NaN or "
                 "infinity, which clsas does not write"

@@ -2,7 +2,6 @@
 
 import functools
 import json
-import os
 import shutil
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 import stores
 from click.testing import CliRunner
-from stores import change, files_of, written
+from stores import change, files_of, killed_at, written
 
 import clsas
 from clsas.cli import main
@@ -131,28 +130,6 @@ def test_powers_beyond_single_precision_are_kept(scale):
     rows, columns = (pyramid.covered(0, -(-n // 2), 2, n) for n in GRID.shape)
     coarser = pyramid.coarser(found[2], rows, columns)
     np.testing.assert_allclose(coarser.amplitude, scale * expected(4)[0], rtol=1e-6)
-
-
-class Killed(BaseException):
-    """Stands for a signal that ends the process."""
-
-
-def killed_at(monkeypatch, step, work):
-    """Do some work until a file is about to get its name for the `step`-th time; or return."""
-    rename, count = os.replace, iter(range(step))
-
-    def replace(source, target):
-        if next(count, None) is None:
-            raise Killed
-        rename(source, target)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", replace)
-        try:
-            work()
-        except Killed:
-            return True
-    return False
 
 
 @pytest.mark.slow

@@ -1,0 +1,304 @@
+"""Mosaics of heights: measured patch by patch in bounded memory, and kept in a store.
+
+Everything that does not depend on a patch is decided once: the window, so that all heights have the
+same resolution, and the margin with which patches are measured. Both are kept with the inputs of
+the store, and a run that continues it takes them from there.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from clsas.core import banks as numbers
+from clsas.core import validate
+from clsas.core.georeference import placed
+from clsas.core.grid import Grid
+from clsas.core.lines import RangeLines
+from clsas.interferometry import heights
+from clsas.interferometry.checks import (
+    check_grid,
+    check_pair,
+    checked_coherence,
+    checked_search,
+)
+from clsas.interferometry.coherence import Window
+from clsas.interferometry.heights import LEAST_COHERENCE
+from clsas.interferometry.interferogram import window_within
+from clsas.mosaics.banks import Bank
+from clsas.mosaics.devices import open_devices
+from clsas.mosaics.documents import read_document
+from clsas.mosaics.height_patches import HeightsJob, seen
+from clsas.mosaics.levels import aligned_side, factors_of
+from clsas.mosaics.patches import Layout
+from clsas.mosaics.provenance import inputs_of
+from clsas.mosaics.scheduling import Run, form_patches
+from clsas.mosaics.store import Store
+from clsas.mosaics.survey import open_survey
+from clsas.opencl.device import Device
+from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
+from clsas.sonar.beam import BeamWindow
+
+_SIDE = 1024  # pixels of a patch by default, which take about 1 GiB
+_TRIAL = 512  # largest side of the part of the grid that decides on the windows; arbitrary
+_MARGIN_WINDOWS = 2.0  # beside half a large one: for as many passes, of half a window each
+
+Lines = RangeLines | str | os.PathLike
+
+
+def mosaic_heights(
+    a: Lines,
+    b: Lines | None,
+    grid: Grid,
+    store: str | os.PathLike,
+    *,
+    search_m: ArrayLike,
+    window_m: float | None = None,
+    tolerance_db: float = -40.0,
+    least_coherence: float = LEAST_COHERENCE,
+    beam: BeamWindow | None = None,
+    patch_m: float | None = None,
+    device: Device | str | int | Sequence[Device | str | int] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Store:
+    """Measure the heights of a seabed of any size patch by patch, and return their store.
+
+    The store keeps every patch as it is finished. After an interruption, the same call continues
+    with the others.
+
+    Parameters
+    ----------
+    a, b : RangeLines or path
+        Range lines of the two banks, or files or folders of them as for `mosaic`, which are read in
+        slices. If `b` is None, `a` contains both banks.
+    grid : Grid
+        Plane above which heights are measured, or height map where the search starts, as for
+        `heights`.
+    store : path
+        Zarr store to write, or to continue.
+    search_m, tolerance_db, least_coherence, beam
+        See `heights`. A beam's direction is computed from the whole track.
+    window_m : float, optional
+        Side of the windows, metres. By default those in the middle of the grid contain about 50
+        independent samples. The window is the same in all patches.
+    patch_m : float, optional
+        Approximate side of the patches, metres; by default 1024 pixels. Memory grows with the size
+        of a patch and its margin.
+    device : Device, str or int, or a sequence of them, optional
+        Devices that work side by side, as for `mosaic`.
+    progress : callable, optional
+        Called as progress(patches finished, number of patches).
+
+    Returns
+    -------
+    Store
+        `Store.heights` reads them, and `Store.overview_heights` those of fewer pixels. `clsas show`
+        and `export` take the store too.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument has the wrong type or is outside its limits; if the banks do not belong
+        together or do not show heights in the middle of the grid, as for `heights`; or if `store`
+        was made with other inputs (the message names the differences).
+    FileFormatError, OSError
+        If a file cannot be read or the store cannot be written.
+    ImportError
+        If Zarr is not installed.
+    DeviceError
+        If there is no such device.
+
+    Warns
+    -----
+    ClsasWarning
+        If a store is damaged, whose damaged patches are then measured again.
+
+    See Also
+    --------
+    heights : Measure heights in memory.
+    mosaic : Form an image of any size.
+
+    Notes
+    -----
+    Every patch is measured with a margin of two windows and half a large one, which decides between
+    the cycles of the phase, and with all that lies at the same ranges within the search. So heights
+    hardly depend on the division into patches: at most as much as they still change in the last
+    pass, about 0.3 standard deviations. The number of independent samples is measured in every
+    patch, and with it the standard deviation and the threshold of the coherence.
+
+    Patches without lines, or whose geometry shows no heights, such as one below the track, contain
+    NaN. `Record.flags` gives the reason.
+
+    Examples
+    --------
+    A flat seabed 0.2 m above the plane of the grid, 20 m away:
+
+    >>> import tempfile
+    >>> import clsas
+    >>> import numpy as np
+    >>> random = np.random.default_rng(1)
+    >>> places_m = random.uniform([-0.9, 19.0, 0.2], [0.9, 21.6, 0.2], (10000, 3))
+    >>> amplitudes = random.standard_normal((10000, 2)) @ [1, 1j]
+    >>> scene = clsas.PointTargets(places_m, amplitudes)
+    >>> tx_m = np.outer(np.linspace(-2, 2, 81), [1, 0, 0]) + [0, 0, 6]
+    >>> lower, upper = (
+    ...     clsas.simulate_lines(
+    ...         tx_m, tx_m + [0, 0, up_m], scene, carrier_hz=100e3, bandwidth_hz=30e3
+    ...     )
+    ...     for up_m in (0.0, 0.2)
+    ... )
+    >>> grid = clsas.Grid.plane((-0.5, 0.5, 41), (19.6, 20.8, 49))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     store = clsas.mosaic_heights(
+    ...         lower, upper, grid, f"{folder}/heights.zarr", search_m=(-0.1, 0.5), patch_m=0.6
+    ...     )
+    ...     print(f"{len(store.records())} patches, {np.nanmedian(store.heights().height_m):.2f} m")
+    4 patches, 0.20 m
+    """
+    validate.instance("grid", grid, Grid)
+    check_grid(grid)
+    search = checked_search(search_m)
+    tolerance_db = validate.number(
+        "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
+    )
+    least_coherence = checked_coherence(least_coherence)
+    validate.instance("beam", beam, BeamWindow, type(None))
+    if window_m is not None:
+        window_m = validate.positive("window_m", window_m, "m")
+        window_within(grid, window_m)
+    if patch_m is not None:
+        patch_m = validate.positive("patch_m", patch_m, "m")
+    validate.progress(progress)
+    banks = _banks(a, b, beam)
+    check_pair(*(bank.geometry for bank in banks))
+    grid = placed(banks[1].geometry, placed(banks[0].geometry, grid))
+    opened = Store.at(validate.path("store", store))
+    devices = open_devices(device)
+    patch_shape = _patch_shape(grid, patch_m)
+    inputs = _inputs(banks, grid, search, tolerance_db, least_coherence, beam)
+    decided = _decided(opened)
+    if decided is None or window_m is not None:
+        decided = _decide(
+            banks, grid, search, window_m, tolerance_db, least_coherence, beam, devices[0]
+        )
+    inputs |= decided
+    window = Window.of(grid, decided["window_m"])
+    opened.begin(inputs, grid, patch_shape, window.sides)
+    job = HeightsJob(
+        banks, grid, search, tolerance_db, least_coherence, beam, decided["window_m"],
+        tuple(decided["margin"]), opened.path,
+    )  # fmt: skip
+    run = Run(Layout(grid, patch_shape), job, inputs, banks[0].visibility, devices, None, None)
+    finished = opened.undamaged_records()
+    report = progress or (lambda done, total: None)
+    report(len(finished), len(run.layout))
+    with closing(form_patches(run, finished)) as forming:
+        for _ in forming:
+            report(len(finished), len(run.layout))
+    return opened
+
+
+def _banks(a: Lines, b: Lines | None, beam: BeamWindow | None) -> tuple[Bank, Bank]:
+    """Return the two banks of one source or of two."""
+    if b is not None:
+        first, second = (
+            open_survey(each if isinstance(each, RangeLines) else Path(each).resolve())
+            for each in (_source("a", a), _source("b", b))
+        )
+        for name, survey in (("a", first), ("b", second)):
+            if survey.geometry.banks > 1:
+                raise ValueError(
+                    f"{name} must have the lines of one bank if both are given, got "
+                    f"{survey.geometry.banks} banks: leave b out, or take one by clsas convert "
+                    "--bank"
+                )
+        return Bank.of(first, None, beam), Bank.of(second, None, beam)
+    source = _source("a", a)
+    survey = open_survey(source if isinstance(source, RangeLines) else source.resolve())
+    known = numbers.present(survey.geometry.bank_numbers)
+    if len(known) != 2:
+        raise ValueError(
+            f"a must have the range lines of 2 receiver banks if b is None, got {len(known)}"
+        )
+    return Bank.of(survey, known[0], beam), Bank.of(survey, known[1], beam)
+
+
+def _source(name: str, lines: Any) -> RangeLines | Path:
+    return lines if isinstance(lines, RangeLines) else validate.path(name, lines)
+
+
+def _patch_shape(grid: Grid, patch_m: float | None) -> tuple[int, int]:
+    """Return the number of pixels of a patch, rounded so that levels end at its borders."""
+    sides = []
+    coarsest = factors_of(grid.shape)[-1]
+    for step_m, count in zip(grid.vectors_m[1:], grid.shape, strict=True):
+        side = _SIDE if patch_m is None else round(patch_m / float(np.linalg.norm(step_m)))
+        patches = math.ceil(count / min(max(side, 1), count))
+        sides.append(aligned_side(math.ceil(count / patches), patches, count, coarsest))
+    return sides[0], sides[1]
+
+
+def _inputs(
+    banks: tuple[Bank, Bank],
+    grid: Grid,
+    search_m: tuple[float, float],
+    tolerance_db: float,
+    least_coherence: float,
+    beam: BeamWindow | None,
+) -> dict[str, Any]:
+    """Return the inputs of a mosaic of heights as JSON types."""
+    first, second = (bank.survey for bank in banks)
+    inputs = inputs_of(first, grid, {"tolerance_db": tolerance_db}, beam)
+    if second is not first:
+        inputs["parts"] += second.digests()
+    inputs |= {"search_m": list(search_m), "least_coherence": least_coherence}
+    return json.loads(json.dumps(inputs))
+
+
+def _decided(store: Store) -> dict[str, Any] | None:
+    """Return the window and the margin of a store that exists."""
+    if store.patch_shape is None:
+        return None
+    inputs = read_document(store.path)["inputs"]
+    if "window_m" not in inputs or "margin" not in inputs:  # a mosaic of images
+        return None
+    return {"window_m": inputs["window_m"], "margin": inputs["margin"]}
+
+
+def _decide(
+    banks: tuple[Bank, Bank],
+    grid: Grid,
+    search_m: tuple[float, float],
+    window_m: float | None,
+    tolerance_db: float,
+    least_coherence: float,
+    beam: BeamWindow | None,
+    device: Device,
+) -> dict[str, Any]:
+    """Return the window and the margin of a new mosaic, from images of the middle of the grid."""
+    middle = grid.window(*(_middle(count) for count in grid.shape))
+    pair, _ = seen(banks, middle, search_m, tolerance_db, beam, device)
+    if pair is None:
+        raise ValueError(
+            "grid must lie where the lines reach it: no channel receives from its middle"
+        )
+    found_m, window, large = heights.windows(pair, middle, search_m, window_m, least_coherence)
+    margin = [
+        math.ceil(wide / 2 + _MARGIN_WINDOWS * side)
+        for side, wide in zip(window.sides, large.sides, strict=True)
+    ]
+    return {"window_m": found_m, "margin": margin}
+
+
+def _middle(count: int) -> slice:
+    side = min(count, _TRIAL)
+    first = (count - side) // 2
+    return slice(first, first + side)

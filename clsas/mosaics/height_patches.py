@@ -1,0 +1,231 @@
+"""Measure the heights of one patch of a mosaic, and write them to the store.
+
+A patch is measured together with a margin, so that the windows of its outermost pixels are complete
+and the cycles of the phase are decided as in a measurement of the whole grid. Lines are read for
+everything that the sweep images: the patch with its margin at all heights of the search, and what
+lies at the same ranges.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core.grid import Grid
+from clsas.core.image import Image, holds_any
+from clsas.interferometry import heights
+from clsas.interferometry.baseline import Baseline
+from clsas.interferometry.errors import UnmeasurableError
+from clsas.interferometry.pair import Pair
+from clsas.interferometry.result import Heights
+from clsas.interferometry.sweep import Curves
+from clsas.mosaics.banks import Bank
+from clsas.mosaics.devices import thread_device
+from clsas.mosaics.levels import LAYERS
+from clsas.mosaics.patches import PatchWindow
+from clsas.mosaics.record import Record
+from clsas.mosaics.store import Store
+from clsas.mosaics.survey import largest_gap_m
+from clsas.mosaics.visibility import SurveyVisibility
+from clsas.opencl.device import Device
+from clsas.sonar.beam import BeamWindow
+
+_PLACES = 5  # along either side of a patch, for which curves are found; arbitrary
+
+
+class Seen(NamedTuple):
+    """What two banks recorded of a part of a grid.
+
+    Attributes
+    ----------
+    pair : Pair or None
+        Lines of both banks, or None if no channel of both has samples.
+    known : dict
+        Fields of the record of the patch.
+    """
+
+    pair: Pair | None
+    known: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class HeightsJob:
+    """Settings that all patches of a mosaic of heights share.
+
+    Attributes
+    ----------
+    banks : (Bank, Bank)
+    grid : Grid
+        Grid of the whole mosaic.
+    search_m : (lowest, highest)
+    tolerance_db, least_coherence : float
+        See `clsas.heights`.
+    beam : BeamWindow or None
+    window_m : float
+        Side of the windows.
+    margin : (rows, columns)
+        Pixels beyond each side of a patch that are measured with it.
+    store : Path or None
+    """
+
+    banks: tuple[Bank, Bank]
+    grid: Grid
+    search_m: tuple[float, float]
+    tolerance_db: float
+    least_coherence: float
+    beam: BeamWindow | None
+    window_m: float
+    margin: tuple[int, int]
+    store: Path | None
+
+    def on(self, visibility: SurveyVisibility, in_process: bool) -> HeightsJob:
+        """Return the settings themselves, since the survey does not change."""
+        return self
+
+    def opened_store(self) -> Store | None:
+        """Return the store."""
+        return None if self.store is None else Store.at(self.store)
+
+    def complete_levels(self) -> None:
+        """Compute the levels of the store that mix patches, once all patches are finished."""
+        if (store := self.opened_store()) is not None:
+            store.complete_levels()
+
+    def form(self, window: PatchWindow) -> tuple[Record, Image | None]:
+        """Measure a patch and write it to the store.
+
+        Raises
+        ------
+        ValueError
+            If the patch cannot be imaged; the message begins with its row and column.
+        """
+        try:
+            record, pixels, layers = self._measured(window, thread_device())
+        except ValueError as error:
+            raise ValueError(f"patch {window.row},{window.column}: {error}") from error
+        if (store := self.opened_store()) is not None:
+            store.write(*window[1:], pixels, record, layers)
+        return record, None
+
+    def _measured(
+        self, window: PatchWindow, device: Device
+    ) -> tuple[Record, NDArray[np.complex64], dict[str, NDArray[np.float32]]]:
+        """Return the record, the pixels and the layers of a patch."""
+        start = time.perf_counter()
+        wide, inside = self._with_margin(window)
+        pair, known = seen(self.banks, wide, self.search_m, self.tolerance_db, self.beam, device)
+        pixels: NDArray[np.complex64] = np.zeros(window.grid.shape, np.complex64)
+        layers = {name: np.full(window.grid.shape, np.nan, np.float32) for name in LAYERS}
+        if pair is None:
+            return Record(**known, seconds=time.perf_counter() - start), pixels, layers
+        try:
+            found, refined = heights.measured(
+                pair, wide, self.search_m, self.window_m, self.least_coherence, None
+            )
+        except UnmeasurableError as error:
+            known["heights"] = {"reason": str(error)}
+        else:
+            scale = 1.0
+            if self.beam is not None and self.beam.normalise:  # by the channels of this patch
+                scale = len(self.banks[0].members) / pair.a.channels
+            pixels = np.complex64(scale) * found.image.pixels[inside]
+            layers = {name: getattr(found, name)[inside].astype(np.float32) for name in LAYERS}
+            known["heights"] = _summary(found, inside) | {"converged": refined.converged}
+        known |= {"has_pixels": holds_any(pixels), "seconds": time.perf_counter() - start}
+        return Record(**known), pixels, layers
+
+    def _with_margin(self, window: PatchWindow) -> tuple[Grid, tuple[slice, slice]]:
+        """Return the grid of a patch with its margin, and where the patch lies in it."""
+        outer, inner = [], []
+        for part, margin, count in zip(
+            (window.rows, window.columns), self.margin, self.grid.shape, strict=True
+        ):
+            begin = max(part.start - margin, 0)
+            outer.append(slice(begin, min(part.stop + margin, count)))
+            inner.append(slice(part.start - begin, part.stop - begin))
+        return self.grid.window(*outer), (inner[0], inner[1])
+
+
+def seen(
+    banks: tuple[Bank, Bank],
+    grid: Grid,
+    search_m: tuple[float, float],
+    tolerance_db: float,
+    beam: BeamWindow | None,
+    device: Device,
+) -> Seen:
+    """Return what two banks recorded of a grid and of the heights to search above it."""
+    start = time.perf_counter()
+    known: dict[str, Any] = {
+        "survey_channels": len(banks[0].members),
+        "device": device.info.label,
+        "driver": device.info.driver,
+    }
+    visible = _visible(banks, _box(grid, search_m))
+    if visible.any():
+        some = [bank.geometry.select(visible) for bank in banks]
+        baseline = Baseline.of(some[0], some[1], _beam_of(banks[0], beam, visible), 1.0)
+        every = [slice(None, None, max((n - 1) // _PLACES, 1)) for n in grid.shape]
+        reached = Curves.over(baseline, grid.window(*every), np.array(search_m)).grid
+        volume = _box(reached, search_m)
+        visible = _visible(banks, volume)
+    known["channels"] = int(np.count_nonzero(visible))
+    if not visible.any():
+        return Seen(None, known)
+    (first, lost), (second, lost_too) = (
+        bank.read(visible, *bank.visibility.ranges_m(volume)) for bank in banks
+    )
+    missing = lost | lost_too
+    known |= {
+        "missing_channels": int(np.count_nonzero(missing)),
+        "gap_m": largest_gap_m(first, missing),
+        "read_seconds": time.perf_counter() - start,
+    }
+    if missing.all():
+        return Seen(None, known)
+    chosen = visible.copy()
+    chosen[visible] = ~missing
+    if missing.any():
+        first, second = first.select(~missing), second.select(~missing)
+    pair = Pair(first, second, tolerance_db, None, _beam_of(banks[0], beam, chosen), device)
+    return Seen(pair, known)
+
+
+def _visible(banks: tuple[Bank, Bank], volume: Grid) -> NDArray[np.bool_]:
+    """Return the channels with which either bank receives from a volume."""
+    first, second = (bank.visibility.channels(volume) for bank in banks)
+    return first | second
+
+
+def _beam_of(bank: Bank, beam: BeamWindow | None, channels: NDArray[np.bool_]) -> BeamWindow | None:
+    """Return the beam with the directions of the track at some channels."""
+    along = bank.visibility.along
+    return None if beam is None or along is None else replace(beam, along=along[channels])
+
+
+def _box(grid: Grid, search_m: tuple[float, float]) -> Grid:
+    """Return a grid of four pixels that span the volume of all heights to search above a grid."""
+    rows, columns = grid.shape
+    origin_m, row_step_m, column_step_m = grid.vectors_m
+    lowest_m, highest_m = 0.0, 0.0
+    if grid.height_m is not None:
+        lowest_m, highest_m = float(grid.height_m.min()), float(grid.height_m.max())
+    ends_m = lowest_m + search_m[0], highest_m + search_m[1]
+    corners = Grid.oriented(
+        origin_m, (rows - 1) * row_step_m, (columns - 1) * column_step_m, (2, 2)
+    )
+    return corners.with_height([ends_m, ends_m[::-1]])
+
+
+def _summary(found: Heights, inside: tuple[slice, slice]) -> dict[str, Any]:
+    """Return what a record says about heights, as types of JSON."""
+    return {
+        "valid": float(found.mask[inside].mean()),
+        "looks": float(np.median(found.looks[inside])),
+        "ambiguity_m": float(2 * np.pi * np.median(np.abs(found.m_per_rad[inside]))),
+    }

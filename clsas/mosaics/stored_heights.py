@@ -1,0 +1,136 @@
+"""Heights in a store, read as `clsas.Heights`: a window, or an overview of fewer pixels."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.core import validate
+from clsas.core.grid import Grid
+from clsas.core.image import Image
+from clsas.interferometry.refinement import filled
+from clsas.interferometry.result import Heights
+from clsas.mosaics.documents import read_document
+from clsas.mosaics.levels import LAYERS, WINDOW, level_shape
+from clsas.mosaics.pyramid import coarser_layers, mean_of_four
+
+if TYPE_CHECKING:
+    from clsas.mosaics.store import Store
+
+_READ = 2048  # pixels along a side that are read at once; a plain choice
+_POWER = "power"
+_BYTES = 100  # per pixel of `Heights`: eight numbers and their copies
+
+
+def check_heights(store: Store) -> None:
+    """Raise ValueError if a store has no heights."""
+    if not store.layers:
+        raise ValueError(
+            f"{store.path} must be a mosaic of heights, as of clsas.mosaic_heights, got one of "
+            "images"
+        )
+
+
+def window_of(store: Store, rows: slice, columns: slice) -> Heights:
+    """Return the heights in a window of a store; see `Store.heights`."""
+    check_heights(store)
+    plane = _plane(store.grid.window(rows, columns))
+    validate.memory("heights", _BYTES * plane.size)
+    layers = {name: store.read_layer(name, rows, columns) for name in LAYERS}
+    return _heights(plane, store.read(rows, columns), layers, _window_m(store))
+
+
+def overview_of(store: Store, most: int, rows: slice, columns: slice) -> Heights:
+    """Return the heights of a part of a store at fewer pixels; see `Store.overview_heights`."""
+    check_heights(store)
+    grid = store.grid
+    part = _plane(grid.window(rows, columns))
+    first, last = [], []
+    for name, given, count in zip(("rows", "columns"), (rows, columns), grid.shape, strict=True):
+        pixels = range(count)[validate.selection(name, given, ascending=True)]
+        if pixels.step != 1:
+            raise ValueError(f"{name} must have no step for an overview, got {pixels.step}")
+        first.append(pixels.start)
+        last.append(pixels.stop)
+    factor = 1
+    while math.ceil(max(part.shape) / factor) > most:
+        factor *= 2
+    if factor == 1:
+        return window_of(store, rows, columns)
+    # A level serves if the part begins and ends with one of its pixels.
+    finest = max(
+        level
+        for level in (1, *store.levels)
+        if level <= factor
+        and not any(start % level for start in first)
+        and all(n % level == 0 or n == most for n, most in zip(last, grid.shape, strict=True))
+    )
+    shape = level_shape(part.shape, factor)
+    found = {name: np.empty(shape, np.float32) for name in (*LAYERS, _POWER)}
+    side = max(_READ * finest // factor, 1)
+    for top, left in itertools.product(range(0, shape[0], side), range(0, shape[1], side)):
+        place = [
+            slice(
+                (begin + start * factor) // finest,
+                -(-min(begin + (start + side) * factor, end) // finest),
+            )
+            for start, begin, end in zip((top, left), first, last, strict=True)
+        ]
+        block = _reduced(store, finest, factor, place[0], place[1])
+        for name, values in block.items():
+            found[name][top : top + side, left : left + side] = values
+    amplitude = np.sqrt(found.pop(_POWER)).astype(np.complex64)
+    return _heights(_coarser(part, factor, shape), amplitude, found, _window_m(store))
+
+
+def _reduced(
+    store: Store, finest: int, factor: int, rows: slice, columns: slice
+) -> dict[str, NDArray[np.float32]]:
+    """Return layers and power at a factor, from pixels of the level with the factor `finest`."""
+    layers = {name: store.read_layer(name, rows, columns, factor=finest) for name in LAYERS}
+    read = store.read if finest == 1 else partial(store.read_level, finest)
+    power = np.square(np.abs(read(rows, columns)))
+    window = read_document(store.path)[WINDOW]
+    while finest < factor:
+        finest *= 2
+        layers, power = coarser_layers(layers, finest, window), mean_of_four(power)
+    return layers | {_POWER: power}
+
+
+def _heights(
+    plane: Grid, pixels: NDArray, layers: dict[str, NDArray[np.float32]], window_m: float
+) -> Heights:
+    """Return heights of a plane's pixels, with the image on their relief."""
+    values = {name: each.astype(np.float64) for name, each in layers.items()}
+    mask = ~np.isnan(values["height_m"])
+    # Patches that are not finished or not seen have neither coherence nor sensitivity.
+    for name in ("coherence", "looks", "m_per_rad"):
+        values[name] = np.nan_to_num(values[name])
+    image = Image(pixels, plane.with_height(filled(values["height_m"], mask)))
+    return Heights(**values, mask=mask, image=image, window_m=window_m)
+
+
+def _plane(grid: Grid) -> Grid:
+    return replace(grid, height_m=None)
+
+
+def _coarser(plane: Grid, factor: int, shape: tuple[int, int]) -> Grid:
+    """Return the grid of a level: its pixels lie in the middle of those that they cover."""
+    origin_m, row_step_m, column_step_m = plane.vectors_m
+    return Grid.oriented(
+        origin_m + (factor - 1) / 2 * (row_step_m + column_step_m),
+        factor * row_step_m,
+        factor * column_step_m,
+        shape,
+        georeference=plane.georeference,
+    )
+
+
+def _window_m(store: Store) -> float:
+    return float(read_document(store.path)["inputs"]["window_m"])

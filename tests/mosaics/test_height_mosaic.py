@@ -1,0 +1,412 @@
+"""Mosaics of heights against single measurements, after kills, with damage, and at fewer pixels."""
+
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reliefs import banks, flat_banks, truth
+from scipy.ndimage import uniform_filter
+from stores import files_of, killed_at
+
+import clsas
+from clsas.core.digests import grid_digest
+from clsas.core.validate import ClsasWarning
+from clsas.mosaics import pyramid
+from clsas.mosaics.levels import LAYERS
+from clsas.mosaics.patches import Layout
+from clsas.mosaics.record import Record
+
+GRID = clsas.Grid.plane((-0.6, 0.6, 61), (31.2, 32.8, 81))
+REQUEST = {"search_m": (-0.5, 0.5), "window_m": 0.22, "patch_m": 0.7}
+SMALL = clsas.Grid.plane((-4, 4.3, 84), (30, 36.9, 70))
+OF_PATCHES, MIXED = (24, 32), (20, 28)
+WINDOW = 5, 7
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Let small stores have chunks and levels like large ones."""
+    monkeypatch.setattr("clsas.mosaics.levels.CHUNK_SIDE", 16)
+    monkeypatch.setattr("clsas.mosaics.levels.COARSEST_SIDE", 16)
+    monkeypatch.setattr("clsas.mosaics.levels._SMALLEST_CHUNK", 2)
+
+
+def apart(one, other):
+    """Difference of heights in standard deviations, where both are valid."""
+    both = one.mask & other.mask
+    return np.where(both, (one.height_m - other.height_m) / other.sd_m, np.nan)
+
+
+def borders(shape, patch_shape, width):
+    """The pixels within `width` of a border between patches."""
+    found = np.zeros(shape, bool)
+    for axis, side in enumerate(patch_shape):
+        for place in range(side, shape[axis], side):
+            index = [slice(None), slice(None)]
+            index[axis] = slice(place - width, place + width)
+            found[tuple(index)] = True
+    return found
+
+
+@pytest.mark.slow
+def test_patches_make_the_heights_of_a_single_measurement(tmp_path):
+    def dunes(x, y):
+        return 0.15 * np.sin(2 * np.pi * (y - 32) / 3) + 0.05 * x
+
+    grid = clsas.Grid.plane((-1.2, 1.2, 121), (30.4, 33.2, 141))
+    lines = banks(dunes, snr_db=15, extent_m=((-1.9, 1.9), (29, 35)), pings=240)
+    request = {"search_m": (-1.0, 1.0), "window_m": 0.22}
+    store = clsas.mosaic_heights(*lines, grid, tmp_path / "a.zarr", **request, patch_m=0.95)
+    assert len(store.records()) == 9
+    found, whole = store.heights(), clsas.heights(*lines, grid, **request)
+    assert np.mean(found.mask != whole.mask) < 0.04
+    difference = apart(found, whole)
+    border = borders(grid.shape, store.patch_shape, 3)
+    for some in (border, ~border):
+        assert np.sqrt(np.nanmean(difference[some] ** 2)) < 0.3
+        ratio = (found.sd_m / whole.sd_m)[some & found.mask & whole.mask]
+        assert np.median(ratio) == pytest.approx(1, abs=0.05)
+    # Neighbours across a border differ no more than elsewhere.
+    for axis, side in enumerate(store.patch_shape):
+        steps = np.abs(np.diff(found.height_m, axis=axis) / np.delete(found.sd_m, -1, axis=axis))
+        at = np.arange(side, grid.shape[axis], side) - 1
+        assert np.nanmean(np.take(steps, at, axis=axis)) < 1.5 * np.nanmean(steps)
+    error_m = (found.height_m - truth(dunes, grid))[found.mask]
+    rms_m, predicted_m = (np.sqrt(np.mean(e**2)) for e in (error_m, found.sd_m[found.mask]))
+    assert rms_m < 1.3 * predicted_m
+
+
+def test_a_store_has_what_heights_have(tmp_path):
+    place = clsas.Georeference.local(60.39, 5.32, heading_deg=90)
+    first, second = (replace(lines, georeference=place) for lines in flat_banks())
+    calls = []
+    store = clsas.mosaic_heights(
+        first, second, GRID, tmp_path / "a.zarr", **REQUEST,
+        progress=lambda *done: calls.append(done),
+    )  # fmt: skip
+    assert calls == [(done, 6) for done in range(7)]
+    assert store.layers == tuple(LAYERS)
+    assert store.patch_shape == (27, 31)
+    found, whole = store.heights(), clsas.heights(first, second, GRID, **{
+        name: REQUEST[name] for name in ("search_m", "window_m")
+    })  # fmt: skip
+    assert found.georeference == place
+    assert found.window_m == 0.22
+    assert found.mask.mean() > 0.95
+    assert np.nanmax(np.abs(apart(found, whole))) < 0.5
+    for name in ("coherence", "looks", "m_per_rad"):
+        ratio = (getattr(found, name) / getattr(whole, name))[found.mask & whole.mask]
+        assert np.median(ratio) == pytest.approx(1, abs=0.05)
+    part = store.heights(slice(10, 60), slice(3, 40))
+    assert np.array_equal(part.height_m, found.height_m[10:60, 3:40], equal_nan=True)
+    # The image lies on the relief, whose heights are those of the seabed where it is known.
+    relief_m = part.image.grid.height_m
+    assert np.array_equal(relief_m[part.mask], part.height_m[part.mask])
+    assert np.array_equal(store.image(slice(10, 60), slice(3, 40)).pixels, part.image.pixels)
+    record = store.records()[0, 0]
+    assert record.heights["valid"] == pytest.approx(found.mask[:27, :31].mean())
+    assert record.heights["ambiguity_m"] == pytest.approx(2.06, rel=0.05)
+    assert not record.flags
+
+
+def test_files_and_folders_are_read_in_slices(tmp_path):
+    first, second = flat_banks()
+    both = replace(
+        first,
+        samples=np.concatenate([first.samples, second.samples]),
+        bank_numbers=np.repeat([0, 1], first.channels),
+        **{
+            name: np.concatenate([getattr(first, name), getattr(second, name)])
+            for name in ("first_range_m", "tx_m", "rx_m")
+        },
+    )
+    # Pings after each other, each with both banks, in a folder of two files.
+    order = np.arange(2 * first.channels).reshape(2, -1).T.reshape(-1)
+    half = first.channels
+    (tmp_path / "both").mkdir()
+    for name, some in (("a", order[:half]), ("b", order[half:])):
+        clsas.save(tmp_path / "both" / f"{name}.h5", both.select(some))
+    for name, lines in (("first", first), ("second", second)):
+        clsas.save(tmp_path / f"{name}.h5", lines)
+    stores = [
+        clsas.mosaic_heights(*lines, GRID, tmp_path / f"{number}.zarr", **REQUEST)
+        for number, lines in enumerate(
+            [
+                (first, second),
+                (tmp_path / "first.h5", tmp_path / "second.h5"),
+                (tmp_path / "both", None),
+            ]
+        )
+    ]
+    expected = stores[0].heights()
+    for store in stores[1:]:
+        found = store.heights()
+        assert np.array_equal(found.height_m, expected.height_m, equal_nan=True)
+        assert np.array_equal(found.image.pixels, expected.image.pixels)
+
+
+def test_the_search_may_start_from_a_relief(tmp_path):
+    low = clsas.Grid.plane((-0.6, 0.6, 61), (31.2, 32.8, 81), z=-0.4)
+    start = low.with_height(0.4 + np.linspace(-0.05, 0.05, 81)[:, None] + np.zeros(61))
+    store = clsas.mosaic_heights(
+        *flat_banks(), start, tmp_path / "a.zarr", **REQUEST | {"search_m": (-0.2, 0.2)}
+    )
+    found = store.heights()
+    assert found.mask.mean() > 0.95
+    error = (found.height_m - 0.4)[found.mask] / found.sd_m[found.mask]
+    assert np.sqrt(np.mean(error**2)) < 1.3
+    assert store.grid.height_m is not None
+
+
+def test_the_default_window_is_kept(tmp_path):
+    request = {name: REQUEST[name] for name in ("search_m", "patch_m")}
+    store = clsas.mosaic_heights(*flat_banks(), GRID, tmp_path / "a.zarr", **request)
+    before = files_of(store.path)
+    looks = np.median([record.heights["looks"] for record in store.records().values()])
+    assert 30 < looks < 70
+    again = clsas.mosaic_heights(*flat_banks(), GRID, tmp_path / "a.zarr", **request)
+    assert files_of(again.path) == before
+    with pytest.raises(ValueError, match=r"window_m is 0.* in the store, 0\.2 given"):
+        clsas.mosaic_heights(*flat_banks(), GRID, store.path, **request, window_m=0.2)
+
+
+@pytest.mark.slow
+def test_a_killed_run_continues_bit_for_bit(tmp_path):
+    """Runs that are killed with SIGKILL after some patches."""
+    program = f"""
+        import clsas, pickle
+        first, second, grid, request = pickle.load(open({str(tmp_path / "wish")!r}, "rb"))
+        clsas.mosaic_heights(
+            first, second, grid, {str(tmp_path / "a.zarr")!r}, **request,
+            progress=lambda *done: print(*done, flush=True),
+        )
+    """
+    wish = (*flat_banks(), GRID, REQUEST | {"patch_m": 0.4})
+    (tmp_path / "wish").write_bytes(pickle.dumps(wish))
+    finished = []
+    for kills in range(3):
+        process = subprocess.Popen(
+            [sys.executable, "-c", textwrap.dedent(program)], stdout=subprocess.PIPE, text=True
+        )
+        begun = None
+        for line in process.stdout:
+            done, total = map(int, line.split())
+            begun = done if begun is None else begun
+            finished.append(done)
+            if kills < 2 and done - begun == 4:
+                process.send_signal(signal.SIGKILL)
+                break
+        process.stdout.read()
+        assert process.wait() == (-signal.SIGKILL if kills < 2 else 0)
+    assert finished[-1] == total == 20
+    assert finished == sorted(finished)
+    assert len(finished) <= 20 + 3  # the number finished before is reported once for every run
+    store = clsas.Store.opened(tmp_path / "a.zarr")
+    whole = clsas.mosaic_heights(*wish[:3], tmp_path / "whole.zarr", **wish[3])
+    for name in (*LAYERS, "amplitude_db", "pixels"):
+        one, other = (files_of(each.path / name) for each in (store, whole))
+        assert one == other
+        assert len(one) > 1
+    assert not store.damage()
+    assert not store.array_damage()
+
+
+def test_damaged_layers_are_found_and_measured_again(tmp_path):
+    store = clsas.mosaic_heights(*flat_banks(), GRID, tmp_path / "a.zarr", **REQUEST)
+    before = store.heights().height_m
+    chunk = next(path for path in (store.path / "height_m" / "c").rglob("*") if path.is_file())
+    content = bytearray(chunk.read_bytes())
+    content[100] ^= 1
+    chunk.write_bytes(content)
+    assert "do not match their checksum" in str(clsas.Store.opened(store.path).damage())
+    with pytest.raises(ValueError, match="values of height_m do not match their checksum"):
+        clsas.Store.opened(store.path).heights()
+    with pytest.warns(ClsasWarning, match="these patches are formed again"):
+        again = clsas.mosaic_heights(*flat_banks(), GRID, tmp_path / "a.zarr", **REQUEST)
+    assert np.array_equal(again.heights().height_m, before, equal_nan=True)
+
+
+def test_patches_without_heights_say_why(tmp_path):
+    lines = [each.tapered_ends(1.0) for each in flat_banks()]
+    grid = clsas.Grid.plane((-0.6, 0.6, 61), (41.2, 57.2, 801))
+    with pytest.raises(ValueError, match="no channel receives from its middle"):
+        clsas.mosaic_heights(*lines, grid, tmp_path / "a.zarr", **REQUEST)
+    assert not (tmp_path / "a.zarr").exists()
+    grid = clsas.Grid.plane((-0.6, 0.6, 61), (22.4, 41.4, 951))
+    request = REQUEST | {"patch_m": 2.6}
+    store = clsas.mosaic_heights(*lines, grid, tmp_path / "a.zarr", **request)
+    flags = {index: record.flags for index, record in store.records().items()}
+    assert "outside the beam or recorded ranges" in str(flags[0, 0])
+    assert flags[3, 0] == ()
+    found = store.heights()
+    assert not found.mask[:100].any()
+    assert found.mask[450:500].mean() > 0.9
+
+
+def filled_store(path, patch_shape, seed=0):
+    """A store of heights with random numbers, of which some are missing, and their layers."""
+    random = np.random.default_rng(seed)
+    layers = {name: random.uniform(1, 2, SMALL.shape).astype(np.float32) for name in LAYERS}
+    for name in ("height_m", "sd_m"):
+        layers[name][10:37, 20:50] = np.nan
+    store = clsas.Store.at(path)
+    inputs = {
+        "parts": [], "pixels": list(SMALL.shape), "grid": grid_digest(SMALL), "window_m": 0.5,
+    }  # fmt: skip
+    store.begin(inputs, SMALL, patch_shape, WINDOW)
+    return store, layers
+
+
+def patches_of(patch_shape):
+    layout = Layout(SMALL, patch_shape)
+    return [layout.window(index) for index in np.ndindex(layout.shape)]
+
+
+def write_patch(store, layers, window):
+    _, row, column, rows, columns = window
+    pixels = (layers["looks"] * np.exp(1j * layers["m_per_rad"])).astype(np.complex64)
+    record = Record(channels=1, survey_channels=1, has_pixels=True)
+    store.write(
+        row, column, rows, columns, pixels[rows, columns], record,
+        {name: values[rows, columns] for name, values in layers.items()},
+    )  # fmt: skip
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("patch_shape", [OF_PATCHES, MIXED])
+def test_levels_of_layers(tmp_path, patch_shape):
+    store, layers = filled_store(tmp_path / "a.zarr", patch_shape)
+    for window in patches_of(patch_shape):
+        write_patch(store, layers, window)
+    store.complete_levels()
+    assert store.levels == (2, 4, 8)
+    assert not store.damage()
+    assert not store.array_damage()
+    for name in ("height_m", "coherence"):
+        assert np.array_equal(store.read_layer(name), layers[name], equal_nan=True)
+        level = store.read_layer(name, factor=2)
+        block = layers[name][40:42, 60:62]
+        assert level[20, 30] == pytest.approx(block.mean(), rel=1e-6)
+    height = store.read_layer("height_m", factor=2)
+    assert np.isnan(height[6:18, 11:24]).all()
+    assert height[18, 15] == pytest.approx(np.nanmean(layers["height_m"][36:38, 30:32]), rel=1e-6)
+    overview = store.overview_heights(20)
+    assert overview.height_m.shape == (9, 11)
+    at = overview.mask
+    np.testing.assert_allclose(overview.height_m[at], store.read_layer("height_m", factor=8)[at])
+    np.testing.assert_allclose(np.abs(overview.image.pixels), store.read_level(8), rtol=1e-5)
+    # Without levels that serve, the pixels are reduced in the same way.
+    part = store.overview_heights(20, slice(1, 80), slice(0, 66))
+    moved, _ = filled_store(tmp_path / "b.zarr", patch_shape)
+    shifted = {name: np.roll(values, -1, axis=0) for name, values in layers.items()}
+    for window in patches_of(patch_shape):
+        write_patch(moved, shifted, window)
+    moved.complete_levels()
+    expected = moved.overview_heights(20, slice(0, 79), slice(0, 66))
+    np.testing.assert_allclose(part.height_m[:-1], expected.height_m[:-1], rtol=1e-6)
+    np.testing.assert_allclose(part.sd_m[:-1], expected.sd_m[:-1], rtol=1e-6)
+
+
+def test_deviations_of_levels_are_those_of_means():
+    """Errors of heights are means of white noise over windows."""
+    random = np.random.default_rng(3)
+    window = 9, 5
+    errors = uniform_filter(random.standard_normal((4096, 1024)), window, mode="wrap")
+    sd = np.full(errors.shape, errors.std(), np.float32)
+    levels = pyramid.layer_levels(
+        {"height_m": errors.astype(np.float32), "sd_m": sd}, (2, 4, 8, 16, 32), window
+    )
+    for factor in (2, 4, 8, 16, 32):
+        level = levels[factor]
+        ratio = level["height_m"].std() / np.median(level["sd_m"])
+        assert ratio == pytest.approx(1, abs=0.05)
+    assert levels[32]["sd_m"].max() < 0.3 * sd.max()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("patch_shape", [OF_PATCHES, MIXED])
+def test_a_store_killed_at_any_step_ends_bit_identical(tmp_path, monkeypatch, patch_shape):
+    store, layers = filled_store(tmp_path / "whole.zarr", patch_shape)
+    first, *others = patches_of(patch_shape)
+    for window in (first, *others):
+        write_patch(store, layers, window)
+    store.complete_levels()
+    whole = files_of(store.path)
+
+    start, path = tmp_path / "start.zarr", tmp_path / "a.zarr"
+    store, old = filled_store(start, patch_shape, seed=1)
+    write_patch(store, old, first)
+    _, layers = filled_store(start, patch_shape)
+    for window in others:
+        write_patch(store, layers, window)
+    store.complete_levels()
+    step, kills, is_killed = 0, 0, True
+    while is_killed:
+        shutil.rmtree(path, ignore_errors=True)
+        shutil.copytree(start, path)
+        store = clsas.Store.opened(path)
+
+        def work(store=store):
+            write_patch(store, layers, first)
+            store.complete_levels()
+
+        is_killed = killed_at(monkeypatch, step, work)
+        kills += is_killed
+        step += 1 if step < 8 else 7
+        again, _ = filled_store(path, patch_shape)
+        assert not again.damage()
+        assert not again.array_damage()
+        if (0, 0) not in again.records():
+            write_patch(again, layers, first)
+        again.complete_levels()
+        assert files_of(path) == whole
+    assert kills > 8
+
+
+class TestBadInput:
+    def refused(self, tmp_path, match, *lines, grid=GRID, error=ValueError, **options):
+        given = REQUEST | options
+        with pytest.raises(error, match=match):
+            clsas.mosaic_heights(*(lines or flat_banks()), grid, tmp_path / "a.zarr", **given)
+        assert not (tmp_path / "a.zarr").exists()
+
+    def test_lines(self, tmp_path):
+        first, second = flat_banks()
+        self.refused(tmp_path, "range lines of 2 receiver banks if b is None, got 1", first, None)
+        self.refused(tmp_path, "same carrier_hz", first, replace(second, carrier_hz=90e3))
+        self.refused(tmp_path, "apart across the line of sight", first, first)
+        both = replace(first, bank_numbers=np.arange(first.channels) % 2)
+        self.refused(tmp_path, "a must have the lines of one bank", both, second)
+
+    def test_options(self, tmp_path):
+        self.refused(tmp_path, "search_m must be .lowest, highest.", search_m=(1, 0))
+        self.refused(tmp_path, "patch_m must be finite and > 0", patch_m=-1)
+        self.refused(tmp_path, "window_m must be", window_m=9.0)
+        self.refused(tmp_path, "tolerance_db must be", tolerance_db=3)
+        self.refused(tmp_path, "least_coherence must be", least_coherence=2)
+        points = clsas.Grid.points(GRID.positions_m())
+        self.refused(tmp_path, "grid must be a plane or height map", grid=points)
+
+    def test_other_inputs(self, tmp_path):
+        path = tmp_path / "a.zarr"
+        clsas.mosaic_heights(*flat_banks(), GRID, path, **REQUEST)
+        with pytest.raises(ValueError, match=r"least_coherence is 0\.5 in the store, 0\.6"):
+            clsas.mosaic_heights(*flat_banks(), GRID, path, **REQUEST, least_coherence=0.6)
+        with pytest.raises(ValueError, match="made with other inputs"):
+            clsas.mosaic(flat_banks()[0], GRID, path)
+
+    def test_a_mosaic_of_images_has_no_heights(self, tmp_path):
+        list(clsas.mosaic(flat_banks()[0], GRID, tmp_path / "a.zarr", tolerance_db=-30))
+        store = clsas.Store.opened(tmp_path / "a.zarr")
+        assert store.layers == ()
+        with pytest.raises(ValueError, match="must be a mosaic of heights"):
+            store.heights()
+        with pytest.raises(ValueError, match=r"layer.*none: it has no heights"):
+            store.read_layer("height_m")
