@@ -17,10 +17,11 @@ import numpy as np
 from apertures import Aperture, Floats, aperture, log_uniform
 from numpy.random import Generator
 from numpy.typing import NDArray
-from sums import SPEED_M_S, Channels, Echoes, Noise, Points, Sampling, weights
+from sums import SPEED_M_S, BentChannels, Channels, Echoes, Noise, Points, Sampling, weights
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
+from clsas.core.sound_speed import SoundSpeed
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import oracle
 
@@ -73,6 +74,7 @@ class Family:
     gains: tuple[str, ...] = ("equal gains",)
     grid: tuple[str, ...] = ("plane", "plane", "tilted")
     echoes: tuple[str, ...] = ("points", "points", "noise")
+    water: tuple[str, ...] = ("one speed",)
 
 
 DENSE = ("ring", "arc", "helix", "raster", "planar", "headings", "star")
@@ -80,6 +82,8 @@ EVERY_APERTURE = ("straight", "jittered", "curved", *DENSE)
 APART = ("beside", "fixed tx", "fixed rx", "array")
 BEAMS = ("hann", "hamming", "tukey", "rectangular")
 CLOSE = (0.2, 1.0)  # so that many channels see a pixel through a beam
+WIDE = (3.0, 30.0)  # so that ranges are tens to hundreds of metres
+PROFILES = ("gradient", "thermocline", "layers")
 UNEVEN = ("loud off the track", "log-normal", "40 dB")
 
 FAMILIES = {
@@ -112,6 +116,16 @@ FAMILIES = {
     "reliefs and points with beam": Family(
         aperture=EVERY_APERTURE, beam=BEAMS, spacing=CLOSE, grid=("relief", "points")
     ),
+    "profiles": Family(
+        spacing=WIDE, grid=("plane",), water=PROFILES, velocity=("at rest", "at rest", "even"),
+        antennas=("monostatic", "near"),
+    ),
+    "profiles with beam": Family(
+        spacing=WIDE, grid=("plane",), water=PROFILES, beam=("hann", "tukey"),
+    ),
+    "profiles and reliefs": Family(
+        spacing=WIDE, grid=("relief", "points"), water=PROFILES, antennas=("monostatic", "near"),
+    ),
     "anything": Family(
         band=(0.005, 1.9),
         on_carrier=0.3,
@@ -137,6 +151,7 @@ class _Parts:
     gains: str
     grid: str
     echoes: str
+    water: str
 
     @classmethod
     def of(cls, rng: Generator, family: Family) -> _Parts:
@@ -150,13 +165,16 @@ def draw(name: str, seed: int) -> Scene:
     family = FAMILIES[name]
     rng = np.random.default_rng([seed, *name.encode()])  # families differ in what a seed draws
     parts = _Parts.of(rng, family)
-    carrier_hz = log_uniform(rng, 2e4, 1e6)
+    is_bent = parts.water != "one speed"
+    carrier_hz = log_uniform(rng, *((6e4, 3e5) if is_bent else (2e4, 1e6)))
     fraction = log_uniform(rng, *family.band)
     wave_m = SPEED_M_S / carrier_hz
     spacing_m = wave_m * log_uniform(rng, *family.spacing)
     around = aperture(rng, parts.aperture, int(rng.integers(100, 600)), spacing_m, wave_m)
     channels = _channels(rng, parts, around, wave_m)
-    grid, pixels_m = _pixels(rng, parts.grid, around, wave_m)
+    grid, pixels_m = _pixels(rng, parts.grid, around, wave_m, (0.15 if is_bent else 0, 0.5))
+    if is_bent:
+        channels = _in_water(rng, parts.water, channels, pixels_m, wave_m)
     beam = _beam(rng, parts.beam, channels, pixels_m)
     on_carrier = bool(rng.random() < family.on_carrier and fraction > 0.05)
     sampling = _sampling(rng, carrier_hz, fraction, on_carrier)
@@ -164,6 +182,7 @@ def draw(name: str, seed: int) -> Scene:
     lines = RangeLines(
         echoes.samples(), echoes.first_m, sampling.step_m, channels.tx_m, channels.rx_m,
         sampling.mixed * SPEED_M_S / 2, SPEED_M_S, channels.velocity_m_s,
+        sound_speed=_profile(channels),
     )  # fmt: skip
     some = rng.choice(len(pixels_m), min(SAMPLED, len(pixels_m)), replace=False)
     some = np.unique(np.append(some, near))
@@ -176,6 +195,10 @@ def draw(name: str, seed: int) -> Scene:
         f"{lines.channels} channels of {lines.length} samples",
         f"{'x'.join(map(str, grid.shape))} pixels",
     ]
+    if isinstance(channels, BentChannels):
+        speeds, reach_m = channels.speed_m_s, np.ptp(channels.depth_m)
+        said.append(f"{speeds[0]:.1f} to {speeds[-1]:.1f} m/s over {reach_m:.0f} m")
+        said.append(f"range {around.range_m:.0f} m")
     if beam is not None:
         said.append(f"beam {beam.width_deg:.0f} deg, squint {beam.squint_deg:.0f}")
         said.append("normalised" * beam.normalise)
@@ -183,7 +206,7 @@ def draw(name: str, seed: int) -> Scene:
     return Scene(words, lines, grid, beam, some, values.sum(axis=0))
 
 
-_ORDINARY = ("monostatic", "at rest", "no beam", "equal gains")
+_ORDINARY = ("monostatic", "at rest", "no beam", "equal gains", "one speed")
 
 
 def _channels(rng: Generator, parts: _Parts, around: Aperture, wave_m: float) -> Channels:
@@ -219,6 +242,48 @@ def _antennas(rng: Generator, kind: str, around: Aperture) -> tuple[Floats, Floa
     return centre_m, centre_m + apart_m
 
 
+def _in_water(
+    rng: Generator, kind: str, channels: Channels, pixels_m: Floats, wave_m: float
+) -> BentChannels:
+    """Return channels in water in which rays fall from all antennas to all pixels."""
+    antennas_m = np.concatenate([channels.tx_m, channels.rx_m])
+    room_m = 10 * wave_m + 1.0
+    top, bottom = antennas_m[:, 2].max() + room_m, pixels_m[:, 2].min() - room_m
+    highest, lowest = float(pixels_m[:, 2].max()), float(antennas_m[:, 2].min())
+    share = {
+        "gradient": np.array([0.0, 1.0]),
+        "thermocline": np.cumsum([0.0, rng.uniform(0.1, 0.6), rng.uniform(0.02, 0.2), 1.0]),
+        "layers": np.append(0.0, np.sort(rng.uniform(0.05, 0.95, 3))),
+    }[kind]
+    share[-1] = 1.0
+    change = rng.normal(size=len(share)).cumsum()
+    if kind == "gradient":
+        change = rng.choice([-1.0, 1.0]) * share
+    elif kind == "thermocline":
+        change = np.array([0.0, 0.0, -1.0, -1.0 + 0.05 * rng.normal()])
+    change *= rng.uniform(0.1, 1.0) * min(top - bottom, 30.0) / np.ptp(change)
+    surface_z_m = top + rng.uniform(0, 10)
+    depth_m = surface_z_m - top + share * (top - bottom)
+    found = BentChannels(
+        **vars(channels), depth_m=depth_m, speed_m_s=1490 + change, surface_z_m=surface_z_m
+    )
+    far_m = 1.1 * np.linalg.norm(pixels_m[None, ::7, :2] - antennas_m[::7, None, :2], axis=-1).max()
+    ends = surface_z_m - np.array([lowest, highest + room_m])
+    # Weaker changes until rays fall all the way between the heights that are nearest each other.
+    for _ in range(12):
+        if np.isfinite(oracle.rays(depth_m, found.speed_m_s, far_m, *ends)[0]):
+            return found
+        change = change / 2
+        found = dataclasses.replace(found, speed_m_s=1490 + change)
+    return dataclasses.replace(found, speed_m_s=np.full(len(share), 1490.0))
+
+
+def _profile(channels: Channels) -> SoundSpeed | None:
+    if not isinstance(channels, BentChannels):
+        return None
+    return SoundSpeed(channels.depth_m, channels.speed_m_s, channels.surface_z_m)
+
+
 def _velocity(rng: Generator, kind: str, channels: int) -> Floats | None:
     """Return velocities of the receivers, or None."""
     if kind == "at rest":
@@ -234,12 +299,17 @@ def _direction(rng: Generator) -> Floats:
     return vector / np.linalg.norm(vector)
 
 
-def _pixels(rng: Generator, kind: str, around: Aperture, wave_m: float) -> tuple[Grid, Floats]:
-    """Return a grid and where its pixels lie, [n, 3]."""
+def _pixels(
+    rng: Generator, kind: str, around: Aperture, wave_m: float, falls: tuple[float, float]
+) -> tuple[Grid, Floats]:
+    """Return a grid and where its pixels lie, [n, 3].
+
+    `falls` are the least and the largest angle below the horizontal in which the grid is seen.
+    """
     if around.looks_inside:
         centre_m = np.append(rng.uniform(-0.3, 0.3, 2) * around.range_m, -around.depth_m)
     else:
-        along_m, down = rng.uniform(-0.3, 0.3) * around.length_m, rng.uniform(0, 0.5)
+        along_m, down = rng.uniform(-0.3, 0.3) * around.length_m, rng.uniform(*falls)
         away_m = around.range_m * np.array([np.cos(down), -np.sin(down)])
         centre_m = np.append(along_m, away_m)
     rows, columns = (int(log_uniform(rng, 48, 260)) for _ in range(2))
@@ -342,10 +412,8 @@ def _wanted(
     if beam is None or kind == "points":
         return anywhere
     some = np.unique(rng.integers(0, len(channels.gain), 40))
-    part = Channels(
-        channels.tx_m[some], channels.rx_m[some], None, channels.gain[some], channels.along[some]
-    )
-    sums = weights(beam, part.sines(pixels_m), normalise=False).mean(axis=0)
+    sines = channels.select(some).sines(pixels_m)
+    sums = weights(beam, sines, normalise=False).mean(axis=0)
     lit = (sums > 0) & (sums < 0.05 * sums.max())
     wanted = lit if kind == "points at the edge" else sums == 0
     return wanted.astype(float) if wanted.any() else anywhere

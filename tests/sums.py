@@ -5,7 +5,7 @@ Of the library only the oracle's pulse is used. Frequencies are cycles per metre
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import finufft
@@ -59,6 +59,58 @@ class Channels:
         """Return the sines of the aspect angles of points, [channels, points]."""
         towards = points_m[None] - self.centres_m[:, None]
         return np.einsum("cpi,ci->cp", towards, self.along) / np.linalg.norm(towards, axis=-1)
+
+    def select(self, some: NDArray[np.int64]) -> Channels:
+        """Return some of the channels, at rest."""
+        parts = (self.tx_m, self.rx_m, self.gain, self.along)
+        tx_m, rx_m, gain, along = (each[some] for each in parts)
+        return replace(self, tx_m=tx_m, rx_m=rx_m, velocity_m_s=None, gain=gain, along=along)
+
+
+@dataclass(frozen=True, eq=False)
+class BentChannels(Channels):
+    """Channels in water whose sound speed is linear between some depths.
+
+    Ranges are SPEED_M_S times half the delay, and sines those of rays at the phase centres.
+    """
+
+    depth_m: Floats
+    speed_m_s: Floats
+    surface_z_m: float
+
+    def ranges_m(self, points_m: Floats) -> Floats:
+        """Return half the delays to points as ranges, [channels, points]."""
+        out_s = self._rays(self.tx_m[:, None], points_m)[0]
+        if self.velocity_m_s is None and np.array_equal(self.tx_m, self.rx_m):
+            return SPEED_M_S * out_s
+        back_s = out_s
+        for _ in range(1 if self.velocity_m_s is None else 6):  # each leaves v/c of the error
+            rx_m = self.rx_m[:, None]
+            if self.velocity_m_s is not None:
+                rx_m = rx_m + self.velocity_m_s[:, None] * (out_s + back_s)[..., None]
+            back_s = self._rays(rx_m, points_m)[0]
+        return SPEED_M_S * (out_s + back_s) / 2
+
+    def sines(self, points_m: Floats) -> Floats:
+        """Return the sines of the aspect angles at which rays leave for points."""
+        centres_m = self.centres_m
+        offset_m = points_m[None] - centres_m[:, None]
+        slowness = self._rays(centres_m[:, None], points_m)[1]
+        speed = np.interp(self.surface_z_m - centres_m[:, 2], self.depth_m, self.speed_m_s)
+        level = speed[:, None] * slowness
+        distance_m = np.hypot(offset_m[..., 0], offset_m[..., 1])
+        across = np.einsum("cpi,ci->cp", offset_m[..., :2], self.along[:, :2]) / distance_m
+        down = np.sign(offset_m[..., 2]) * np.sqrt(1 - level**2)
+        return across * level + down * self.along[:, None, 2]
+
+    def _rays(self, antennas_m: Floats, points_m: Floats) -> tuple[Floats, Floats]:
+        offset_m = points_m[None] - antennas_m
+        found = oracle.rays(
+            self.depth_m, self.speed_m_s, np.hypot(offset_m[..., 0], offset_m[..., 1]),
+            self.surface_z_m - antennas_m[..., 2], self.surface_z_m - points_m[None, :, 2],
+        )  # fmt: skip
+        assert np.isfinite(found[0]).all(), "a ray is missing or turns"
+        return found
 
 
 @dataclass(frozen=True)

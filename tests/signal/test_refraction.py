@@ -182,3 +182,19 @@ def test_an_error_that_is_left_is_reported():
     lines = over(wide, along_x(200, 0.3, z=-6.0), profile=SoundSpeed([0, 60], [1500, 1482]))
     with pytest.warns(ClsasWarning, match="refraction leaves an error of up to .* -60 dB are"):
         homogeneous(lines, wide.with_height(heights), None, -60)
+
+
+@pytest.mark.parametrize("request_db", [{"tolerance_db": -60}, {"accuracy_db": -60}])
+def test_an_exact_image_finds_its_water_once(request_db, monkeypatch):
+    """One that was planned takes that of its plan, and the user is warned once."""
+    small = Grid.plane((-30, 30, 11), (40, 100, 11), SEABED)
+    heights = np.random.default_rng(4).uniform(-3, 3, small.shape)
+    lines = over(small, along_x(200, 0.3, z=-6.0), profile=SoundSpeed([0, 60], [1500, 1482]))
+    found, samples = [], RaySample.of
+    monkeypatch.setattr(RaySample, "of", lambda *given: found.append(1) or samples(*given))
+    with pytest.warns(ClsasWarning) as caught:
+        imager = clsas.Imager(lines, small.with_height(heights), **request_db)
+    imager(lines)
+    assert imager.plan is None or imager.plan.is_exact
+    assert sum("refraction leaves" in str(each.message) for each in caught) == 1
+    assert len(found) == 1

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bent import travel_times
 
 from clsas.trials import oracle
 from clsas.trials.oracle import Band, Echo
@@ -19,7 +20,7 @@ def test_it_imports_nothing_but_numpy():
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0
             imported.add(node.module)
-    standard = {"__future__", "collections.abc", "dataclasses"}
+    standard = {"__future__", "collections.abc", "dataclasses", "itertools"}
     assert imported - standard == {"numpy", "numpy.typing"}
 
 
@@ -64,3 +65,32 @@ def test_lines_sampled_at_the_ranges_of_pixels_are_the_image():
     one = oracle.samples(echoes, pixel[:, 0], 1.0, 1, 50.0)[:, 0]
     summed = np.sum(one * np.exp(2j * np.pi * 50.0 * pixel[:, 0]))
     assert oracle.image(echoes, pixel)[0] == pytest.approx(summed, rel=1e-12)
+
+
+PROFILES = {
+    "thermocline": ([0, 12, 15, 60], [1505, 1504.5, 1494, 1490]),
+    "gradient": ([0, 60], [1480, 1510]),
+    "one speed": ([0, 20, 60], [1500, 1500, 1500]),
+}
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_rays_are_those_of_quadrature(name):
+    depth_m, speed_m_s = PROFILES[name]
+    distance_m = np.append(np.random.default_rng(1).uniform(0, 80, 500), [1e-3, 80])
+    times = travel_times(depth_m, speed_m_s, 6.0, 25.0, 90.0)
+    for ends in ((6.0, 25.0), (25.0, 6.0)):
+        time_s, slowness = oracle.rays(depth_m, speed_m_s, distance_m, *ends)
+        np.testing.assert_allclose(time_s, times(distance_m), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(slowness, times(distance_m, 1), rtol=0, atol=1e-10)
+
+
+def test_rays_that_would_turn_are_left_out():
+    """In this gradient, arcs from 6 m leave the level of 25 m at 237 m."""
+    radius_m = 1500.0 - 25.0
+    reach_m = np.sqrt((1500.0 - 6.0) ** 2 - radius_m**2)
+    distance_m = reach_m * np.array([0.999, 1.001])
+    time_s, _ = oracle.rays([0, 60], [1500, 1440], distance_m, 6.0, 25.0)
+    assert np.isnan(oracle.rays([0, 60], [1500, 1500], 10.0, 6.0, 6.0)[0])
+    assert np.isfinite(time_s[0])
+    assert np.isnan(time_s[1])
