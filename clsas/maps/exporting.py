@@ -156,13 +156,16 @@ def export(
     georeference. They count from its vertical datum.
 
     With `north_up`, power is interpolated bilinearly, and so are heights. Complex pixels are
-    interpolated by a windowed sinc, without the carrier that the phase has at every place: the
-    middle of the frequencies K dr/dx, where r is the range of a channel that sees the place, and K
-    the two-way phase per metre in the band of the lines. The tag INTERPOLATION_ERROR_DB bounds the
-    rms error relative to the rms of the image. It is measured: twice the power that the image would
-    have if its spectrum were everywhere as dense as at half the sample rate. If it exceeds -40 dB,
-    the export is refused. Pixels closer to the border of the image than half the sinc, which are 12
-    to 48 rows or columns, are left out.
+    interpolated by a windowed sinc, after their local carrier has been removed. Around a pixel x,
+    an image contains the spatial frequencies K dr/dx, where r is the range of a channel that sees
+    the pixel, and K the two-way phase per metre in the band of the lines. The carrier follows the
+    middle of these frequencies.
+
+    The tag INTERPOLATION_ERROR_DB bounds the rms error relative to the rms of the image. The bound
+    is measured on the spectrum of the image without its carrier. It is twice the power that a
+    spectrum would have which is everywhere as dense as this one close to half the sample rate,
+    along rows plus along columns. Bounds above -40 dB are refused. Pixels within 12 to 48 rows or
+    columns of the border of the image, which is half the length of the sinc, are 0.
 
     Examples
     --------
