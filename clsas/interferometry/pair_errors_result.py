@@ -108,7 +108,7 @@ class PairErrors:
                 )
 
     def _found(self) -> list[str]:
-        units = {"phase": (1.0, "rad"), "delay": (1.0, "s"), "roll": (1e3, "mrad")}
+        units = {"phase": (1.0, "rad"), "delay": (1e6, "µs"), "roll": (1e3, "mrad")}
         found = []
         for name, value, sd in zip(self.unknowns, self.values, self.sd, strict=True):
             factor, unit = units[name]

@@ -219,6 +219,43 @@ def test_control_points_and_heights_between_nan():
     assert uncertain.sd[0] == pytest.approx(0.1 / 0.327, rel=0.05)
 
 
+@pytest.mark.slow
+def test_tilted_planes_and_other_axes():
+    first, second, _ = narrow()
+    plane = clsas.Grid.oriented([-0.6, 31.0, -0.3], [0, 0.02, 0.002], [0.02, 0, -0.002], (81, 61))
+    found = measured((first, second), plane, (-0.5, 0.9), window_m=0.22)
+    known_m = -plane.positions_m()[..., 2]  # the seabed lies at z = 0
+    errors = clsas.pair_errors(first, second, found, known_height_m=known_m, unknowns=("phase",))
+    assert abs(errors.phase_rad - 0.5) < 2 * errors.sd[0]
+    points_m = plane.positions_m()[10:71:20, 10:51:20].reshape(-1, 3) * [1, 1, 0]
+    few = clsas.pair_errors(first, second, found, points_m=points_m, unknowns=("phase",))
+    assert abs(few.phase_rad - 0.5) < 2 * few.sd[0]
+
+
+@pytest.mark.slow
+def test_lines_with_a_profile_of_the_sound_speed():
+    random = np.random.default_rng(3)
+    places_m = random.uniform([-0.6, 19.2, -10], [0.6, 21.4, -10], (8000, 3))
+    scene = clsas.PointTargets(places_m, random.standard_normal((8000, 2)) @ [1, 1j])
+    tx_m = np.outer(np.linspace(-2, 2, 81), [1, 0, 0]) + [0, 0, -4]
+    profile = clsas.SoundSpeed([0, 6, 9, 40], [1510, 1508, 1498, 1497])
+    first, second = (
+        clsas.simulate_lines(
+            tx_m, tx_m + [0, 0, up_m], scene, carrier_hz=100e3, bandwidth_hz=30e3,
+            sound_speed=profile,
+        )
+        for up_m in (0.0, 0.2)
+    )  # fmt: skip
+    second = second.weighted(np.full(second.channels, np.exp(0.5j)))
+    grid = clsas.Grid.plane((-0.4, 0.4, 33), (19.8, 20.6, 33), z=-10)
+    found = measured((first, second), grid, (-0.5, 0.5), None)
+    errors = clsas.pair_errors(first, second, found, known_height_m=0.0, unknowns=("phase",))
+    # Sensitivities are those of straight rays on a level plane, which err by parts in a thousand.
+    assert abs(errors.phase_rad - 0.5) < 0.01
+    right = measured((first, errors.corrected(first, second)), grid, (-0.5, 0.5), None)
+    assert abs(np.nanmean(right.height_m)) < 0.1 * np.nanmean(found.height_m)
+
+
 def test_outliers_do_not_matter():
     first, second, found = narrow()
     known_m = np.zeros(reliefs.GRID.shape)
