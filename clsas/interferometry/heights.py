@@ -42,7 +42,7 @@ from clsas.interferometry.pair import Pair
 from clsas.interferometry.refinement import PASSES, Refined, filled, refine
 from clsas.interferometry.result import Heights
 from clsas.interferometry.shadows import in_shadow
-from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, sweep
+from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, Sweep, sweep
 from clsas.interferometry.task import Task
 from clsas.opencl.device import Device, open_device
 from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
@@ -94,7 +94,8 @@ def heights(
     search_m : (lowest, highest)
         Heights above the pixels of the grid between which the seabed lies, metres: above the plane,
         or above the relief of a height map. The phase repeats with the height of ambiguity: a
-        seabed outside may appear inside, that much too high or too low.
+        seabed outside may appear inside, that much too high or too low. A
+        warning appears if most of the seabed seems to lie outside.
     window_m : float, optional
         Side of the windows in which the coherence is estimated, metres. It is the resolution of the
         heights. By default windows contain about 50 independent samples.
@@ -130,8 +131,9 @@ def heights(
     -----
     ClsasWarning
         If the search spans several heights of ambiguity and the grid is too small to tell them
-        apart; if less than a hundredth of the pixels is coherent; or if the corrections do not fall
-        below the deviation.
+        apart; if the banks agree best at an end of the search, so that the seabed seems to lie
+        outside; if less than a hundredth of the pixels is coherent; or if the corrections do not
+        fall below the deviation.
 
     See Also
     --------
@@ -164,8 +166,8 @@ def heights(
 
     Images are coregistered because they are formed in the time domain, and a sway or yaw of the
     track is accounted for like any other motion. The mask leaves out what is not coherent, pixels
-    on none of the curves (shadow), and pixels on several or on slopes that face the sonar too
-    steeply (layover).
+    on none of the curves or hidden by other pixels (shadow), and pixels on several curves or on
+    slopes that face the sonar too steeply (layover).
 
     Errors that all pixels have in common are not part of the deviation. A constant phase between
     the banks, as from a delay of one receiver, adds `Heights.m_per_rad` per radian. An error of the
@@ -353,6 +355,8 @@ def _first_relief(
     validate.memory("grid and search_m", 32 * len(heights_m) * curves.grid.size)
     found = sweep(task.pair.within(_SWEPT_DB), curves, small, large, progress)
     reliable = found.coherence >= noise_coherence(looks, _FALSE_ALARM / len(heights_m))
+    if reliable.mean() > 2 * _FALSE_ALARM:
+        _check_ends(found, task.ambiguity_m)
     rows, columns = (np.arange(math.ceil((n - 1) / every) + 1.0) for n in task.grid.shape)
     return _finer(found.relief(rows, columns, reliable, task.ambiguity_m), every, task.grid.shape)
 
@@ -409,6 +413,23 @@ def _check_size(grid: Grid, large: Window, ambiguity_m: float) -> None:
             f"differ by the height of ambiguity, {ambiguity_m:.3g} m, where the coherence is low: "
             "make the grid larger or search_m smaller"
         )
+
+
+def _check_ends(found: Sweep, ambiguity_m: float) -> None:
+    """Warn if the banks agree best at an end of the search, one height beyond which was imaged.
+
+    The phase cannot show this, but the magnitude of the coherence falls with the distance from the
+    seabed. Averaged over an image, it does so clearly, even within a sixth of a cycle.
+    """
+    best = int(found.profile.argmax())
+    if 0 < best < len(found.profile) - 1:
+        return
+    end, beyond = ("lower", "below") if best == 0 else ("upper", "above")
+    validate.warn(
+        f"search_m may not contain the seabed: the banks agree best at its {end} end, so that most "
+        f"of the seabed seems to lie {beyond} it. Heights may be wrong by multiples of the height "
+        f"of ambiguity, {ambiguity_m:.3g} m: search farther {beyond}"
+    )
 
 
 def _warn(refined: Refined) -> None:

@@ -7,8 +7,6 @@ of sight to them passes through the seabed that casts the shadow.
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
@@ -65,14 +63,14 @@ def in_shadow(
         for side, step in zip(window.sides, steps_m, strict=True)
     )
     hidden = np.zeros(valid.shape, bool)
-    for count in itertools.count(1):
-        ground_m = count * stride_m
+    ground_m = 0.0
+    while place.size:
+        ground_m += stride_m
         at = np.rint(place + ground_m * towards).astype(int)
         within = (at >= 0).all(axis=0) & (at < np.array(grid.shape)[:, None]).all(axis=0)
-        open_ = within & (line_m + ground_m * slope < roof_m.max()) & ~hidden[tuple(place)]
-        if not open_.any():
-            return hidden
+        left = within & (line_m + ground_m * slope < roof_m.max()) & ~hidden[tuple(place)]
         place, towards, line_m, slope, at = (
-            each[..., open_] for each in (place, towards, line_m, slope, at)
+            each[..., left] for each in (place, towards, line_m, slope, at)
         )
         hidden[tuple(place)] = line_m + ground_m * slope < roof_m[tuple(at)]
+    return hidden

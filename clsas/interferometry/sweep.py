@@ -212,11 +212,15 @@ class Sweep:
         Height along the curve above its pixel.
     coherence : float64 [rows, columns]
         Magnitude of the sample coherence at the height.
+    profile : float64 [heights]
+        Mean square of the coherence of all curves at every height, weighted by that at their most
+        likely height.
     """
 
     curves: Curves
     offset_m: NDArray[np.float64]
     coherence: NDArray[np.float64]
+    profile: NDArray[np.float64]
 
     def relief(
         self,
@@ -314,7 +318,9 @@ def sweep(
     best = likeliest(coherence, coarse)
     found = np.take_along_axis(coherence, best[None], axis=0)[0].astype(np.complex128)
     at_m = offset_m[best] - np.angle(found) / curves.rad_m(best)
-    return Sweep(curves, at_m, np.abs(found))
+    weight = np.abs(found) ** 2
+    profile = np.array([np.vdot(weight, np.abs(each) ** 2) for each in coherence])
+    return Sweep(curves, at_m, np.abs(found), profile / max(float(weight.sum()), 1e-9))
 
 
 def likeliest(coherence: NDArray[np.complex64], coarse: Window) -> NDArray[np.intp]:

@@ -1,5 +1,6 @@
 """Heights of simulated reliefs against the reliefs themselves."""
 
+import warnings
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -53,7 +54,7 @@ def step(x, y):
 # The far side of the rock is 25 dB darker than the seabed beside it, and full of its side lobes.
 LOW_SIDE_LOBES = clsas.BeamWindow(14.0, "hann")
 
-# Receivers ahead of the transmitter, the upper bank a little more, which yaw moves across the track.
+# Receivers ahead of the transmitter, the upper bank more. Yaw moves them across the track.
 AHEAD_M = ((0.5, 0.1, 0.0), (0.55, 0.05, 0.25))
 
 SCENES = {
@@ -275,6 +276,32 @@ def test_shadow_and_layover_are_masked():
     assert layover.mask[mixed].mean() < 0.2
     error_m = (layover.height_m - truth(wall))[layover.mask]
     assert np.mean(np.abs(error_m) > 5 * layover.sd_m[layover.mask]) < 0.005
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cycles", [0.3, 1.0, 2.0])
+@pytest.mark.parametrize("snr_db", [17, 7])
+def test_searches_beside_the_seabed_warn(cycles, snr_db):
+    lines = flat_banks() if snr_db == 17 else banks(flat, snr_db=snr_db)
+    off_m = cycles * AMBIGUITY_M
+    for search_m, end in (((off_m, off_m + 1.5), "lower"), ((-off_m - 1.5, -off_m), "upper")):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            heights(*lines, GRID, search_m=search_m, window_m=WINDOW_M)
+        # Where no pixel finds the seabed in another cycle, a second warning says so.
+        assert f"agree best at its {end} end" in str(caught[0].message)
+        assert all(each.category is ClsasWarning for each in caught)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("snr_db", [17, 7])
+@pytest.mark.parametrize("name", ["flat", "facing", "dunes", "rock"])
+def test_searches_that_end_at_the_seabed_do_not_warn(name, snr_db):
+    relief, _ = SCENES[name]
+    lines = banks(relief, snr_db=snr_db)
+    low_m, high_m = truth(relief).min(), truth(relief).max()
+    for search_m in ((low_m, high_m + 1.5), (low_m - 1.5, high_m)):
+        heights(*lines, GRID, search_m=search_m, window_m=WINDOW_M)  # warnings are errors
 
 
 def test_results_describe_themselves():
