@@ -94,8 +94,8 @@ def heights(
     search_m : (lowest, highest)
         Heights above the pixels of the grid between which the seabed lies, metres: above the plane,
         or above the relief of a height map. The phase repeats with the height of ambiguity: a
-        seabed outside may appear inside, that much too high or too low. A
-        warning appears if most of the seabed seems to lie outside.
+        seabed outside may appear inside, that much too high or too low. A warning appears if most
+        of the seabed seems to lie outside.
     window_m : float, optional
         Side of the windows in which the coherence is estimated, metres. It is the resolution of the
         heights. By default windows contain about 50 independent samples.

@@ -225,6 +225,8 @@ class Store:
         validate.instance("grid", grid, Grid)
         check_inputs(inputs, grid.shape)
         patch_shape = validate.sides("patch_shape", patch_shape)
+        if window is not None:
+            window = validate.sides("window", window)
         check_place(self.path)
         if not is_there(self.path):
             arrays.create_store(self.path, inputs, grid, patch_shape, window)
@@ -359,11 +361,13 @@ class Store:
         shape = tuple(part.stop - part.start for part in own)
         pixels = validate.array("pixels", pixels, np.complex64, shape)
         validate.instance("record", record, Record)
+        validate.instance("layers", layers, Mapping)
         if set(layers) != set(self.layers):
             raise ValueError(
                 f"layers must be {', '.join(self.layers) or 'left out'} for {self.path}, got "
                 f"{', '.join(layers) or 'none'}"
             )
+        layers = {name: _layer(name, values, shape) for name, values in layers.items()}
         folder = self._arrays.files.folder((row, column))
         check_own(self.path, folder)
         # Remove the old record first, so that it never stands beside pixels of the new patch.
@@ -493,12 +497,13 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        if name not in self.layers:
+        if validate.text("name", name) not in self.layers:
             raise ValueError(
                 f"name must be that of a layer of {self.path} "
                 f"({', '.join(self.layers) or 'none: it has no heights'}), got {name!r}"
             )
-        factor = self._checked_factor(factor) if factor != 1 else 1
+        if validate.count("factor", factor) != 1:
+            factor = self._checked_factor(factor)
         return self._read(f"{factor}x/{name}" if factor > 1 else name, rows, columns)
 
     def read_level(
@@ -695,6 +700,17 @@ class Store:
         if not (self.path / LEVELS / "zarr.json").exists() or not self._is_complete():
             return {}
         return _completing().damage(self.path, read_document(self.path))
+
+
+def _layer(name: str, values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return a layer of a patch as float32; raise TypeError or ValueError unless it is one."""
+    validate.instance(name, values, np.ndarray)
+    if values.dtype.kind != "f" or values.shape != shape or np.isinf(values).any():
+        raise ValueError(
+            f"layers must have real numbers of shape {shape}, finite or NaN, got "
+            f"{validate.shown(values)} for {name}"
+        )
+    return values.astype(np.float32)
 
 
 def _completing() -> ModuleType:

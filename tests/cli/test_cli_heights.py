@@ -74,6 +74,55 @@ def test_the_search_may_start_from_a_relief(files, tmp_path):
     assert "the grid of the scene has heights" in twice.stderr
 
 
+def test_a_store_is_measured_drawn_and_exported(files, tmp_path):
+    pytest.importorskip("zarr")
+    rasterio = pytest.importorskip("rasterio")
+    output = tmp_path / "heights.zarr"
+    given = *files, *GRID, "--search-m", "-0.5:0.5", "--window-m", 0.2
+    mosaic = *given, "-o", output, "--patch-m", 0.6
+    results = json.loads(run("heights", *mosaic, "--json").stdout)
+    assert results["patches"] == [2, 2]
+    assert results["patch_shape"] == [26, 26]
+    store = clsas.Store.opened(output)
+    found = store.heights()
+    assert results["valid"] == found.mask.mean() > 0.9
+    text = run("heights", *mosaic).stdout
+    assert "2 x 2 patches of 26 x 26 pixels" in text
+    assert "% of 2601 pixels are valid" in text
+
+    run("show", output, "-o", tmp_path / "part.png", "--near", "0,32", "--extent-m", 0.4)
+    assert (tmp_path / "part.png").stat().st_size > 10_000
+    refused = run("show", output, "--db", 40, code=2)
+    assert "cannot be used with a mosaic of heights" in refused.stderr
+
+    place = "--origin", "60.39,5.32", "--heading-deg", 0
+    run("export", output, tmp_path / "heights.tif", *place)
+    clsas.save(tmp_path / "heights.h5", found)
+    run("export", tmp_path / "heights.h5", tmp_path / "single.tif", *place)
+    with (
+        rasterio.open(tmp_path / "heights.tif") as one,
+        rasterio.open(tmp_path / "single.tif") as other,
+    ):
+        assert (
+            one.descriptions
+            == other.descriptions
+            == (
+                "Height (m)",
+                "Standard deviation (m)",
+                "Coherence",
+            )
+        )
+        assert np.array_equal(one.read(), other.read(), equal_nan=True)
+        assert one.tags()["WINDOW_M"] == "0.2"
+    run("export", output, tmp_path / "heights.nc", *place)
+    run("export", output, tmp_path / "heights.png")
+    refused = run("export", output, tmp_path / "heights.nitf", code=1)
+    assert "for heights, got" in refused.stderr
+
+    alone = run("heights", *given, "-o", tmp_path / "heights.h5", "--patch-m", 1, code=2)
+    assert "--patch-m requires an output that ends in .zarr" in alone.stderr
+
+
 def test_mistakes_are_reported(files, tmp_path):
     output = "-o", tmp_path / "heights.h5"
     crossed = run("heights", *files, *GRID, "--search-m", "1:-1", *output, code=2)

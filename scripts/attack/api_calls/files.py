@@ -33,7 +33,7 @@ def files(folder: Path) -> dict[str, Call]:
     document = read_document(opened.path)
     inputs, patch_shape = document["inputs"], document["patch_shape"]
     record = opened.records()[0, 0]
-    shape = opened.pixels.chunks
+    of_heights = store_of_heights(folder, inputs, record)
     return {
         "load": Call(clsas.load, {"path": folder / "lines.h5"}),
         "save": Call(
@@ -101,8 +101,13 @@ def files(folder: Path) -> dict[str, Call]:
         "Store.damage": Call(opened.damage, {"progress": nothing}, accepts={"progress": optional}),
         "Store.begin": Call(
             opened.begin,
-            {"inputs": inputs, "grid": s.grid, "patch_shape": tuple(patch_shape)},
-            accepts={"inputs": ("dict",)},
+            {
+                "inputs": inputs,
+                "grid": s.grid,
+                "patch_shape": tuple(patch_shape),
+                "window": None,
+            },
+            accepts={"inputs": ("dict",), "window": optional},
         ),
         "Store.grow": Call(opened.grow, {"inputs": inputs}),
         "Store.read_level": Call(
@@ -116,17 +121,48 @@ def files(folder: Path) -> dict[str, Call]:
             opened.add_levels, {"progress": nothing}, accepts={"progress": optional}
         ),
         "Store.write": Call(
-            opened.write,
+            of_heights.write,
             {
                 "row": 0,
                 "column": 0,
-                "rows": slice(0, shape[0]),
-                "columns": slice(0, shape[1]),
-                "pixels": np.array(opened.read(slice(0, shape[0]))),
+                "rows": slice(0, 4),
+                "columns": slice(0, 6),
+                "pixels": np.ones((4, 6), np.complex64),
                 "record": record,
+                "layers": _layers((4, 6)),
             },
         ),
+        "Store.undamaged_records": Call(opened.undamaged_records, {}),
+        "Store.read_layer": Call(
+            of_heights.read_layer,
+            {"name": "sd_m", "rows": slice(0, 4), "columns": slice(1, 5), "factor": 1},
+            may_be_nan=True,
+        ),
+        "Store.heights": Call(
+            of_heights.heights, {"rows": slice(0, 4), "columns": slice(1, 5)}, may_be_nan=True
+        ),
+        "Store.overview_heights": Call(
+            of_heights.overview_heights,
+            {"most": 2, "rows": slice(0, 4), "columns": slice(1, 5)},
+            may_be_nan=True,
+        ),
     }
+
+
+def store_of_heights(folder: Path, inputs: dict[str, Any], record: Record) -> clsas.Store:
+    """Return a small store of heights."""
+    grid = clsas.Grid.plane((0, 1, 6), (20, 21, 4))
+    store = clsas.Store.at(folder / "of-heights.zarr")
+    own = {"grid": grid_digest(grid), "pixels": [4, 6], "window_m": 0.5, "georeference": None}
+    store.begin(inputs | own, grid, grid.shape, (3, 3))
+    pixels = np.ones(grid.shape, np.complex64)
+    store.write(0, 0, slice(0, 4), slice(0, 6), pixels, record, _layers(grid.shape))
+    return store
+
+
+def _layers(shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    names = ("height_m", "sd_m", "coherence", "looks", "m_per_rad")
+    return {name: np.full(shape, 0.5, np.float32) for name in names}
 
 
 def store_with_levels(folder: Path, inputs: dict[str, Any], record: Record) -> clsas.Store:

@@ -281,14 +281,14 @@ def imaging(folder: Path) -> dict[str, Call]:
     }
 
 
-def _anew(store: Path) -> Callable[..., clsas.Mosaic]:
-    """Return `clsas.mosaic`, preceded by the removal of the store that the last call left."""
+def _anew(store: Path, function: Callable = clsas.mosaic) -> Callable:
+    """Return a function, preceded by the removal of the store that the last call left."""
 
-    def mosaic(**given: Any) -> clsas.Mosaic:
+    def anew(**given: Any) -> Any:
         shutil.rmtree(store, ignore_errors=True)
-        return clsas.mosaic(**given)
+        return function(**given)
 
-    return mosaic
+    return anew
 
 
 def navigation(folder: Path) -> dict[str, Call]:
@@ -382,6 +382,28 @@ def navigation(folder: Path) -> dict[str, Call]:
             accepts=dict.fromkeys(("window_m", "progress"), optional)
             | {"beam": ("None", "a BeamWindow")},
             may_be_nan=True,
+        ),
+        "mosaic_heights": Call(
+            _anew(folder / "heights.zarr", clsas.mosaic_heights),
+            {
+                "a": lower,
+                "b": upper,
+                "grid": s.grid,
+                "store": folder / "heights.zarr",
+                "search_m": (-0.3, 0.4),
+                "window_m": 0.3,
+                "tolerance_db": -30.0,
+                "least_coherence": 0.5,
+                "beam": None,
+                "patch_m": 2.0,
+                "device": 0,
+                "progress": nothing,
+            },
+            kinds={"device": "device"},
+            names={"a": ("b", "source"), "b": ("a", "source")},
+            accepts=dict.fromkeys(("window_m", "progress", "patch_m"), optional)
+            | {"beam": ("None", "a BeamWindow"), "b": ("None",)},
+            skips={"a": ("str",), "b": ("str",)},
         ),
         "Heights": Call(clsas.Heights, fields(found), may_be_nan=True),
         "pair_errors": Call(
