@@ -83,6 +83,7 @@ def heights(
     """Measure the heights of a seabed from two receiver banks.
 
     LINES.H5 holds the range lines of both banks, or those of one if B.H5 holds those of the other.
+    Of more than two banks in one file, the first two are taken; clsas convert --bank splits a file.
     The grid, from --scene or from --x, --y and --z, must be a plane. Heights are valid where the
     banks are coherent, and not in shadow or layover; the others are NaN.
 
@@ -93,15 +94,12 @@ def heights(
     beam = read_beam(described, given)
     if second_file is None:
         lines = load_lines(first_file, None, described)
-        if lines.banks != 2:
+        try:
+            first, second = banks.pair(lines)
+        except ValueError as error:
             raise ValueError(
-                f"{first_file} must hold range lines of 2 receiver banks, got {lines.banks}: give "
-                "the lines of the other bank as a second file"
-                if lines.banks == 1
-                else f"{first_file} must hold range lines of 2 receiver banks, got {lines.banks}: "
-                "take two of them by clsas convert --bank"
-            )
-        first, second = (lines.bank(number) for number in banks.present(lines.bank_numbers))
+                f"{first_file} {error}: give the lines of the other bank as a second file"
+            ) from None
     else:
         first, second = (load_lines(each, None, described) for each in (first_file, second_file))
     with progress_bar("measuring heights") as progress:
