@@ -121,6 +121,7 @@ def heights(
     """Measure the heights of a seabed from two receiver banks.
 
     LINES.H5 holds the range lines of both banks, or those of one if B.H5 holds those of the other.
+    Of more than two banks in one file, the first two are taken; clsas convert --bank splits a file.
     The grid, from --scene or from --x, --y and --z, is a plane, or a height map from which the
     search starts. Heights are above the plane, and valid where the banks are coherent, and not in
     shadow or layover; the others are NaN.
@@ -138,7 +139,7 @@ def heights(
     if relief is not None:
         grid = _raised(grid, relief)
     beam = read_beam(described, given)
-    request = {
+    request: dict[str, Any] = {
         "search_m": search_m, "window_m": window_m, "tolerance_db": tolerance_db,
         "least_coherence": least_coherence, "beam": beam, "device": device,
     }  # fmt: skip

@@ -57,18 +57,14 @@ def load_lines(
 def load_banks(
     path: Path, described: SceneFile | None = None
 ) -> tuple[clsas.RangeLines, tuple[int, int]]:
-    """Return the range lines of a file that holds two receiver banks, and the banks' numbers."""
+    """Return the range lines of a file of several receiver banks, and the first two banks."""
     lines = load_lines(path, None, described)
-    if lines.banks != 2:
+    try:
+        return lines, banks.first_two(lines.bank_numbers)
+    except ValueError as error:
         raise ValueError(
-            f"{path} must hold range lines of 2 receiver banks, got {lines.banks}: give "
-            "the lines of the other bank as a second file"
-            if lines.banks == 1
-            else f"{path} must hold range lines of 2 receiver banks, got {lines.banks}: "
-            "take two of them by clsas convert --bank"
-        )
-    first, second = banks.present(lines.bank_numbers)
-    return lines, (int(first), int(second))
+            f"{path} {error}: give the lines of the other bank as a second file"
+        ) from None
 
 
 def read_scene(path: Path) -> SceneFile:

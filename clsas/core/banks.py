@@ -64,6 +64,31 @@ def members(numbers: NDArray[np.int64] | None, number: int) -> slice | NDArray[n
     return slice(None) if numbers is None else np.flatnonzero(numbers == number)
 
 
+def first_two(numbers: NDArray[np.int64] | None) -> tuple[int, int]:
+    """Return the banks from which heights are measured: the first two.
+
+    Parameters
+    ----------
+    numbers : int64 [channels] or None
+        Bank of each channel.
+
+    Raises
+    ------
+    ValueError
+        If there is only one bank.
+    """
+    first, *others = present(numbers)
+    if not others:
+        raise ValueError("must have at least 2 receiver banks (bank_numbers), got 1")
+    return int(first), int(others[0])
+
+
+def pair(lines: RangeLines) -> tuple[RangeLines, RangeLines]:
+    """Return the lines of the two banks from which heights are measured; see `first_two`."""
+    first, second = first_two(lines.bank_numbers)
+    return lines.bank(first), lines.bank(second)
+
+
 def together(lines: RangeLines) -> str | None:
     """Return what to expect of one image of several banks, or None if the lines have one bank."""
     if lines.bank_numbers is None or lines.banks == 1:

@@ -95,6 +95,9 @@ class Heights:
             else:
                 values = validate.array(name, values, np.float64, shape)
             put(name, _read_only(np.where(mask, values, np.nan).astype(np.float64)))
+        _check_limits("sd_m within the mask", self.sd_m[mask], "m")
+        _check_limits("coherence", self.coherence, most=1.0)
+        _check_limits("looks", self.looks)
 
     def __repr__(self) -> str:
         """Return the shape, the valid share, the span of heights and the median deviation."""
@@ -113,6 +116,14 @@ class Heights:
     def georeference(self) -> Georeference | None:
         """Georeference of the grid; None if unknown."""
         return self.image.georeference
+
+
+def _check_limits(
+    name: str, values: NDArray[np.float64], unit: str = "", most: float | None = None
+) -> None:
+    """Raise ValueError if a value is negative, or above a limit."""
+    for value in (values.min(initial=0.0), values.max(initial=0.0)):
+        validate.number(name, float(value), unit, least=0.0, most=most)
 
 
 def _as_array(values: object) -> NDArray | None:

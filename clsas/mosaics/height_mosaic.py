@@ -223,12 +223,11 @@ def _banks(a: Lines, b: Lines | None, beam: BeamWindow | None) -> tuple[Bank, Ba
         return Bank.of(first, None, beam), Bank.of(second, None, beam)
     source = _source("a", a)
     survey = open_survey(source if isinstance(source, RangeLines) else source.resolve())
-    known = numbers.present(survey.geometry.bank_numbers)
-    if len(known) != 2:
-        raise ValueError(
-            f"a must have the range lines of 2 receiver banks if b is None, got {len(known)}"
-        )
-    return Bank.of(survey, known[0], beam), Bank.of(survey, known[1], beam)
+    try:
+        first, second = numbers.first_two(survey.geometry.bank_numbers)
+    except ValueError as error:
+        raise ValueError(f"a {error}: give the other one as b") from None
+    return Bank.of(survey, first, beam), Bank.of(survey, second, beam)
 
 
 def _source(name: str, lines: Any) -> RangeLines | Path:

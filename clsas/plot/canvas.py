@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, Literal
@@ -69,11 +70,14 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -
     import matplotlib as mpl
 
     options: Any = {"metadata": _DATES[kind]} if kind in _DATES else {}
-    with replacing(path) as temporary, mpl.rc_context(_SETTINGS):
+    drawn = io.BytesIO()  # if a file cannot grow, Matplotlib's writer of PDF hides the reason
+    with mpl.rc_context(_SETTINGS):
         # "tight" includes labels that the layout leaves outside, such as those of square axes.
         figure.savefig(
-            temporary, format=kind, dpi=dpi, bbox_inches="tight", pad_inches=PADDING_IN, **options
+            drawn, format=kind, dpi=dpi, bbox_inches="tight", pad_inches=PADDING_IN, **options
         )
+    with replacing(path) as temporary:
+        temporary.write_bytes(drawn.getbuffer())
     remove_sidecars(path)
 
 

@@ -222,11 +222,10 @@ def imaged(job: Job) -> Outcome:
 def measured(job: Job) -> Outcome:
     """Measure the heights of the seabed from the first two receiver banks."""
     (grid,) = job.scene.need("grid")
-    check_banks(job.lines)
-    first, second, *_ = banks.present(job.lines.bank_numbers)
+    first, second = check_banks(job.lines)
     found = heights(
-        job.lines.bank(first), job.lines.bank(second), grid, beam=job.scene.image.get("beam"),
-        **job.options("heights"), device=job.device, progress=job.progress,
+        first, second, grid, beam=job.scene.image.get("beam"), **job.options("heights"),
+        device=job.device, progress=job.progress,
     )  # fmt: skip
     save(job.folder / "heights.h5", found)
     files = ["heights.h5"]
@@ -235,10 +234,12 @@ def measured(job: Job) -> Outcome:
     return Outcome(numbers.of_heights(found), files)
 
 
-def check_banks(lines: RangeLines) -> None:
-    """Raise ValueError unless heights can be measured from several receiver banks."""
-    if lines.banks == 1:
-        raise ValueError("the recording must have at least 2 receiver banks (bank_numbers), got 1")
+def check_banks(lines: RangeLines) -> tuple[RangeLines, RangeLines]:
+    """Return the two banks for heights; raise ValueError for a recording of one bank."""
+    try:
+        return banks.pair(lines)
+    except ValueError as error:
+        raise ValueError(f"the recording {error}") from None
 
 
 def joined(job: Job) -> Outcome:

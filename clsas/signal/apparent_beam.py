@@ -19,7 +19,7 @@ from clsas.core.wavelengths import wavelength_m
 from clsas.signal.ray_delays import RaySample
 from clsas.sonar.beam import BeamWindow
 
-_SINES = 129  # at which the slopes of weights are sampled; a plain choice
+_SINES = 129  # at which the weights of a beam are sampled; a plain choice
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -92,25 +92,21 @@ def apparent_beam(
         np.einsum("ni,ni->n", towards, each[sample.channels[channel]])
         for towards, each in ((of_rays, along), (apparent, turned))
     )
-    inside = (wanted > beam.limits[0]) & (wanted < beam.limits[1])
+    at_antennas_m = faster * wavelength_m(straight)
+    weights, others = (beam.weights(each, at_antennas_m) for each in (wanted, ratio * given))
+    inside = (weights > 0) & (others > 0)
     if not inside.any():
         return found, 0.0
-    shift2 = float(np.mean((ratio * given - wanted)[inside] ** 2))
-    return found, shift2 * _slope2(beam, faster * wavelength_m(straight))
+    # Not relative to the weights of the sample: of few channels, all may lie near the edges.
+    sine = np.linspace(*np.clip(beam.limits, -1, 1), _SINES + 2)[1:-1]
+    usual2 = np.mean(beam.weights(sine, at_antennas_m) ** 2)
+    return found, float(np.mean((others - weights)[inside] ** 2) / usual2)
 
 
 def _ratio(wanted: NDArray[np.float64], given: NDArray[np.float64], otherwise: float) -> float:
     """Return the factor by which given components fit wanted ones best, by least squares."""
     square = float(np.vdot(given, given))
     return float(np.vdot(wanted, given)) / square if square > 0 else otherwise
-
-
-def _slope2(beam: BeamWindow, wavelength_m: float) -> float:
-    """Return the mean squared slope of a beam's weights over their mean square, without steps."""
-    low, high = np.clip(beam.limits, -1, 1)
-    sine = np.linspace(low, high, _SINES + 2)[1:-1]
-    weights = beam.weights(sine, wavelength_m)
-    return float(np.mean(np.gradient(weights, sine) ** 2) / np.mean(weights**2))
 
 
 def _directions_of_rays(

@@ -155,7 +155,20 @@ def test_one_file_may_hold_both_banks(tmp_path):
     run("heights", tmp_path / "upper.h5", *given)
     assert np.array_equal(clsas.load(output).height_m, found.height_m, equal_nan=True)
     alone = run("heights", tmp_path / "low.h5", *given, code=1)
-    assert "must hold range lines of 2 receiver banks, got 1" in alone.stderr
+    assert "low.h5 must have at least 2 receiver banks (bank_numbers), got 1: give" in alone.stderr
+    # Of three banks, the first two are taken, as by clsas process.
+    three = replace(
+        both,
+        samples=np.concatenate([both.samples, 0 * low.samples]),
+        **{
+            name: np.concatenate([getattr(both, name), getattr(low, name)])
+            for name in ("first_range_m", "tx_m", "rx_m")
+        },
+        bank_numbers=np.repeat([0, 1, 2], low.channels),
+    )
+    clsas.save(tmp_path / "three.h5", three)
+    run("heights", tmp_path / "three.h5", *given)
+    assert np.array_equal(clsas.load(output).height_m, found.height_m, equal_nan=True)
 
 
 def test_heights_and_interferograms_are_drawn(files, tmp_path):

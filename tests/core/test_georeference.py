@@ -172,5 +172,5 @@ def test_pixels_of_a_north_up_grid_are_no_larger_than_the_grid():
         with pytest.raises(ValueError, match="pixel_m must be at most the longer side of the grid"):
             place.north_up(grid, pixel_m)
     for pixel_m in (1e-6, 5e-324):
-        with pytest.raises(ValueError, match="pixel_m must ask for at most .* memory"):
+        with pytest.raises(ValueError, match=r"pixel_m must ask for at most .* memory"):
             place.north_up(grid, pixel_m)

@@ -55,9 +55,9 @@ def objects():
         "heights": Heights(
             noise(3, 5),
             np.abs(noise(3, 5)),
-            noise(3, 5),
+            1 / (1 + noise(3, 5) ** 2),
             noise(3, 5) > 0,
-            *noise(2, 3, 5),
+            *np.abs(noise(2, 3, 5)),
             Image(complex_noise(random, 3, 5), PLANE.with_height(noise(3, 5))),
             0.1,
         ),

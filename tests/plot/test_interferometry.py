@@ -1,5 +1,7 @@
 """Pictures of interferograms and of heights."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from matplotlib.colors import Normalize
@@ -127,3 +129,19 @@ def test_wrong_results_are_refused():
         plot.heights(heights(GRID, np.zeros(GRID.shape), np.zeros(GRID.shape, bool)))
     with pytest.raises(ValueError, match="colour_map must be"):
         plot.heights(hill(), colour_map="rainbows")
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("sd_m", -0.01, "sd_m within the mask must be finite and >= 0 m, got -0.01"),
+        ("coherence", 1.01, "coherence must be finite and >= 0 and <= 1, got 1.01"),
+        ("looks", -1.0, "looks must be finite and >= 0, got -1"),
+    ],
+)
+def test_impossible_results_are_refused(field, value, message):
+    found = heights(GRID, np.zeros(GRID.shape), np.ones(GRID.shape, bool))
+    values = getattr(found, field).copy()
+    values[2, 3] = value
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(found, **{field: values})

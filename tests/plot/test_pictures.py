@@ -3,6 +3,7 @@
 import base64
 import io
 import re
+import subprocess
 import sys
 from itertools import combinations
 
@@ -386,3 +387,28 @@ def test_pictures_of_extreme_amplitudes(tmp_path):
             level_of(plot.image_db(SPECKLE)).get_array(),
             atol=1e-3,
         )
+
+
+_LIMITED = """
+import resource, signal, sys
+import matplotlib.pyplot as plt
+import clsas
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+figure, axes = plt.subplots()
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+try:
+    clsas.plot.save(figure, sys.argv[1])
+except OSError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
+def test_a_file_that_cannot_grow_is_reported(suffix, tmp_path):
+    path = tmp_path / f"a.{suffix}"
+    path.write_bytes(b"old")
+    command = [sys.executable, "-c", _LIMITED, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "File too large" in done.stdout
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
