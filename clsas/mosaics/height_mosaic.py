@@ -224,10 +224,10 @@ def _banks(a: Lines, b: Lines | None, beam: BeamWindow | None) -> tuple[Bank, Ba
     source = _source("a", a)
     survey = open_survey(source if isinstance(source, RangeLines) else source.resolve())
     try:
-        first, second = numbers.first_two(survey.geometry.bank_numbers)
+        both = numbers.first_two(survey.geometry.bank_numbers)
     except ValueError as error:
         raise ValueError(f"a {error}: give the other one as b") from None
-    return Bank.of(survey, first, beam), Bank.of(survey, second, beam)
+    return Bank.of(survey, both[0], beam), Bank.of(survey, both[1], beam)
 
 
 def _source(name: str, lines: Any) -> RangeLines | Path:
