@@ -3,6 +3,7 @@ import pytest
 
 from clsas.core.grid import Grid
 from clsas.core.image import Image
+from clsas.core.validate import ClsasWarning
 from clsas.interferometry.interferogram import Interferogram, interferogram
 
 GRID = Grid.plane((0, 1.99, 200), (30, 31.99, 200))
@@ -73,6 +74,13 @@ def test_windows_of_a_single_row_are_rows():
     pixel = GRID.window(slice(1), slice(1))
     with pytest.raises(ValueError, match="more than one pixel"):
         interferogram(*images(np.random.default_rng(8), 0.9, 1.0, pixel), window_m=0.21)
+
+
+def test_windows_nearly_as_large_as_the_images_warn():
+    a, b = images(np.random.default_rng(9), 0.9, 1.0, GRID.window(slice(30), slice(60)))
+    with pytest.warns(ClsasWarning, match="two thirds.*got 70 %"):
+        interferogram(a, b, window_m=0.21)
+    interferogram(a, b, window_m=0.19)  # 63 %; warnings are errors
 
 
 def test_windows_that_cannot_be_are_refused():
