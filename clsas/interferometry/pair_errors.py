@@ -118,7 +118,9 @@ def pair_errors(
     A phase and a delay displace heights alike, but on the relief that was found a phase leaves
     phase (1 - f/f0) at the frequency f. It is measured from both halves of the band. Heights
     follow the delay over any number of cycles, since the magnitude of the coherence decides
-    between cycles.
+    between cycles. With a phase of nearly half a cycle, as from a bank of inverted polarity,
+    heights scatter over two cycles. The sum of phase and delay is then right, but not its parts:
+    estimate again from heights of the corrected lines.
 
     Two tracks show the differences of their displacements only. Those are not constant where the
     tracks see a place at different ranges. On opposite tracks that look at the strip between them

@@ -88,6 +88,21 @@ def test_deviations_are_honest():
 
 
 @pytest.mark.slow
+def test_a_second_estimate_finds_inverted_polarity():
+    first, second = swaths.banks(flat, 1, phase_rad=np.pi)
+    rotation, delay_s = 0.0, 0.0
+    for search_m in ((-2.5, 2.5), (-0.8, 0.8)):
+        found = measured((first, second), search_m=search_m)
+        errors = clsas.pair_errors(first, second, found, known_height_m=0.0)
+        second = errors.corrected(first, second)
+        rotation, delay_s = rotation + errors.phase_rad, delay_s + errors.delay_s
+    sd = dict(zip(errors.unknowns, errors.sd, strict=True))
+    assert abs(np.angle(np.exp(1j * (rotation - np.pi)))) < 2 * sd["phase"]
+    assert abs(delay_s) < 2 * sd["delay"]
+    assert found.mask.mean() > 0.95
+
+
+@pytest.mark.slow
 def test_two_tracks_show_the_errors_without_known_heights():
     true = ERRORS["all"]
     here, there = (swaths.banks(flat, 1, track_y_m=y_m, **true) for y_m in (0.0, -10.0))
