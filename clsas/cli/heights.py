@@ -138,7 +138,7 @@ def heights(
     if relief is not None:
         grid = _raised(grid, relief)
     beam = read_beam(described, given)
-    request = {
+    request: dict[str, Any] = {
         "search_m": search_m, "window_m": window_m, "tolerance_db": tolerance_db,
         "least_coherence": least_coherence, "beam": beam, "device": device,
     }  # fmt: skip
