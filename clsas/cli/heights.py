@@ -18,6 +18,7 @@ from clsas.cli.parameters import INPUT, File, Output, Parsed, Store, keep_out
 from clsas.core import validate
 from clsas.files.hdf5 import SUFFIXES
 from clsas.files.height_files import read_heights
+from clsas.files.scene_files import SceneFile
 from clsas.interferometry.checks import checked_coherence
 from clsas.interferometry.heights import LEAST_COHERENCE
 from clsas.processing import numbers
@@ -145,18 +146,20 @@ def heights(
     }  # fmt: skip
     if is_mosaic:
         keep_out("LINES.H5", first_file, "the store", output)
+        # Lines are read in slices, unless they get the sound speed of the scene.
+        in_slices = described.sound_speed is None
+        sources = (
+            (first_file, second_file)
+            if in_slices
+            else _both_banks(first_file, second_file, described)
+        )
         with progress_bar("measuring heights") as progress:
             store = clsas.mosaic_heights(
-                first_file, second_file, grid, output, **request, patch_m=patch_m,
-                progress=progress,
-            )  # fmt: skip
+                *sources, grid, output, **request, patch_m=patch_m, progress=progress
+            )
         _report_store(store, output, as_json)
         return
-    if second_file is None:
-        lines, numbers_of_banks = load_banks(first_file, described)
-        first, second = (lines.bank(number) for number in numbers_of_banks)
-    else:
-        first, second = (load_lines(each, None, described) for each in (first_file, second_file))
+    first, second = _both_banks(first_file, second_file, described)
     with progress_bar("measuring heights") as progress:
         found = clsas.heights(first, second, grid, **request, progress=progress)
     clsas.save(output, found)
@@ -169,6 +172,17 @@ def heights(
         file=output,
         **results,
     )
+
+
+def _both_banks(
+    first_file: Path, second_file: Path | None, described: SceneFile
+) -> tuple[clsas.RangeLines, clsas.RangeLines]:
+    """Return the range lines of both banks, from one file or from two."""
+    if second_file is not None:
+        first, second = (load_lines(each, None, described) for each in (first_file, second_file))
+        return first, second
+    lines, both = load_banks(first_file, described)
+    return lines.bank(both[0]), lines.bank(both[1])
 
 
 def _report_store(store: clsas.Store, output: Path, as_json: bool) -> None:

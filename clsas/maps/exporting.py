@@ -209,7 +209,7 @@ def export(
     options.check_used(suffix, of_heights=of_heights)
     if suffix and suffix not in PICTURES:
         _write_data(path, _finished(opened, georeference), options, progress)
-    elif of_heights:
+    elif of_heights or isinstance(opened, Heights):  # a picture
         shown = _placed_heights(opened, georeference)
         save_picture(heights_picture(shown, **options.given), path)
     elif suffix:
@@ -382,9 +382,10 @@ def _placed(source: Image | Store, georeference: Georeference | None) -> Image:
     return Image(shown.pixels, replace(shown.grid, georeference=found.grid.georeference))
 
 
-def _placed_heights(source: Any, georeference: Georeference | None) -> Heights:
+def _placed_heights(source: Image | Store | Heights, georeference: Georeference | None) -> Heights:
     """Return the heights that a picture shows, with the georeference of the export."""
     if isinstance(source, Store):
         _finished(source, georeference).check_unchanged()
     heights = source.overview_heights() if isinstance(source, Store) else source
+    assert isinstance(heights, Heights)
     return replace(heights, image=_placed(heights.image, georeference))

@@ -47,7 +47,7 @@ from clsas.opencl.device import Device
 from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
 from clsas.sonar.beam import BeamWindow
 
-_SIDE = 1024  # pixels of a patch by default, which take about 1 GiB
+_SIDE = 1024  # pixels along a patch by default, which then takes about 0.6 GiB
 _TRIAL = 512  # largest side of the part of the grid that decides on the windows; arbitrary
 _MARGIN_WINDOWS = 2.0  # beside half a large one: for as many passes, of half a window each
 
@@ -161,7 +161,7 @@ def mosaic_heights(
     ...         lower, upper, grid, f"{folder}/heights.zarr", search_m=(-0.1, 0.5), patch_m=0.6
     ...     )
     ...     print(f"{len(store.records())} patches, {np.nanmedian(store.heights().height_m):.2f} m")
-    4 patches, 0.20 m
+    6 patches, 0.20 m
     """
     validate.instance("grid", grid, Grid)
     check_grid(grid)

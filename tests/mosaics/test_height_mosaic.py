@@ -7,6 +7,7 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -368,6 +369,45 @@ def test_a_store_killed_at_any_step_ends_bit_identical(tmp_path, monkeypatch, pa
         again.complete_levels()
         assert files_of(path) == whole
     assert kills > 8
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux tells the most memory")
+def test_memory_is_that_of_a_patch(tmp_path):
+    """Four times as many patches take little more memory than those around one in the middle."""
+    script = """
+        import pathlib, sys
+        sys.path += [".", ".."]
+        import clsas
+        from reliefs import flat_banks
+
+        def most_mib():
+            lines = pathlib.Path("/proc/self/status").read_text().splitlines()
+            return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
+
+        search, window, half_m = (-0.5, 0.5), 0.2, 0.004
+
+        def grid(side):
+            along = -half_m * side, half_m * side, side
+            return clsas.Grid.plane(along, (33 + along[0], 33 + along[1], side))
+
+        lines = flat_banks()
+        clsas.mosaic_heights(*lines, grid(300), sys.argv[1] + "/a.zarr", search_m=search,
+                             window_m=window, patch_m=0.8)
+        few = most_mib()
+        clsas.mosaic_heights(*lines, grid(600), sys.argv[1] + "/b.zarr", search_m=search,
+                             window_m=window, patch_m=0.8)
+        many = most_mib()
+        clsas.heights(*lines, grid(900), search_m=search, window_m=window)
+        print(few, many, most_mib())
+    """
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", textwrap.dedent(script), tmp_path],
+        check=True, capture_output=True, text=True, cwd=Path(__file__).parent,
+    )  # fmt: skip
+    few, many, whole = map(float, done.stdout.split())
+    assert many < few + 60
+    assert whole > many + 120
 
 
 class TestBadInput:

@@ -242,13 +242,31 @@ def test_mistakes_are_named(scene, old, new, message):
     assert not scene.with_suffix("").exists()
 
 
-def test_a_relief_is_refused_before_any_step(scene):
-    relief = scene.parent / "relief.csv"
-    np.savetxt(relief, np.zeros((51, 51)), delimiter=",")
-    change(scene, "[grid]\n", '[grid]\nheight_file = "relief.csv"\n')
-    with pytest.raises(ValueError, match=r"heights \(.*\): grid must be a plane.*got a height map"):
+def test_a_vertical_grid_is_refused_before_any_step(scene):
+    start = scene.read_text().index("[image]")
+    grid = """[grid]
+    origin_m = [-0.5, 32.0, -0.5]
+    row_step_m = [0.0, 0.0, 0.02]
+    column_step_m = [0.02, 0.0, 0.0]
+    shape = [51, 51]
+    """
+    scene.write_text(grid + scene.read_text()[start:])
+    with pytest.raises(ValueError, match=r"heights \(.*\): grid must be a plane.*a vertical one"):
         clsas.process(scene)
     assert not scene.with_suffix("").exists()
+
+
+@pytest.mark.slow
+def test_the_search_starts_from_the_relief_of_the_scene(scene):
+    relief = 0.3 + np.linspace(0, 0.1, 51)[:, None] + np.zeros(51)
+    np.savetxt(scene.parent / "relief.csv", relief, delimiter=",")
+    change(scene, "[grid]\n", '[grid]\nz_m = -0.3\nheight_file = "relief.csv"\n')
+    change(scene, "search_m = [-0.5, 0.5]", "search_m = [-0.2, 0.2]")
+    found = clsas.process(scene, steps=("heights",)).heights
+    grid = read_scene(scene).grid
+    expected = clsas.heights(*flat_banks(), grid, search_m=(-0.2, 0.2), window_m=0.2)
+    np.testing.assert_array_equal(found.height_m, expected.height_m)
+    assert np.nanmedian(found.height_m) == pytest.approx(0.3, abs=0.01)
 
 
 @pytest.mark.parametrize("name", ["heights.h5", "heights.png"])
