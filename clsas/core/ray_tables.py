@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from clsas.core.rays import rays
 from clsas.core.sound_speed import SoundSpeed, check_reaches
+from clsas.core.thinning import thinned
 
 _DISTANCES, _HEIGHTS = 8, 4  # entries of the first attempt at a table; each further doubles both
 _ATTEMPTS = 4
@@ -60,7 +61,7 @@ class RayTable:
         """
         check_reaches(profile, np.array([antenna_z_m, *z_m]))
         low, high = z_m
-        kinks = [*profile.z_m, antenna_z_m]
+        kinks = [*thinned(profile).z_m, antenna_z_m]
         edges = np.unique([low, *(z for z in kinks if low < z < high), high])
         edges = edges if len(edges) > 1 else np.repeat(edges, 2)
         found = []

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core.sound_speed import SoundSpeed, check_reaches
+from clsas.core.thinning import thinned
 
 _STEPS = 60  # of Newton's method, at most; 3 to 8 are usual
 _CLOSE = 1e-14  # relative error of the distance at which a ray counts as found
@@ -88,12 +89,15 @@ def rays(
     A direct ray neither passes below the deeper of its ends, where the seabed is, nor meets the
     surface. Where no ray rises or falls all the way, one that first rises above both ends and turns
     is taken; if there are several, the first to arrive.
+
+    Profiles of more than 64 depths are thinned; see `clsas.core.thinning`.
     """
     distance, one, other = np.broadcast_arrays(
         *(np.asarray(each, np.float64) for each in (horizontal_m, one_z_m, other_z_m))
     )
     for z in (one, other):
         check_reaches(profile, z)
+    profile = thinned(profile)
     found = np.empty((5, distance.size))
     flat = [np.ravel(each) for each in (distance, one, other)]
     at_once = max(min(_AT_ONCE, _PIECES_AT_ONCE // len(profile.depth_m)), 1)

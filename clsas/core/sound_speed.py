@@ -289,10 +289,13 @@ def check_reaches(profile: SoundSpeed, z_m: ArrayLike, name: str = "z_m") -> Non
     slack = 1e-9 * max(1.0, abs(profile.surface_z_m), last)
     if depth[0] >= first - slack and depth[1] <= last + slack:
         return
+    # The deepest ocean is 11 km deep, so depths in kilometres end below 12.
+    is_km = last <= _DEEPEST_M / 1e3 and last < depth[1] <= 1e3 * last
+    advice = "; if its depths are kilometres, multiply them by 1000" if is_km else ""
     raise ValueError(
         f"sound_speed must include the depths of {name}, {depth[0]:g} to {depth[1]:g} m, got a "
         f"profile from {first:g} to {last:g} m (depth is surface_z_m = {profile.surface_z_m:g} m "
-        "minus z): extend the profile, or correct surface_z_m"
+        f"minus z): extend the profile, or correct surface_z_m{advice}"
     )
 
 

@@ -159,6 +159,8 @@ def test_a_profile_must_reach_antennas_and_pixels():
     shallow = over(profile=SoundSpeed([0, 20], [1500, 1500]))
     with pytest.raises(ValueError, match="depths of the grid's pixels, 25 to 25 m"):
         clsas.backproject(shallow, GRID)
+    with pytest.raises(ValueError, match="if its depths are kilometres, multiply them by 1000"):
+        over(profile=SoundSpeed([0, 0.2, 5.0], [1500, 1499, 1510]))
     with pytest.raises(TypeError, match="sound_speed must be of type SoundSpeed or NoneType"):
         replace(shallow, sound_speed=1500.0)
 
