@@ -147,15 +147,13 @@ def heights(
     if is_mosaic:
         keep_out("LINES.H5", first_file, "the store", output)
         # Lines are read in slices, unless they get the sound speed of the scene.
-        in_slices = described.sound_speed is None
-        sources = (
-            (first_file, second_file)
-            if in_slices
-            else _both_banks(first_file, second_file, described)
-        )
+        a: Path | clsas.RangeLines = first_file
+        b: Path | clsas.RangeLines | None = second_file
+        if described.sound_speed is not None:
+            a, b = _both_banks(first_file, second_file, described)
         with progress_bar("measuring heights") as progress:
             store = clsas.mosaic_heights(
-                *sources, grid, output, **request, patch_m=patch_m, progress=progress
+                a, b, grid, output, **request, patch_m=patch_m, progress=progress
             )
         _report_store(store, output, as_json)
         return

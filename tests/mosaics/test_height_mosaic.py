@@ -256,6 +256,7 @@ def filled_store(path, patch_shape, seed=0):
     layers = {name: random.uniform(1, 2, SMALL.shape).astype(np.float32) for name in LAYERS}
     for name in ("height_m", "sd_m"):
         layers[name][10:37, 20:50] = np.nan
+    layers["coherence"] -= 1
     store = clsas.Store.at(path)
     inputs = {
         "parts": [], "pixels": list(SMALL.shape), "grid": grid_digest(SMALL), "window_m": 0.5,
