@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from clsas.core.grid import Grid
 from clsas.interferometry.baseline import Lattice
@@ -47,30 +47,46 @@ def in_shadow(
     """
     height_m = grid.positions_m()[..., 2] + offset_m
     at_least_m = np.where(valid, height_m - _CERTAIN * sd_m, -np.inf)
+    at_most_m = np.where(valid, height_m + _CERTAIN * sd_m, np.inf)
     roof_m = minimum_filter(at_least_m, window.sides, mode="constant", cval=-np.inf)
-    at_most_m = height_m + _CERTAIN * sd_m
-    place = np.array(np.nonzero(valid & (at_most_m < roof_m.max())))
     _, *steps_m = grid.vectors_m
-    rows, columns = map(np.arange, grid.shape)
-    tangent = sights.over(rows, columns, offset_m)[1:, place[0], place[1]]  # pixels per rise
-    slope = np.linalg.norm(np.array(steps_m)[:, :2].T @ tangent, axis=0)
-    steep = slope > _LEAST_SLOPE
-    place, tangent, slope = place[:, steep], tangent[:, steep], slope[steep]
-    line_m = at_most_m[tuple(place)]
-    towards = -tangent / slope  # pixels per metre of ground
+    horizontal_m = np.array(steps_m)[:, :2].T
     stride_m = min(
         side * float(np.linalg.norm(step)) / 2
         for side, step in zip(window.sides, steps_m, strict=True)
     )
-    hidden = np.zeros(valid.shape, bool)
-    ground_m = 0.0
-    while place.size:
-        ground_m += stride_m
-        at = np.rint(place + ground_m * towards).astype(int)
-        within = (at >= 0).all(axis=0) & (at < np.array(grid.shape)[:, None]).all(axis=0)
-        left = within & (line_m + ground_m * slope < roof_m.max()) & ~hidden[tuple(place)]
-        place, towards, line_m, slope, at = (
-            each[..., left] for each in (place, towards, line_m, slope, at)
-        )
-        hidden[tuple(place)] = line_m + ground_m * slope < roof_m[tuple(at)]
-    return hidden
+
+    def hidden(
+        place: NDArray[np.int64], line_m: NDArray[np.float64], every: int, roof_m: NDArray
+    ) -> NDArray[np.bool_]:
+        """Return which places, in blocks of `every` x `every` pixels, lie below a roof."""
+        towards = -tangent[:, place[0] * every, place[1] * every]
+        slope = np.linalg.norm(horizontal_m @ towards, axis=0)
+        towards /= np.maximum(slope, _LEAST_SLOPE) * every
+        found = np.zeros(len(line_m), bool)
+        rays, ground_m = np.flatnonzero(slope > _LEAST_SLOPE), 0.0
+        while rays.size:
+            ground_m += stride_m
+            at = np.rint(place[:, rays] + ground_m * towards[:, rays]).astype(int)
+            raised_m = line_m[rays] + ground_m * slope[rays]
+            left = (at >= 0).all(axis=0) & (at < np.array(roof_m.shape)[:, None]).all(axis=0)
+            left &= raised_m < roof_m.max()
+            rays, at, raised_m = rays[left], at[:, left], raised_m[left]
+            found[rays] = below = raised_m < roof_m[tuple(at)]
+            rays = rays[~below]
+        return found
+
+    rows, columns = grid.shape
+    tangent = sights.over(np.arange(rows), np.arange(columns), offset_m)[1:]  # pixels per rise
+    # Most windows are not even hidden if their lowest pixel sees the highest roof around.
+    every = max(min(window.sides) // 2, 1)
+    some = slice(None, None, every)
+    lowest_m = minimum_filter(at_most_m, window.sides, mode="constant", cval=np.inf)[some, some]
+    highest_m = maximum_filter(roof_m, window.sides, mode="constant", cval=-np.inf)[some, some]
+    blocks = np.indices(lowest_m.shape).reshape(2, -1)
+    may_be = hidden(blocks, lowest_m.ravel(), every, highest_m).reshape(lowest_m.shape)
+    may_be = may_be.repeat(every, axis=0)[:rows].repeat(every, axis=1)[:, :columns]
+    place = np.array(np.nonzero(valid & may_be))
+    found = np.zeros(valid.shape, bool)
+    found[tuple(place)] = hidden(place, at_most_m[tuple(place)], 1, roof_m)
+    return found
