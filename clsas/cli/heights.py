@@ -146,15 +146,18 @@ def heights(
     if is_mosaic:
         keep_out("LINES.H5", first_file, "the store", output)
         # Lines are read in slices, unless they get the sound speed of the scene.
-        in_slices = described.sound_speed is None
-        sources = (
-            (first_file, second_file)
-            if in_slices
-            else _both_banks(first_file, second_file, described)
-        )
+        sources: tuple[Any, Any] = first_file, second_file
+        if described.sound_speed is not None:
+            sources = _both_banks(first_file, second_file, described)
         with progress_bar("measuring heights") as progress:
             store = clsas.mosaic_heights(
-                *sources, grid, output, **request, patch_m=patch_m, progress=progress
+                sources[0],
+                sources[1],
+                grid,
+                output,
+                **request,
+                patch_m=patch_m,
+                progress=progress,
             )
         _report_store(store, output, as_json)
         return
