@@ -195,7 +195,7 @@ class Store:
         inputs: dict[str, Any],
         grid: Grid,
         patch_shape: tuple[int, int],
-        window: tuple[int, int] | None = None,
+        window_shape: tuple[int, int] | None = None,
     ) -> None:
         """Create the store, or check that the one at the path was made with the same inputs.
 
@@ -207,7 +207,7 @@ class Store:
             Grid of the mosaic.
         patch_shape : (rows, columns)
             Number of pixels of a patch.
-        window : (rows, columns), optional
+        window_shape : (rows, columns), optional
             Pixels of the window behind each height, for a mosaic of heights.
 
         Raises
@@ -225,11 +225,11 @@ class Store:
         validate.instance("grid", grid, Grid)
         check_inputs(inputs, grid.shape)
         patch_shape = validate.sides("patch_shape", patch_shape)
-        if window is not None:
-            window = validate.sides("window", window)
+        if window_shape is not None:
+            window_shape = validate.sides("window_shape", window_shape)
         check_place(self.path)
         if not is_there(self.path):
-            arrays.create_store(self.path, inputs, grid, patch_shape, window)
+            arrays.create_store(self.path, inputs, grid, patch_shape, window_shape)
         stored = read_document(self.path)
         if found := differences(stored, inputs, patch_shape):
             ways = "choose another path or repeat the inputs"

@@ -105,9 +105,9 @@ def files(folder: Path) -> dict[str, Call]:
                 "inputs": inputs,
                 "grid": s.grid,
                 "patch_shape": tuple(patch_shape),
-                "window": None,
+                "window_shape": (3, 3),
             },
-            accepts={"inputs": ("dict",), "window": optional},
+            accepts={"inputs": ("dict",), "window_shape": optional},
         ),
         "Store.grow": Call(opened.grow, {"inputs": inputs}),
         "Store.read_level": Call(
