@@ -98,7 +98,8 @@ def apparent_beam(
     if not inside.any():
         return found, 0.0
     # Not relative to the weights of the sample: of few channels, all may lie near the edges.
-    sine = np.linspace(*np.clip(beam.limits, -1, 1), _SINES + 2)[1:-1]
+    low, high = np.clip(beam.limits, -1, 1)
+    sine = np.linspace(low, high, _SINES + 2)[1:-1]
     usual2 = np.mean(beam.weights(sine, at_antennas_m) ** 2)
     return found, float(np.mean((others - weights)[inside] ** 2) / usual2)
 

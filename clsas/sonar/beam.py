@@ -42,6 +42,9 @@ class BeamWindow:
 
         sin(theta) = t . (x - p)/|x - p|,   p = (tx + rx)/2.
 
+    If the lines have a profile of the sound speed, (x - p)/|x - p| is replaced by the direction in
+    which the ray to x leaves p.
+
     Parameters
     ----------
     width_deg : float
