@@ -168,8 +168,8 @@ def test_pictures_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
     content = (tmp_path / "image.png").read_bytes()
     assert content.startswith(b"\x89PNG")
 
-    def interrupted(path, **options):
-        path.write_bytes(b"half")
+    def interrupted(file, **options):
+        file.write(b"half")
         raise KeyboardInterrupt
 
     monkeypatch.setattr(figure, "savefig", interrupted)
