@@ -179,7 +179,8 @@ def _both_banks(
     if second_file is not None:
         first, second = (load_lines(each, None, described) for each in (first_file, second_file))
         return first, second
-    lines, both = load_banks(first_file, described)
+    remedy = "give the lines of the other bank as a second file"
+    lines, both = load_banks(first_file, described, remedy)
     return lines.bank(both[0]), lines.bank(both[1])
 
 

@@ -55,16 +55,17 @@ def load_lines(
 
 
 def load_banks(
-    path: Path, described: SceneFile | None = None
+    path: Path, described: SceneFile | None = None, remedy: str = ""
 ) -> tuple[clsas.RangeLines, tuple[int, int]]:
-    """Return the range lines of a file of several receiver banks, and the first two banks."""
+    """Return the range lines of a file of several receiver banks, and the first two banks.
+
+    If there is only one, the error ends with the `remedy`, if any.
+    """
     lines = load_lines(path, None, described)
     try:
         return lines, banks.first_two(lines.bank_numbers)
     except ValueError as error:
-        raise ValueError(
-            f"{path} {error}: give the lines of the other bank as a second file"
-        ) from None
+        raise ValueError(f"{path} {error}" + (f": {remedy}" if remedy else "")) from None
 
 
 def read_scene(path: Path) -> SceneFile:

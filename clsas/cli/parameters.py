@@ -135,7 +135,8 @@ class File(click.Path):
             if other is not param and isinstance(other.type, File):
                 taken = ctx.params.get(other.name)
                 if self.written or other.type.written:
-                    keep_apart(_option_name(other), taken, _option_name(param), path)
+                    for each in taken if isinstance(taken, tuple) else (taken,):
+                        keep_apart(_option_name(other), each, _option_name(param), path)
         return path
 
 

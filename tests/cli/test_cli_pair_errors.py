@@ -74,7 +74,16 @@ def test_mistakes_are_reported(files, tmp_path):
     same = run("pair-errors", *given, *other, "--unknown", "phase", code=1)
     assert "phase is not observable from these heights" in same.stderr
     one = run("pair-errors", files / "low.h5", *given[1:], "--known-height-m", 0, code=1)
-    assert "must have at least 2 receiver banks (bank_numbers), got 1" in one.stderr
+    assert "must have at least 2 receiver banks (bank_numbers), got 1\n" in one.stderr
     no = run("pair-errors", given[0], given[0], *given[2:], "--known-height-m", 0, code=1)
     assert "must hold Heights (clsas heights makes them), got RangeLines" in no.stderr
     assert not (tmp_path / "corrected.h5").exists()
+
+
+def test_another_track_may_be_given_before_the_output(files, tmp_path):
+    given = files / "lines.h5", files / "heights.h5", "--other", files / "lines.h5"
+    other = *given, files / "heights.h5", "--unknown", "phase"
+    same = run("pair-errors", *other, "-o", tmp_path / "corrected.h5", code=1)
+    assert "phase is not observable from these heights" in same.stderr
+    replaced = run("pair-errors", *other, "-o", files / "heights.h5", code=2)
+    assert "must be two files" in replaced.stderr
