@@ -38,7 +38,7 @@ class ApparentBeam(BeamWindow):
     def limits_rad(self) -> tuple[float, float]:
         """Aspect angles in homogeneous water at which the beam begins and ends, radians."""
         low, high = (math.sin(each) / self.ratio for each in super().limits_rad)
-        return math.asin(max(low, -1.0)), math.asin(min(high, 1.0))
+        return math.asin(min(max(low, -1.0), 1.0)), math.asin(min(max(high, -1.0), 1.0))
 
     def _from_axis(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return super()._from_axis(self.ratio * q)
@@ -98,7 +98,8 @@ def apparent_beam(
     if not inside.any():
         return found, 0.0
     # Not relative to the weights of the sample: of few channels, all may lie near the edges.
-    sine = np.linspace(*np.clip(beam.limits, -1, 1), _SINES + 2)[1:-1]
+    low, high = np.clip(beam.limits, -1, 1)
+    sine = np.linspace(low, high, _SINES + 2)[1:-1]
     usual2 = np.mean(beam.weights(sine, at_antennas_m) ** 2)
     return found, float(np.mean((others - weights)[inside] ** 2) / usual2)
 
