@@ -50,7 +50,7 @@ def thinned(profile: SoundSpeed) -> SoundSpeed:
         fitted, error = _fitted(depth, speed, kept)
         wrong = np.abs(error) > allowed
         if not wrong.any():
-            return SoundSpeed(depth[kept], fitted, profile.surface_z_m)
+            return _profile(depth[kept], fitted, profile)
         pieces = np.unique(np.searchsorted(kept, np.flatnonzero(wrong)).clip(1) - 1)
         middles = (kept[pieces] + kept[pieces + 1]) // 2
         more = np.union1d(kept, middles)
@@ -58,6 +58,19 @@ def thinned(profile: SoundSpeed) -> SoundSpeed:
             more = np.union1d(kept, (kept[:-1] + kept[1:]) // 2)
         kept = more
     return profile
+
+
+def _profile(
+    depth: NDArray[np.float64], speed: NDArray[np.float64], given: SoundSpeed
+) -> SoundSpeed:
+    """Return the thinned profile, or the given one if fitted speeds are not those of water.
+
+    At the ends of a steep layer they overshoot, and may change by more than a profile allows.
+    """
+    try:
+        return SoundSpeed(depth, speed, given.surface_z_m)
+    except ValueError:
+        return given
 
 
 def _fitted(

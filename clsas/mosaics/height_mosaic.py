@@ -72,7 +72,8 @@ def mosaic_heights(
     """Measure the heights of a seabed of any size patch by patch, and return their store.
 
     The store keeps every patch as it is finished. After an interruption, the same call continues
-    with the others.
+    with the others. If files have been added to the survey since, finished patches to which their
+    channels contribute are measured again.
 
     Parameters
     ----------
@@ -132,7 +133,9 @@ def mosaic_heights(
     the cycles of the phase, and with all that lies at the same ranges within the search. So heights
     hardly depend on the division into patches: at most as much as they still change in the last
     pass, about 0.3 standard deviations. The number of independent samples is measured in every
-    patch, and with it the standard deviation and the threshold of the coherence.
+    patch, and with it the standard deviation and the threshold of the coherence. Shadows are an
+    exception: they are found from the relief of a patch and its margin. Where a shadow is longer
+    and reaches another patch, pixels in it may count as valid, as far as they are coherent.
 
     Patches without lines, or whose geometry shows no heights, such as one below the track, contain
     NaN. `Record.flags` gives the reason.
@@ -185,7 +188,7 @@ def mosaic_heights(
     patch_shape = _patch_shape(grid, patch_m)
     inputs = _inputs(banks, grid, search, tolerance_db, least_coherence, beam)
     decided = _decided(opened)
-    if decided is None or window_m is not None:
+    if decided is None or window_m not in (None, decided["window_m"]):
         decided = _decide(
             banks, grid, search, window_m, tolerance_db, least_coherence, beam, devices[0]
         )
@@ -196,13 +199,18 @@ def mosaic_heights(
         banks, grid, search, tolerance_db, least_coherence, beam, decided["window_m"],
         tuple(decided["margin"]), opened.path,
     )  # fmt: skip
-    run = Run(Layout(grid, patch_shape), job, inputs, banks[0].visibility, devices, None, None)
-    finished = opened.undamaged_records()
+    layout = Layout(grid, patch_shape)
+    run = Run(layout, job, inputs, banks[0].visibility, devices, None, None)
+    finished = {
+        index: record
+        for index, record in opened.undamaged_records().items()
+        if job.is_current(record, layout.window(index))
+    }
     report = progress or (lambda done, total: None)
-    report(len(finished), len(run.layout))
+    report(len(finished), len(layout))
     with closing(form_patches(run, finished)) as forming:
         for _ in forming:
-            report(len(finished), len(run.layout))
+            report(len(finished), len(layout))
     return opened
 
 

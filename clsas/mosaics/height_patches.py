@@ -96,6 +96,14 @@ class HeightsJob:
         if (store := self.opened_store()) is not None:
             store.complete_levels()
 
+    def is_current(self, record: Record, window: PatchWindow) -> bool:
+        """Return whether no channel that was added since a patch was measured contributes to it."""
+        if record.survey_channels >= len(self.banks[0].members):
+            return True
+        wide, _ = self._with_margin(window)
+        visible, _ = _swept(self.banks, wide, self.search_m, self.beam)
+        return not visible[record.survey_channels :].any()
+
     def form(self, window: PatchWindow) -> tuple[Record, Image | None]:
         """Measure a patch and write it to the store.
 
@@ -166,14 +174,7 @@ def seen(
         "device": device.info.label,
         "driver": device.info.driver,
     }
-    visible = _visible(banks, _box(grid, search_m))
-    if visible.any():
-        some = [bank.geometry.select(visible) for bank in banks]
-        baseline = Baseline.of(some[0], some[1], _beam_of(banks[0], beam, visible), 1.0)
-        every = [slice(None, None, max((n - 1) // _PLACES, 1)) for n in grid.shape]
-        reached = Curves.over(baseline, grid.window(*every), np.array(search_m)).grid
-        volume = _box(reached, search_m)
-        visible = _visible(banks, volume)
+    visible, volume = _swept(banks, grid, search_m, beam)
     known["channels"] = int(np.count_nonzero(visible))
     if not visible.any():
         return Seen(None, known)
@@ -194,6 +195,25 @@ def seen(
         first, second = first.select(~missing), second.select(~missing)
     pair = Pair(first, second, tolerance_db, None, _beam_of(banks[0], beam, chosen), device)
     return Seen(pair, known)
+
+
+def _swept(
+    banks: tuple[Bank, Bank],
+    grid: Grid,
+    search_m: tuple[float, float],
+    beam: BeamWindow | None,
+) -> tuple[NDArray[np.bool_], Grid]:
+    """Return the channels from which heights of a grid follow, and the volume that they image."""
+    volume = _box(grid, search_m)
+    visible = _visible(banks, volume)
+    if visible.any():
+        some = [bank.geometry.select(visible) for bank in banks]
+        baseline = Baseline.of(some[0], some[1], _beam_of(banks[0], beam, visible), 1.0)
+        every = [slice(None, None, max((n - 1) // _PLACES, 1)) for n in grid.shape]
+        reached = Curves.over(baseline, grid.window(*every), np.array(search_m)).grid
+        volume = _box(reached, search_m)
+        visible = _visible(banks, volume)
+    return visible, volume
 
 
 def _visible(banks: tuple[Bank, Bank], volume: Grid) -> NDArray[np.bool_]:

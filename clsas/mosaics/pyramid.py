@@ -16,12 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsas.mosaics.levels import IN_DB, PixelArray
+
+Real = TypeVar("Real", np.float32, np.float64)
 
 _BAND = 256  # rows that are reduced at once: a plain choice, which keeps copies small
 
@@ -149,7 +151,7 @@ def _mean_correlation(count: int, window: int) -> float:
     )
 
 
-def mean_of_four(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def mean_of_four(values: NDArray[Real]) -> NDArray[Real]:
     """Return means of 2 x 2 pixels, of those that are not NaN; NaN if all are."""
     known = ~np.isnan(values)
     sums, counts = (
@@ -158,7 +160,7 @@ def mean_of_four(values: NDArray[np.float32]) -> NDArray[np.float32]:
     )
     mean = np.full(sums.shape, np.nan)
     np.divide(sums, counts, out=mean, where=counts > 0)
-    return mean.astype(np.float32)
+    return mean.astype(values.dtype)
 
 
 def coarser(level: Level, rows: NDArray[np.float64], columns: NDArray[np.float64]) -> Level:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from clsas.mosaics.store import Store
 
 _READ = 2048  # pixels along a side that are read at once; a plain choice
-_POWER = "power"
+_AMPLITUDE = "amplitude"
 _BYTES = 100  # per pixel of `Heights`: eight numbers and their copies
 
 
@@ -72,7 +72,7 @@ def overview_of(store: Store, most: int, rows: slice, columns: slice) -> Heights
         and all(n % level == 0 or n == most for n, most in zip(last, grid.shape, strict=True))
     )
     shape = level_shape(part.shape, factor)
-    found = {name: np.empty(shape, np.float32) for name in (*LAYERS, _POWER)}
+    found = {name: np.empty(shape, np.float32) for name in (*LAYERS, _AMPLITUDE)}
     side = max(_READ * finest // factor, 1)
     for top, left in itertools.product(range(0, shape[0], side), range(0, shape[1], side)):
         place = [
@@ -85,22 +85,22 @@ def overview_of(store: Store, most: int, rows: slice, columns: slice) -> Heights
         block = _reduced(store, finest, factor, place[0], place[1])
         for name, values in block.items():
             found[name][top : top + side, left : left + side] = values
-    amplitude = np.sqrt(found.pop(_POWER)).astype(np.complex64)
+    amplitude = found.pop(_AMPLITUDE).astype(np.complex64)
     return _heights(_coarser(part, factor, shape), amplitude, found, _window_m(store))
 
 
 def _reduced(
     store: Store, finest: int, factor: int, rows: slice, columns: slice
 ) -> dict[str, NDArray[np.float32]]:
-    """Return layers and power at a factor, from pixels of the level with the factor `finest`."""
+    """Return layers and amplitude at a factor, from those of the level with the factor `finest`."""
     layers = {name: store.read_layer(name, rows, columns, factor=finest) for name in LAYERS}
     read = store.read if finest == 1 else partial(store.read_level, finest)
-    power = np.square(np.abs(read(rows, columns)))
+    power = np.square(np.abs(read(rows, columns)), dtype=np.float64)
     window = read_document(store.path)[WINDOW]
     while finest < factor:
         finest *= 2
         layers, power = coarser_layers(layers, finest, window), mean_of_four(power)
-    return layers | {_POWER: power}
+    return layers | {_AMPLITUDE: np.sqrt(power).astype(np.float32)}
 
 
 def _heights(

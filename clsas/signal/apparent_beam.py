@@ -38,7 +38,7 @@ class ApparentBeam(BeamWindow):
     def limits_rad(self) -> tuple[float, float]:
         """Aspect angles in homogeneous water at which the beam begins and ends, radians."""
         low, high = (math.sin(each) / self.ratio for each in super().limits_rad)
-        return math.asin(max(low, -1.0)), math.asin(min(high, 1.0))
+        return math.asin(min(max(low, -1.0), 1.0)), math.asin(min(max(high, -1.0), 1.0))
 
     def _from_axis(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return super()._from_axis(self.ratio * q)

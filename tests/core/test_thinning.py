@@ -42,6 +42,15 @@ def test_a_profile_that_needs_its_depths_keeps_them():
     assert thinned(profile) is profile
 
 
+@pytest.mark.parametrize("depths", [300, 1000])
+def test_steep_profiles_are_not_refused(depths):
+    """Fitted speeds overshoot at kinks, by more than a profile may change."""
+    depth = np.linspace(0, 3, depths)
+    profile = SoundSpeed(depth, 1440 + np.clip(59 * (depth - 1.51), 0, 40))
+    assert thinned(profile) is profile
+    assert np.isfinite(rays(profile, 5.0, -0.5, -2.5).time_s)
+
+
 def test_the_time_hardly_grows_with_the_depths():
     found = [len(thinned(cast(0.002, np.linspace(0, 60, n))).depth_m) for n in (1000, 5000)]
     assert max(found) < 200

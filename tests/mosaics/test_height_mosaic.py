@@ -116,8 +116,8 @@ def test_a_store_has_what_heights_have(tmp_path):
     assert not record.flags
 
 
-def test_files_and_folders_are_read_in_slices(tmp_path):
-    first, second = flat_banks()
+def halves_of(first, second):
+    """Lines of both banks, pings after each other, in two halves."""
     both = replace(
         first,
         samples=np.concatenate([first.samples, second.samples]),
@@ -127,12 +127,15 @@ def test_files_and_folders_are_read_in_slices(tmp_path):
             for name in ("first_range_m", "tx_m", "rx_m")
         },
     )
-    # Pings after each other, each with both banks, in a folder of two files.
     order = np.arange(2 * first.channels).reshape(2, -1).T.reshape(-1)
-    half = first.channels
+    return [both.select(some) for some in np.split(order, 2)]
+
+
+def test_files_and_folders_are_read_in_slices(tmp_path):
+    first, second = flat_banks()
     (tmp_path / "both").mkdir()
-    for name, some in (("a", order[:half]), ("b", order[half:])):
-        clsas.save(tmp_path / "both" / f"{name}.h5", both.select(some))
+    for name, half in zip("ab", halves_of(first, second), strict=True):
+        clsas.save(tmp_path / "both" / f"{name}.h5", half)
     for name, lines in (("first", first), ("second", second)):
         clsas.save(tmp_path / f"{name}.h5", lines)
     stores = [
@@ -150,6 +153,25 @@ def test_files_and_folders_are_read_in_slices(tmp_path):
         found = store.heights()
         assert np.array_equal(found.height_m, expected.height_m, equal_nan=True)
         assert np.array_equal(found.image.pixels, expected.image.pixels)
+
+
+def test_patches_are_measured_again_if_files_were_added(tmp_path):
+    early, late = halves_of(*flat_banks())
+    (tmp_path / "lines").mkdir()
+    clsas.save(tmp_path / "lines" / "a.h5", early)
+    request = REQUEST | {"patch_m": 5.0}
+    store = clsas.mosaic_heights(tmp_path / "lines", None, GRID, tmp_path / "a.zarr", **request)
+    before = store.records()
+    clsas.save(tmp_path / "lines" / "b.h5", late)
+    clsas.mosaic_heights(tmp_path / "lines", None, GRID, store.path, **request)
+    after = store.records()
+    assert before.keys() == after.keys() == {(0, 0)}
+    for index in before:
+        assert after[index].survey_channels == 2 * before[index].survey_channels
+        assert after[index].channels > 1.5 * before[index].channels
+    files = files_of(store.path)
+    clsas.mosaic_heights(tmp_path / "lines", None, GRID, store.path, **request)
+    assert files_of(store.path) == files
 
 
 def test_the_search_may_start_from_a_relief(tmp_path):
@@ -175,6 +197,15 @@ def test_the_default_window_is_kept(tmp_path):
     assert files_of(again.path) == before
     with pytest.raises(ValueError, match=r"window_m is 0.* in the store, 0\.2 given"):
         clsas.mosaic_heights(*flat_banks(), GRID, store.path, **request, window_m=0.2)
+
+
+def test_a_given_window_is_not_decided_on_again(tmp_path, monkeypatch):
+    """Another device, or more lines, may lead to another margin."""
+    store = clsas.mosaic_heights(*flat_banks(), GRID, tmp_path / "a.zarr", **REQUEST)
+    before = files_of(store.path)
+    monkeypatch.setattr("clsas.mosaics.height_mosaic._MARGIN_WINDOWS", 3.0)
+    clsas.mosaic_heights(*flat_banks(), GRID, store.path, **REQUEST)
+    assert files_of(store.path) == before
 
 
 @pytest.mark.slow
@@ -313,6 +344,21 @@ def test_levels_of_layers(tmp_path, patch_shape):
     expected = moved.overview_heights(20, slice(0, 79), slice(0, 66))
     np.testing.assert_allclose(part.height_m[:-1], expected.height_m[:-1], rtol=1e-6)
     np.testing.assert_allclose(part.sd_m[:-1], expected.sd_m[:-1], rtol=1e-6)
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("amplitude", [1e-30, 1e30])
+def test_overviews_have_amplitudes_of_any_size(tmp_path, amplitude):
+    store, layers = filled_store(tmp_path / "a.zarr", OF_PATCHES)
+    for _, row, column, rows, columns in patches_of(OF_PATCHES):
+        part = {name: values[rows, columns] for name, values in layers.items()}
+        pixels = np.full(part["height_m"].shape, amplitude, np.complex64)
+        record = Record(channels=1, survey_channels=1, has_pixels=True)
+        store.write(row, column, rows, columns, pixels, record, part)
+    store.complete_levels()
+    for rows in (slice(None), slice(1, 80)):
+        pixels = store.overview_heights(20, rows).image.pixels
+        np.testing.assert_allclose(np.abs(pixels), np.float32(amplitude), rtol=1e-6)
 
 
 def test_deviations_of_levels_are_those_of_means():

@@ -5,6 +5,7 @@ import pytest
 from cases import along_x, lines_over
 
 from clsas import BeamWindow, Grid, SoundSpeed
+from clsas.signal.apparent_beam import ApparentBeam
 from clsas.signal.refraction import homogeneous
 
 GRID = Grid.plane((-2, 2, 33), (58, 63, 41), -25.0)
@@ -38,6 +39,14 @@ def test_a_beam_of_all_directions_stays_one():
     lines = lines_over(GRID, along_x(150, 0.2, z=-6.0), None, carrier_hz=100e3, step_m=0.02)
     beam = BeamWindow(20)
     assert homogeneous(lines, GRID, beam, -50).beam is beam
+
+
+@pytest.mark.parametrize("squint_deg", [87, -87])
+def test_a_beam_that_no_ray_reaches_is_empty(squint_deg):
+    found = ApparentBeam(2, squint_deg=squint_deg, ratio=0.98)
+    sine = np.linspace(-1, 1, 101)
+    assert not found.weights(sine, 0.015).any()
+    assert found.limits_rad[0] == found.limits_rad[1]
 
 
 @pytest.mark.parametrize("heave_m", [0.0, 0.2, 0.8])
