@@ -121,7 +121,7 @@ def heights(
 ) -> None:
     """Measure the heights of a seabed from two receiver banks.
 
-    LINES.H5 holds the range lines of both banks, or those of one if B.H5 holds those of the other.
+    LINES.H5 has the range lines of both banks, or those of one if B.H5 has those of the other.
     Of more than two banks in one file, the first two are taken; clsas convert --bank splits a file.
     The grid, from --scene or from --x, --y and --z, is a plane, or a height map from which the
     search starts. Heights are above the plane, and valid where the banks are coherent, and not in

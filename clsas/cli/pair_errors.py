@@ -87,7 +87,7 @@ def pair_errors(
 ) -> None:
     """Correct phase, delay and roll of two receiver banks.
 
-    HEIGHTS.H5 holds the heights that clsas heights measured from both banks of LINES.H5. They are
+    HEIGHTS.H5 has the heights that clsas heights measured from both banks of LINES.H5. They are
     compared with --known-height-m, with control points, or with heights from another track. Then
     measure the heights again.
 

@@ -251,7 +251,7 @@ def measured(
     least_coherence: float,
     progress: Callable[[int, int], None] | None,
 ) -> tuple[Heights, Refined]:
-    """Return heights, and how they were refined, without warnings.
+    """Return heights, and how they were refined, without a warning if that did not succeed.
 
     Raises
     ------

@@ -91,8 +91,8 @@ class PairErrors:
                 )
                 yield (
                     "roll is not observable here, because it changes the phase almost alike at all "
-                    f"places: the {self.unknowns[0]} alone was estimated, and 1 mrad of roll adds "
-                    f"{costs} to heights"
+                    f"places: the estimate is of {' and '.join(self.unknowns)} alone, and 1 mrad "
+                    f"of roll adds {costs} to heights"
                 )
             elif self.unknowns == ("roll",):
                 yield (

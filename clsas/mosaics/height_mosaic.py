@@ -120,7 +120,9 @@ def mosaic_heights(
     Warns
     -----
     ClsasWarning
-        If a store is damaged, whose damaged patches are then measured again.
+        If a store is damaged, whose damaged patches are then measured again; or if, in a patch, the
+        banks agree best at an end of the search, or it is too small to tell heights of ambiguity
+        apart, as for `heights`.
 
     See Also
     --------

@@ -316,6 +316,11 @@ def test_results_describe_themselves():
     assert "3 mm in heights at 17 m" in errors.describe()
     assert errors.figures["sd"][0] == pytest.approx(0.02)
     assert errors.figures["unknowns"] == ["phase", "delay", "roll"]
+    both = replace(
+        errors, unknowns=("phase", "delay"), values=errors.values[:2],
+        covariance=errors.covariance[:2, :2], held=("roll",),
+    )  # fmt: skip
+    assert "the estimate is of phase and delay alone" in both.describe()
 
 
 def result(unknowns, values):
