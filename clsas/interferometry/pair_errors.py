@@ -12,7 +12,7 @@ from clsas.core import validate
 from clsas.core.lines import RangeLines
 from clsas.core.wavelengths import cycles_per_m_at
 from clsas.interferometry.checks import check_pair
-from clsas.interferometry.comparisons import at_pixels, at_points, in_overlap
+from clsas.interferometry.comparisons import Comparison, at_pixels, at_points, in_overlap
 from clsas.interferometry.displaced import Displaced
 from clsas.interferometry.estimate import MOST_SD_RAD, Estimate, estimated
 from clsas.interferometry.misregistration import ConstantPhase, constant_phase
@@ -25,6 +25,8 @@ from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow
 
 _MRAD = 1e-3
+# Deviations by which heights may differ from expected ones without a warning; dunes reach 2.
+_MOST_MISFIT = 5.0
 _UNLIKE = 5.0  # ratio of sensitivities that no slope of the seabed explains
 
 
@@ -90,7 +92,8 @@ def pair_errors(
     Warns
     -----
     ClsasWarning
-        If an error is not observable. It is then in `PairErrors.held`.
+        If an error is not observable, which is then in `PairErrors.held`; if control points lie
+        where no height is valid; or if heights remain that differ by more than 5 deviations.
 
     See Also
     --------
@@ -182,6 +185,7 @@ def pair_errors(
         comparison = in_overlap(*surfaces)
     elif points_m is not None:
         comparison = at_points(surfaces[0], points_m, known_sd_m)
+        _warn_of_points(comparison)
     else:
         assert known_height_m is not None
         comparison = at_pixels(surfaces[0], known_height_m, known_sd_m)
@@ -194,7 +198,23 @@ def pair_errors(
     errors = _errors(estimate, unknowns, constant, _middle_hz(a), surfaces[0])
     for sentence in errors.held_in_words():
         validate.warn(sentence)
+    if errors.misfit > _MOST_MISFIT:
+        validate.warn(
+            f"heights still differ from those expected by {errors.residual_m:.2g} m rms, "
+            f"{errors.misfit:.0f} of their standard deviations: {names[0]} may not be that of this "
+            "seabed, and the estimates may be wrong"
+        )
     return errors
+
+
+def _warn_of_points(comparison: Comparison) -> None:
+    """Warn of control points that are not used, unless none is, which is refused later."""
+    usable = comparison.equations_at(np.zeros(2)).usable
+    if usable.any() and not usable.all():
+        validate.warn(
+            f"{np.count_nonzero(~usable)} of {usable.size} points_m lie where no height is valid, "
+            "and are left out"
+        )
 
 
 def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:

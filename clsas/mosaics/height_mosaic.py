@@ -196,6 +196,11 @@ def mosaic_heights(
         )
     inputs |= decided
     window = Window.of(grid, decided["window_m"])
+    if patch_m is not None and patch_m < decided["window_m"]:
+        raise ValueError(
+            f"patch_m must be at least the side of a window, {decided['window_m']:.3g} m, got "
+            f"{patch_m:g} m"
+        )
     opened.begin(inputs, grid, patch_shape, window.sides)
     job = HeightsJob(
         banks, grid, search, tolerance_db, least_coherence, beam, decided["window_m"],

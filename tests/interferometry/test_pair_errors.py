@@ -210,6 +210,24 @@ def test_a_single_window_shows_no_slope_over_the_band():
     assert constant_phase(pair, replace(found, mask=mask)).sd_rad == np.inf
 
 
+def test_heights_of_another_seabed_warn():
+    first, second, found = narrow()
+    row, _ = np.indices(reliefs.GRID.shape)
+    other_m = 0.1 * np.sin(row / 6)
+    with pytest.warns(ClsasWarning, match=r"still differ from those expected by 0\.0\d* m rms, "):
+        errors = clsas.pair_errors(
+            first, second, found, known_height_m=other_m, unknowns=("phase",)
+        )
+    assert errors.misfit > 5
+
+
+def test_points_without_a_height_are_reported():
+    first, second, found = narrow()
+    points_m = [[0, 32, 0], [0, 200, 0], [0.2, 31.5, 0]]
+    with pytest.warns(ClsasWarning, match="1 of 3 points_m lie where no height is valid"):
+        clsas.pair_errors(first, second, found, points_m=points_m, unknowns=("phase",))
+
+
 def test_control_points_and_heights_between_nan():
     first, second, found = narrow()
     x_m, y_m = (each.ravel() for each in np.meshgrid([-0.5, 0.0, 0.5], [31.2, 32.0, 32.8]))

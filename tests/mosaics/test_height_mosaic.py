@@ -475,6 +475,7 @@ class TestBadInput:
     def test_options(self, tmp_path):
         self.refused(tmp_path, "search_m must be .lowest, highest.", search_m=(1, 0))
         self.refused(tmp_path, "patch_m must be finite and > 0", patch_m=-1)
+        self.refused(tmp_path, "patch_m must be at least the side of a window", patch_m=0.05)
         self.refused(tmp_path, "window_m must be", window_m=9.0)
         self.refused(tmp_path, "tolerance_db must be", tolerance_db=3)
         self.refused(tmp_path, "least_coherence must be", least_coherence=2)
