@@ -329,6 +329,7 @@ def navigation(folder: Path) -> dict[str, Call]:
         "names": {"a": ("b", "found"), "b": ("a", "found"), "found": ("mask",)},
         "accepts": {"beam": ("None", "a BeamWindow")},
     }
+    errors = clsas.pair_errors(lower, upper, found, known_height_m=0.0, unknowns=("phase",))
     return {
         "micronavigate": Call(
             clsas.micronavigate,
@@ -408,7 +409,7 @@ def navigation(folder: Path) -> dict[str, Call]:
         "Heights": Call(clsas.Heights, fields(found), may_be_nan=True),
         "pair_errors": Call(
             clsas.pair_errors,
-            pair | {"known_height_m": 0.0},
+            pair | {"known_height_m": 0.0, "points_m": None, "other": None},
             **of_pair,
         ),
         "pair_errors:points": Call(
@@ -417,18 +418,10 @@ def navigation(folder: Path) -> dict[str, Call]:
             **of_pair,
         ),
         "PairErrors.corrected": Call(
-            clsas.pair_errors(
-                lower, upper, found, known_height_m=0.0, unknowns=("phase",)
-            ).corrected,
-            {"a": lower, "b": upper},
-            names={"a": ("b",), "b": ("a",)},
+            errors.corrected, {"a": lower, "b": upper}, names={"a": ("b",), "b": ("a",)}
         ),
-        "PairErrors.describe": Call(
-            clsas.pair_errors(
-                lower, upper, found, known_height_m=0.0, unknowns=("phase",)
-            ).describe,
-            {},
-        ),
+        "PairErrors.describe": Call(errors.describe, {}),
+        "PairErrors.held_in_words": Call(errors.held_in_words, {}),
         "autofocus": Call(
             clsas.autofocus,
             {
