@@ -15,6 +15,7 @@ from clsas.interferometry.baseline import Baseline
 from clsas.interferometry.errors import UnmeasurableError
 
 _APART = 0.1  # relative change of the distance between banks that waves of the track may cause
+_MOST_SEARCH_M = 1e5  # from the grid; far above any relief, a plain choice
 _MOST_CYCLES = 1e3  # of phase within the search; more need more planes than anyone has time for
 _POINTS = 5  # along either side of a grid, whose geometry is checked; arbitrary
 _LEAST_PHASE_RAD = 0.1  # over the whole search; less is not above the noise of usual coherences
@@ -25,6 +26,11 @@ def checked_search(search_m: ArrayLike) -> tuple[float, float]:
     low_m, high_m = map(float, validate.array("search_m", search_m, np.float64, (2,)))
     if not low_m < high_m:
         raise ValueError(f"search_m must be (lowest, highest) in m, got ({low_m:g}, {high_m:g})")
+    if max(-low_m, high_m) > _MOST_SEARCH_M:
+        raise ValueError(
+            f"search_m must lie within {_MOST_SEARCH_M:g} m of the grid, got ({low_m:g}, "
+            f"{high_m:g})"
+        )
     return low_m, high_m
 
 

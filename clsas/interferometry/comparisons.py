@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,6 +58,8 @@ def at_pixels(surface: Displaced, known_height_m: ArrayLike, known_sd_m: float) 
 
 def _checked_heights(known_height_m: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
     """Return known heights as float64 [rows, columns]; NaN is allowed."""
+    if isinstance(known_height_m, Real):
+        known_height_m = validate.number("known_height_m", known_height_m, "m")
     given = np.asanyarray(known_height_m)
     if np.ma.isMaskedArray(given) or given.dtype.kind not in "iuf":
         raise TypeError(

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,8 +29,6 @@ from clsas.interferometry.checks import (
     check_geometry,
     check_grid,
     check_pair,
-    checked_coherence,
-    checked_search,
 )
 from clsas.interferometry.coherence import (
     Window,
@@ -37,15 +36,14 @@ from clsas.interferometry.coherence import (
     effective_looks,
     noise_coherence,
 )
-from clsas.interferometry.interferogram import window_within
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.refinement import PASSES, Refined, filled, refine
+from clsas.interferometry.request import Request
 from clsas.interferometry.result import Heights
 from clsas.interferometry.shadows import in_shadow
 from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, Sweep, sweep
 from clsas.interferometry.task import Task
 from clsas.opencl.device import Device, open_device
-from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
 from clsas.signal.spectrum import measure_spectrum
 from clsas.sonar.beam import BeamWindow
 
@@ -215,41 +213,23 @@ def heights(
     validate.instance("grid", grid, Grid)
     check_grid(grid)
     grid = placed(b, placed(a, grid))
-    search = checked_search(search_m)
-    tolerance_db = validate.number(
-        "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
-    )
-    least_coherence = checked_coherence(least_coherence)
-    validate.instance("beam", beam, BeamWindow, type(None))
+    request = Request.checked(grid, search_m, window_m, tolerance_db, least_coherence, beam)
     validate.progress(progress)
-    if window_m is not None:
-        window_m = validate.positive("window_m", window_m, "m")
-        window_within(grid, window_m)
-    pair = Pair(a, b, tolerance_db, None, beam, open_device(device))
-    return measure(pair, grid, search, window_m, least_coherence, progress)
+    pair = Pair(a, b, request.tolerance_db, None, beam, open_device(device))
+    return measure(pair, grid, request, progress)
 
 
 def measure(
-    pair: Pair,
-    grid: Grid,
-    search_m: tuple[float, float],
-    window_m: float | None,
-    least_coherence: float,
-    progress: Callable[[int, int], None] | None,
+    pair: Pair, grid: Grid, request: Request, progress: Callable[[int, int], None] | None
 ) -> Heights:
-    """Return the heights that a pair of banks shows; parameters are those of `heights`."""
-    found, refined = measured(pair, grid, search_m, window_m, least_coherence, progress)
+    """Return the heights that a pair of banks shows."""
+    found, refined = measured(pair, grid, request, progress)
     _warn(refined)
     return found
 
 
 def measured(
-    pair: Pair,
-    grid: Grid,
-    search_m: tuple[float, float],
-    window_m: float | None,
-    least_coherence: float,
-    progress: Callable[[int, int], None] | None,
+    pair: Pair, grid: Grid, request: Request, progress: Callable[[int, int], None] | None
 ) -> tuple[Heights, Refined]:
     """Return heights, and how they were refined, without a warning if that did not succeed.
 
@@ -258,20 +238,12 @@ def measured(
     UnmeasurableError
         If the geometry or the images do not show heights.
     """
-    # Rays are exact on the relief that is refined. A sweep needs no more than nearly right ones.
-    straight = pair.straightened(grid)
-    task = _task(straight, grid, search_m, least_coherence)
-    images = straight.images(task.level)
-    window_m = _default_window_m(images, grid) if window_m is None else window_m
-    window = Window.of(grid, window_m)
-    looks = effective_looks(images, window)
-    check_looks(window_m, looks)
-
-    heights_m = _sweep_heights(search_m, task.ambiguity_m)
+    task, images, window_m, window, looks = _begun(pair, grid, request)
+    heights_m = _sweep_heights(task.search_m, task.ambiguity_m)
     total = len(heights_m) + PASSES
     report = progress or (lambda done, total: None)
     relief = _first_relief(task, images, window_m, heights_m, lambda done: report(done, total))
-    sights = sight_lattice(task.baseline, grid, search_m)
+    sights = sight_lattice(task.baseline, grid, task.search_m)
     refined = refine(
         replace(task, pair=pair),
         relief,
@@ -295,30 +267,44 @@ def measured(
     return found, refined
 
 
-def windows(
-    pair: Pair,
-    grid: Grid,
-    search_m: tuple[float, float],
-    window_m: float | None,
-    least_coherence: float,
-) -> tuple[float, Window, Window]:
+def windows(pair: Pair, grid: Grid, request: Request) -> tuple[float, Window, Window]:
     """Return the windows with which heights of a grid, or of one like it, are measured.
 
     Returns
     -------
     window_m : float
-        The given one, or the default.
+        The requested one, or the default.
     window, large : Window
         Windows of the heights, and those that decide between cycles of the phase.
     """
+    task, _, window_m, window, looks = _begun(pair, grid, request)
+    large = _large_window(looks, window, task.relative_band, task.least_coherence)
+    return window_m, window, large
+
+
+class _Begun(NamedTuple):
+    """The task, images on the plane, and the window with its effective number of looks."""
+
+    task: Task
+    images: tuple[NDArray[np.complex64], NDArray[np.complex64]]
+    window_m: float
+    window: Window
+    looks: float
+
+
+def _begun(pair: Pair, grid: Grid, request: Request) -> _Begun:
+    """Return what images of the plane show; raise UnmeasurableError if they show no heights."""
+    # Rays are exact on the relief that is refined. A sweep needs no more than nearly right ones.
     straight = pair.straightened(grid)
-    task = _task(straight, grid, search_m, least_coherence)
+    task = _task(straight, grid, request.search_m, request.least_coherence)
     images = straight.images(task.level)
-    window_m = _default_window_m(images, grid) if window_m is None else window_m
+    window_m = request.window_m
+    if window_m is None:
+        window_m = _default_window_m(images, grid)
     window = Window.of(grid, window_m)
     looks = effective_looks(images, window)
     check_looks(window_m, looks)
-    return window_m, window, _large_window(looks, window, task.relative_band, least_coherence)
+    return _Begun(task, images, window_m, window, looks)
 
 
 def _task(pair: Pair, grid: Grid, search_m: tuple[float, float], least_coherence: float) -> Task:

@@ -12,6 +12,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +25,10 @@ from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.interferometry import heights
-from clsas.interferometry.checks import (
-    check_grid,
-    check_pair,
-    checked_coherence,
-    checked_search,
-)
+from clsas.interferometry.checks import check_grid, check_pair
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.heights import LEAST_COHERENCE
-from clsas.interferometry.interferogram import window_within
+from clsas.interferometry.request import Request
 from clsas.mosaics.banks import Bank
 from clsas.mosaics.devices import open_devices
 from clsas.mosaics.documents import read_document
@@ -44,7 +40,6 @@ from clsas.mosaics.scheduling import Run, form_patches
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import open_survey
 from clsas.opencl.device import Device
-from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
 from clsas.sonar.beam import BeamWindow
 
 _SIDE = 1024  # pixels along a patch by default, which then takes about 0.6 GiB
@@ -170,15 +165,7 @@ def mosaic_heights(
     """
     validate.instance("grid", grid, Grid)
     check_grid(grid)
-    search = checked_search(search_m)
-    tolerance_db = validate.number(
-        "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
-    )
-    least_coherence = checked_coherence(least_coherence)
-    validate.instance("beam", beam, BeamWindow, type(None))
-    if window_m is not None:
-        window_m = validate.positive("window_m", window_m, "m")
-        window_within(grid, window_m)
+    request = Request.checked(grid, search_m, window_m, tolerance_db, least_coherence, beam)
     if patch_m is not None:
         patch_m = validate.positive("patch_m", patch_m, "m")
     validate.progress(progress)
@@ -188,24 +175,18 @@ def mosaic_heights(
     opened = Store.at(validate.path("store", store))
     devices = open_devices(device)
     patch_shape = _patch_shape(grid, patch_m)
-    inputs = _inputs(banks, grid, search, tolerance_db, least_coherence, beam)
     decided = _decided(opened)
-    if decided is None or window_m not in (None, decided["window_m"]):
-        decided = _decide(
-            banks, grid, search, window_m, tolerance_db, least_coherence, beam, devices[0]
-        )
-    inputs |= decided
-    window = Window.of(grid, decided["window_m"])
-    if patch_m is not None and patch_m < decided["window_m"]:
+    if decided is None or request.window_m not in (None, decided["window_m"]):
+        decided = _decide(banks, grid, request, devices[0])
+    window_m = decided["window_m"]
+    if patch_m is not None and patch_m < window_m:
         raise ValueError(
-            f"patch_m must be at least the side of a window, {decided['window_m']:.3g} m, got "
-            f"{patch_m:g} m"
+            f"patch_m must be at least the side of a window, {window_m:.3g} m, got {patch_m:g} m"
         )
-    opened.begin(inputs, grid, patch_shape, window.sides)
-    job = HeightsJob(
-        banks, grid, search, tolerance_db, least_coherence, beam, decided["window_m"],
-        tuple(decided["margin"]), opened.path,
-    )  # fmt: skip
+    inputs = _inputs(banks, grid, request) | decided
+    opened.begin(inputs, grid, patch_shape, Window.of(grid, window_m).sides)
+    request = replace(request, window_m=window_m)
+    job = HeightsJob(banks, grid, request, tuple(decided["margin"]), opened.path)
     layout = Layout(grid, patch_shape)
     run = Run(layout, job, inputs, banks[0].visibility, devices, None, None)
     finished = {
@@ -260,20 +241,13 @@ def _patch_shape(grid: Grid, patch_m: float | None) -> tuple[int, int]:
     return sides[0], sides[1]
 
 
-def _inputs(
-    banks: tuple[Bank, Bank],
-    grid: Grid,
-    search_m: tuple[float, float],
-    tolerance_db: float,
-    least_coherence: float,
-    beam: BeamWindow | None,
-) -> dict[str, Any]:
+def _inputs(banks: tuple[Bank, Bank], grid: Grid, request: Request) -> dict[str, Any]:
     """Return the inputs of a mosaic of heights as JSON types."""
     first, second = (bank.survey for bank in banks)
-    inputs = inputs_of(first, grid, {"tolerance_db": tolerance_db}, beam)
+    inputs = inputs_of(first, grid, {"tolerance_db": request.tolerance_db}, request.beam)
     if second is not first:
         inputs["parts"] += second.digests()
-    inputs |= {"search_m": list(search_m), "least_coherence": least_coherence}
+    inputs |= {"search_m": list(request.search_m), "least_coherence": request.least_coherence}
     return json.loads(json.dumps(inputs))
 
 
@@ -288,28 +262,21 @@ def _decided(store: Store) -> dict[str, Any] | None:
 
 
 def _decide(
-    banks: tuple[Bank, Bank],
-    grid: Grid,
-    search_m: tuple[float, float],
-    window_m: float | None,
-    tolerance_db: float,
-    least_coherence: float,
-    beam: BeamWindow | None,
-    device: Device,
+    banks: tuple[Bank, Bank], grid: Grid, request: Request, device: Device
 ) -> dict[str, Any]:
     """Return the window and the margin of a new mosaic, from images of the middle of the grid."""
     middle = grid.window(*(_middle(count) for count in grid.shape))
-    pair, _ = seen(banks, middle, search_m, tolerance_db, beam, device)
+    pair, _ = seen(banks, middle, request, device)
     if pair is None:
         raise ValueError(
             "grid must lie where the lines reach it: no channel receives from its middle"
         )
-    found_m, window, large = heights.windows(pair, middle, search_m, window_m, least_coherence)
+    window_m, window, large = heights.windows(pair, middle, request)
     margin = [
         math.ceil(wide / 2 + _MARGIN_WINDOWS * side)
         for side, wide in zip(window.sides, large.sides, strict=True)
     ]
-    return {"window_m": found_m, "margin": margin}
+    return {"window_m": window_m, "margin": margin}
 
 
 def _middle(count: int) -> slice:

@@ -22,6 +22,7 @@ from clsas.interferometry import heights
 from clsas.interferometry.baseline import Baseline
 from clsas.interferometry.errors import UnmeasurableError
 from clsas.interferometry.pair import Pair
+from clsas.interferometry.request import Request
 from clsas.interferometry.result import Heights
 from clsas.interferometry.sweep import Curves
 from clsas.mosaics.banks import Bank
@@ -39,7 +40,7 @@ _PLACES = 5  # along either side of a patch, for which curves are found; arbitra
 
 
 class Seen(NamedTuple):
-    """What two banks recorded of a part of a grid.
+    """Lines of two banks from which heights of a part of a grid follow.
 
     Attributes
     ----------
@@ -62,12 +63,8 @@ class HeightsJob:
     banks : (Bank, Bank)
     grid : Grid
         Grid of the whole mosaic.
-    search_m : (lowest, highest)
-    tolerance_db, least_coherence : float
-        See `clsas.heights`.
-    beam : BeamWindow or None
-    window_m : float
-        Side of the windows.
+    request : Request
+        With the side of the windows.
     margin : (rows, columns)
         Pixels beyond each side of a patch that are measured with it.
     store : Path or None
@@ -75,13 +72,14 @@ class HeightsJob:
 
     banks: tuple[Bank, Bank]
     grid: Grid
-    search_m: tuple[float, float]
-    tolerance_db: float
-    least_coherence: float
-    beam: BeamWindow | None
-    window_m: float
+    request: Request
     margin: tuple[int, int]
     store: Path | None
+
+    @property
+    def beam(self) -> BeamWindow | None:
+        """Beam of the request."""
+        return self.request.beam
 
     def on(self, visibility: SurveyVisibility, in_process: bool) -> HeightsJob:
         """Return the settings themselves, since the survey does not change."""
@@ -101,7 +99,7 @@ class HeightsJob:
         if record.survey_channels >= len(self.banks[0].members):
             return True
         wide, _ = self._with_margin(window)
-        visible, _ = _swept(self.banks, wide, self.search_m, self.beam)
+        visible, _ = _swept(self.banks, wide, self.request)
         return not visible[record.survey_channels :].any()
 
     def form(self, window: PatchWindow) -> tuple[Record, Image | None]:
@@ -126,15 +124,13 @@ class HeightsJob:
         """Return the record, the pixels and the layers of a patch."""
         start = time.perf_counter()
         wide, inside = self._with_margin(window)
-        pair, known = seen(self.banks, wide, self.search_m, self.tolerance_db, self.beam, device)
+        pair, known = seen(self.banks, wide, self.request, device)
         pixels: NDArray[np.complex64] = np.zeros(window.grid.shape, np.complex64)
         layers = {name: np.full(window.grid.shape, np.nan, np.float32) for name in LAYERS}
         if pair is None:
             return Record(**known, seconds=time.perf_counter() - start), pixels, layers
         try:
-            found, refined = heights.measured(
-                pair, wide, self.search_m, self.window_m, self.least_coherence, None
-            )
+            found, refined = heights.measured(pair, wide, self.request, None)
         except UnmeasurableError as error:
             known["heights"] = {"reason": str(error)}
         else:
@@ -159,14 +155,7 @@ class HeightsJob:
         return self.grid.window(*outer), (inner[0], inner[1])
 
 
-def seen(
-    banks: tuple[Bank, Bank],
-    grid: Grid,
-    search_m: tuple[float, float],
-    tolerance_db: float,
-    beam: BeamWindow | None,
-    device: Device,
-) -> Seen:
+def seen(banks: tuple[Bank, Bank], grid: Grid, request: Request, device: Device) -> Seen:
     """Return what two banks recorded of a grid and of the heights to search above it."""
     start = time.perf_counter()
     known: dict[str, Any] = {
@@ -174,7 +163,7 @@ def seen(
         "device": device.info.label,
         "driver": device.info.driver,
     }
-    visible, volume = _swept(banks, grid, search_m, beam)
+    visible, volume = _swept(banks, grid, request)
     known["channels"] = int(np.count_nonzero(visible))
     if not visible.any():
         return Seen(None, known)
@@ -193,25 +182,23 @@ def seen(
     chosen[visible] = ~missing
     if missing.any():
         first, second = first.select(~missing), second.select(~missing)
-    pair = Pair(first, second, tolerance_db, None, _beam_of(banks[0], beam, chosen), device)
+    beam = _beam_of(banks[0], request.beam, chosen)
+    pair = Pair(first, second, request.tolerance_db, None, beam, device)
     return Seen(pair, known)
 
 
 def _swept(
-    banks: tuple[Bank, Bank],
-    grid: Grid,
-    search_m: tuple[float, float],
-    beam: BeamWindow | None,
+    banks: tuple[Bank, Bank], grid: Grid, request: Request
 ) -> tuple[NDArray[np.bool_], Grid]:
     """Return the channels from which heights of a grid follow, and the volume that they image."""
-    volume = _box(grid, search_m)
+    volume = _box(grid, request.search_m)
     visible = _visible(banks, volume)
     if visible.any():
         some = [bank.geometry.select(visible) for bank in banks]
-        baseline = Baseline.of(some[0], some[1], _beam_of(banks[0], beam, visible), 1.0)
+        baseline = Baseline.of(some[0], some[1], _beam_of(banks[0], request.beam, visible), 1.0)
         every = [slice(None, None, max((n - 1) // _PLACES, 1)) for n in grid.shape]
-        reached = Curves.over(baseline, grid.window(*every), np.array(search_m)).grid
-        volume = _box(reached, search_m)
+        reached = Curves.over(baseline, grid.window(*every), np.array(request.search_m)).grid
+        volume = _box(reached, request.search_m)
         visible = _visible(banks, volume)
     return visible, volume
 

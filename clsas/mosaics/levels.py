@@ -132,7 +132,7 @@ class PixelArray:
 
     @property
     def kind(self) -> str:
-        """What the numbers are: "pixels", "amplitude", `IN_DB` or one of `LAYERS`."""
+        """Kind of numbers: "pixels", "amplitude", `IN_DB` or one of `LAYERS`."""
         return self.name.rpartition("/")[2]
 
     def window(self, index: tuple[int, int]) -> tuple[slice, slice]:

@@ -12,6 +12,7 @@ import clsas
 from clsas.core.validate import ClsasWarning
 from clsas.interferometry.heights import heights, measure
 from clsas.interferometry.pair import Pair
+from clsas.interferometry.request import Request
 from clsas.opencl.device import open_device
 
 AMBIGUITY_M = 2.06  # 2 pi R/(k B): a wavelength of 15 mm, 34.2 m of range, 0.25 m between the banks
@@ -251,7 +252,7 @@ def test_the_tolerance_adds_little_to_the_deviation():
     errors_m = []
     for tolerance_db, accuracy_db in ((-40.0, None), (None, -70.0)):
         pair = Pair(*lines, tolerance_db, accuracy_db, None, device)
-        result = measure(pair, GRID, (-1.0, 1.0), WINDOW_M, 0.5, None)
+        result = measure(pair, GRID, Request((-1.0, 1.0), WINDOW_M, -40.0, 0.5, None), None)
         some = coherent(result)
         errors_m.append(np.sqrt(np.mean((result.height_m - truth(dunes))[some] ** 2)))
     assert errors_m[0] < 1.1 * errors_m[1]

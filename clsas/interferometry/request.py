@@ -1,0 +1,57 @@
+"""What is asked of a measurement of heights, beside the lines and the grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+from numpy.typing import ArrayLike
+
+from clsas.core import validate
+from clsas.core.grid import Grid
+from clsas.interferometry.checks import checked_coherence, checked_search
+from clsas.interferometry.interferogram import window_within
+from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
+from clsas.sonar.beam import BeamWindow
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """A request for heights; see `clsas.heights`.
+
+    Attributes
+    ----------
+    search_m : (lowest, highest)
+    window_m : float or None
+        Side of the windows; None for the default.
+    tolerance_db, least_coherence : float
+    beam : BeamWindow or None
+    """
+
+    search_m: tuple[float, float]
+    window_m: float | None
+    tolerance_db: float
+    least_coherence: float
+    beam: BeamWindow | None
+
+    @classmethod
+    def checked(
+        cls,
+        grid: Grid,
+        search_m: ArrayLike,
+        window_m: float | None,
+        tolerance_db: float,
+        least_coherence: float,
+        beam: BeamWindow | None,
+    ) -> Self:
+        """Return the request; raise TypeError or ValueError unless it is valid for a grid."""
+        search = checked_search(search_m)
+        tolerance_db = validate.number(
+            "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
+        )
+        least_coherence = checked_coherence(least_coherence)
+        validate.instance("beam", beam, BeamWindow, type(None))
+        if window_m is not None:
+            window_m = validate.positive("window_m", window_m, "m")
+            window_within(grid, window_m)
+        return cls(search, window_m, tolerance_db, least_coherence, beam)
