@@ -164,6 +164,7 @@ for name in clsas.__all__:
     assert said.keys() == {
         *("FileFormatError", "load", "save", "read_airsas", "read_cphd", "read_full_matrix"),
         *("read_phase_history", "write_cphd", "Mosaic", "Patch", "Store", "mosaic"),
+        "mosaic_heights",
         *("export", "Processed", "process", "assess", "survey_lines", "simulate", "simulate_lines"),
         *("read_sound_speed", "wavenumber"),
     }

@@ -755,6 +755,7 @@ def test_bench(monkeypatch):
     monkeypatch.setattr(cases, "EXACT_CASES", {"one": SMALL, "two": SMALL})
     monkeypatch.setattr(cases, "FACTORIZED_CASES", {"fast": SMALL})
     monkeypatch.setattr(cases, "MOSAIC_CASES", {})
+    monkeypatch.setattr(cases, "HEIGHTS_CASES", {})
     result = run_json("bench", "one", "--repeats", 2)
     assert result["case"] == "one"
     assert result.keys() >= {"device", "driver", "gbp_per_s", "rounding_error_db"}
