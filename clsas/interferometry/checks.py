@@ -15,7 +15,7 @@ from clsas.interferometry.baseline import Baseline
 from clsas.interferometry.errors import UnmeasurableError
 
 _APART = 0.1  # relative change of the distance between banks that waves of the track may cause
-_MOST_SEARCH_M = 1e5  # from the grid; far above any relief, a plain choice
+_MOST_SEARCH_M = 1e8  # from the grid; positions may be up to ten times as large
 _MOST_CYCLES = 1e3  # of phase within the search; more need more planes than anyone has time for
 _POINTS = 5  # along either side of a grid, whose geometry is checked; arbitrary
 _LEAST_PHASE_RAD = 0.1  # over the whole search; less is not above the noise of usual coherences
