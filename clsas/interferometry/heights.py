@@ -253,7 +253,7 @@ def measured(
         lambda done: report(len(heights_m) + done, total),
     )
     report(total, total)
-    hidden = in_shadow(grid, refined.offset_m, refined.sd_m, refined.valid, sights, window)
+    hidden = in_shadow(task.plane, refined.offset_m, refined.sd_m, refined.valid, sights, window)
     found = Heights(
         refined.offset_m,
         refined.sd_m,

@@ -232,6 +232,17 @@ def test_a_coarse_relief_narrows_the_search():
     assert np.sqrt(np.mean(apart**2)) < 0.3
 
 
+@pytest.mark.slow
+def test_lit_slopes_of_a_known_relief_are_not_in_shadow():
+    """Twice as steep a slope would be: the line of sight falls by 0.37 m per metre."""
+    lines = banks(averted, snr_db=17)
+    start = GRID.with_height(truth(averted))
+    sloping = heights(*lines, start, search_m=(-0.5, 0.5), window_m=WINDOW_M)
+    level = heights(*lines, GRID, search_m=(-1.0, 1.0), window_m=WINDOW_M)
+    assert level.mask.mean() > 0.8
+    assert sloping.mask.mean() > 0.97 * level.mask.mean()
+
+
 def test_a_level_relief_is_a_plane_at_its_height():
     lines = flat_banks()
     low = clsas.Grid.plane((-0.8, 0.8, 81), (30.8, 33.2, 121), z=-0.4)
