@@ -79,14 +79,7 @@ _SEARCH = Parsed("LOW:HIGH", _heights, "LOW:HIGH, two ascending heights in metre
     help="Side of the windows, the resolution of the heights (m). [default: that of about 50 "
     "independent samples]",
 )
-@click.option(
-    "--tolerance-db",
-    type=float,
-    default=-40.0,
-    show_default=True,
-    callback=options.check_tolerance_db,
-    help="Largest relative rms error of the images (dB).",
-)
+@options.tolerance_of_images
 @click.option(
     "--least-coherence",
     type=float,

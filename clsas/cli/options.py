@@ -14,7 +14,12 @@ from clsas.cli.parameters import AXIS, INPUT, PERCENTILES, RATIO, STAGES, Output
 from clsas.core import validate
 from clsas.exact.backprojection import BEST_ACCURACY_DB
 from clsas.files.hdf5 import SUFFIXES
-from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, wavelengths
+from clsas.planning.request import (
+    BEST_TOLERANCE_DB,
+    WORST_TOLERANCE_DB,
+    checked_tolerance_db,
+    wavelengths,
+)
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.sonar.beam import SHAPES
 from clsas.sonar.coverage import UnreachedWarning
@@ -124,11 +129,11 @@ axes = _together(
     ),
 )  # fmt: skip
 grid = _together(scene, axes)
-check_tolerance_db = checked(
-    partial(
-        validate.number, "tolerance_db", unit="dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
-    )
-)
+check_tolerance_db = checked(checked_tolerance_db)
+tolerance_of_images = click.option(
+    "--tolerance-db", type=float, default=-40.0, show_default=True, callback=check_tolerance_db,
+    help="Largest relative rms error of the images (dB).",
+)  # fmt: skip
 check_accuracy_db = checked(
     partial(validate.number, "accuracy_db", unit="dB", least=BEST_ACCURACY_DB, below=0.0)
 )

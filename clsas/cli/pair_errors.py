@@ -60,14 +60,7 @@ from clsas.interferometry.pair_errors_result import UNKNOWNS
     help="Error to estimate, the most important first; repeat the option for several. "
     "[default: phase, delay, roll]",
 )
-@click.option(
-    "--tolerance-db",
-    type=float,
-    default=-40.0,
-    show_default=True,
-    callback=options.check_tolerance_db,
-    help="Largest relative rms error of images (dB).",
-)
+@options.tolerance_of_images
 @options.beam
 @options.device
 @options.as_json

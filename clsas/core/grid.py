@@ -529,3 +529,8 @@ def _check_steps(
             f"row_step_m and column_step_m must not be parallel, got {row_step_m} "
             f"and {column_step_m} m"
         )
+
+
+def without_heights(grid: Grid) -> Grid:
+    """Return the plane of a height map, or the grid itself if it has no heights."""
+    return replace(grid, height_m=None)

@@ -16,14 +16,14 @@ line of sight, and negative in layover.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from clsas.core.grid import Grid
+from clsas.core.grid import Grid, without_heights
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.wavelengths import wavelength_m
 from clsas.sonar.beam import BeamWindow
@@ -214,7 +214,7 @@ def sight_lattice(baseline: Baseline, grid: Grid, search_m: tuple[float, float])
     rows, columns = lattice_pixels(grid)
     above_m = levels_m(grid)
     offset_m = np.linspace(above_m[0] + search_m[0], above_m[-1] + search_m[1], _LEVELS)
-    grid = replace(grid, height_m=None)
+    grid = without_heights(grid)
     points_m = grid.positions_m()[np.ix_(rows, columns)][..., None, :]
     points_m = points_m + offset_m[:, None] * np.array([0.0, 0.0, 1.0])
     sight = baseline.sight(points_m.reshape(-1, 3))

@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from clsas.core.grid import Grid
-from clsas.core.wavelengths import cycles_per_m_at
+from clsas.core.grid import Grid, without_heights
 from clsas.interferometry.baseline import Baseline, Lattice, in_pixels
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.result import Heights
-from clsas.signal.spectrum import measure_spectrum
+from clsas.signal.spectrum import middle_cycles_per_m
 
 _UP = np.array([0.0, 0.0, 1.0])
 _SMOOTHED = 3.0  # windows along either side, over which slopes are averaged
@@ -82,9 +81,9 @@ class Displaced:
     @classmethod
     def of(cls, pair: Pair, found: Heights) -> Self:
         """Return heights together with the geometry of the pair that found them."""
-        plane = plane_of(found)
+        plane = without_heights(found.image.grid)
         straight = pair.straightened(plane)
-        cycles_per_m = float(cycles_per_m_at(straight.a, measure_spectrum(straight.a).centre))
+        cycles_per_m = middle_cycles_per_m(straight.a)
         baseline = Baseline.of(straight.a, straight.b, straight.beam, cycles_per_m)
         beyond_m = 2 * np.pi * _MOST_CYCLES * float(np.median(np.abs(found.m_per_rad)))
         known_m = found.height_m[found.mask]
@@ -205,11 +204,3 @@ class Elevation(NamedTuple):
     range_m: float
     rad_m: float
     rad_per_roll: float
-
-
-def plane_of(found: Heights) -> Grid:
-    """Return the plane above which heights were measured."""
-    origin_m, row_step_m, column_step_m = found.image.grid.vectors_m
-    return Grid.oriented(
-        origin_m, row_step_m, column_step_m, (found.mask.shape[0], found.mask.shape[1])
-    )

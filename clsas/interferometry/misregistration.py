@@ -22,7 +22,7 @@ from clsas.interferometry.coherence import UNIFORM_SD_RAD, Window
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.result import Heights
 from clsas.signal.band_parts import sub_bands
-from clsas.signal.spectrum import measure_spectrum
+from clsas.signal.spectrum import measure_spectrum, middle_cycles_per_m
 
 _LEAST_TILES = 3  # independent windows from which a deviation is estimated
 
@@ -48,7 +48,7 @@ def constant_phase(pair: Pair, found: Heights) -> ConstantPhase:
         return ConstantPhase(0.0, np.inf)
     low, high = low[some], high[some]
     slope, sd = _phase_between(low, high)
-    middle = float(cycles_per_m_at(pair.a, measure_spectrum(pair.a).centre))
+    middle = middle_cycles_per_m(pair.a)
     per_slope = -middle / (cycles_per_m[1] - cycles_per_m[0])
     return ConstantPhase(slope * per_slope, sd * abs(per_slope))
 

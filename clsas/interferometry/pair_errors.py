@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from clsas.core import validate
 from clsas.core.lines import RangeLines
-from clsas.core.wavelengths import cycles_per_m_at
 from clsas.interferometry.checks import check_pair
 from clsas.interferometry.comparisons import Comparison, at_pixels, at_points, in_overlap
 from clsas.interferometry.displaced import Displaced
@@ -20,8 +19,8 @@ from clsas.interferometry.pair import Pair
 from clsas.interferometry.pair_errors_result import UNKNOWNS, PairErrors
 from clsas.interferometry.result import Heights
 from clsas.opencl.device import Device, open_device
-from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
-from clsas.signal.spectrum import measure_spectrum
+from clsas.planning.request import checked_tolerance_db
+from clsas.signal.spectrum import middle_cycles_per_m
 from clsas.sonar.beam import BeamWindow
 
 _MRAD = 1e-3
@@ -158,9 +157,7 @@ def pair_errors(
     0.0 m after
     """
     unknowns = _checked_unknowns(unknowns)
-    tolerance_db = validate.number(
-        "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
-    )
+    tolerance_db = checked_tolerance_db(tolerance_db)
     validate.instance("beam", beam, BeamWindow, type(None))
     known_sd_m = validate.number("known_sd_m", known_sd_m, "m", least=0.0)
     given = {"known_height_m": known_height_m, "points_m": points_m, "other": other}
@@ -278,8 +275,7 @@ def _mean_phase(each: list[ConstantPhase]) -> ConstantPhase:
 
 def _middle_hz(lines: RangeLines) -> float:
     """Return the frequency in the middle of the occupied band."""
-    cycles_per_m = cycles_per_m_at(lines, measure_spectrum(lines).centre)
-    return float(cycles_per_m) * lines.sound_speed_m_s / 2
+    return middle_cycles_per_m(lines) * lines.sound_speed_m_s / 2
 
 
 def _errors(

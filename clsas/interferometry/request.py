@@ -1,4 +1,4 @@
-"""What is asked of a measurement of heights, beside the lines and the grid."""
+"""Settings of a measurement of heights, checked before any image is formed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.interferometry.checks import checked_coherence, checked_search
 from clsas.interferometry.interferogram import window_within
-from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB
+from clsas.planning.request import checked_tolerance_db
 from clsas.sonar.beam import BeamWindow
 
 
@@ -46,9 +46,7 @@ class Request:
     ) -> Self:
         """Return the request; raise TypeError or ValueError unless it is valid for a grid."""
         search = checked_search(search_m)
-        tolerance_db = validate.number(
-            "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
-        )
+        tolerance_db = checked_tolerance_db(tolerance_db)
         least_coherence = checked_coherence(least_coherence)
         validate.instance("beam", beam, BeamWindow, type(None))
         if window_m is not None:

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, maximum_filter1d
 
-from clsas.core.grid import Grid
+from clsas.core.grid import Grid, without_heights
 from clsas.interferometry.baseline import (
     Baseline,
     Lattice,
@@ -176,7 +176,7 @@ def _traced(baseline: Baseline, grid: Grid, offset_m: NDArray[np.float64]) -> tu
     The curves through a height map begin at a few heights between its lowest and its highest one.
     """
     rows, columns = lattice_pixels(grid)
-    plane = replace(grid, height_m=None)
+    plane = without_heights(grid)
     above_m = levels_m(grid)
     start_m = plane.positions_m()[np.ix_(rows, columns)][:, :, None]
     start_m = (start_m + above_m[:, None] * [0.0, 0.0, 1.0]).reshape(-1, 3)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid
+from clsas.core.grid import Grid, without_heights
 from clsas.interferometry.baseline import Baseline
 from clsas.interferometry.pair import Pair
 
@@ -44,7 +44,7 @@ class Task:
     @property
     def plane(self) -> Grid:
         """The plane above which heights are measured."""
-        return replace(self.grid, height_m=None)
+        return without_heights(self.grid)
 
     @property
     def start_m(self) -> NDArray[np.float64]:

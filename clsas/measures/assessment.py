@@ -35,7 +35,7 @@ from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 from clsas.planning.prediction import half_precision_error
-from clsas.planning.request import BEST_TOLERANCE_DB, TOLERANCE_DB, WORST_TOLERANCE_DB
+from clsas.planning.request import TOLERANCE_DB, checked_tolerance_db
 from clsas.plans.factorization import Factorization
 from clsas.plans.plan import Plan
 from clsas.signal.compression import Window
@@ -141,9 +141,7 @@ def assess(
     >>> motion.needed
     True
     """
-    tolerance_db = validate.number(
-        "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
-    )
+    tolerance_db = checked_tolerance_db(tolerance_db)
     repeats = validate.count("repeats", repeats, least=0)
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)

@@ -67,14 +67,14 @@ class HeightsJob:
         With the side of the windows.
     margin : (rows, columns)
         Pixels beyond each side of a patch that are measured with it.
-    store : Path or None
+    store : Path
     """
 
     banks: tuple[Bank, Bank]
     grid: Grid
     request: Request
     margin: tuple[int, int]
-    store: Path | None
+    store: Path
 
     @property
     def beam(self) -> BeamWindow | None:
@@ -85,14 +85,13 @@ class HeightsJob:
         """Return the settings themselves, since the survey does not change."""
         return self
 
-    def opened_store(self) -> Store | None:
+    def opened_store(self) -> Store:
         """Return the store."""
-        return None if self.store is None else Store.at(self.store)
+        return Store.at(self.store)
 
     def complete_levels(self) -> None:
         """Compute the levels of the store that mix patches, once all patches are finished."""
-        if (store := self.opened_store()) is not None:
-            store.complete_levels()
+        self.opened_store().complete_levels()
 
     def is_current(self, record: Record, window: PatchWindow) -> bool:
         """Return whether no channel that was added since a patch was measured contributes to it."""
@@ -114,8 +113,7 @@ class HeightsJob:
             record, pixels, layers = self._measured(window, thread_device())
         except ValueError as error:
             raise ValueError(f"patch {window.row},{window.column}: {error}") from error
-        if (store := self.opened_store()) is not None:
-            store.write(*window[1:], pixels, record, layers)
+        self.opened_store().write(*window[1:], pixels, record, layers)
         return record, None
 
     def _measured(

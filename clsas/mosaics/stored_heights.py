@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core import validate
-from clsas.core.grid import Grid
+from clsas.core.grid import Grid, without_heights
 from clsas.core.image import Image
 from clsas.interferometry.refinement import filled
 from clsas.interferometry.result import Heights
@@ -40,7 +39,7 @@ def check_heights(store: Store) -> None:
 def window_of(store: Store, rows: slice, columns: slice) -> Heights:
     """Return the heights in a window of a store; see `Store.heights`."""
     check_heights(store)
-    plane = _plane(store.grid.window(rows, columns))
+    plane = without_heights(store.grid.window(rows, columns))
     validate.memory("heights", _BYTES * plane.size)
     layers = {name: store.read_layer(name, rows, columns) for name in LAYERS}
     return _heights(plane, store.read(rows, columns), layers, _window_m(store))
@@ -50,7 +49,7 @@ def overview_of(store: Store, most: int, rows: slice, columns: slice) -> Heights
     """Return the heights of a part of a store at fewer pixels; see `Store.overview_heights`."""
     check_heights(store)
     grid = store.grid
-    part = _plane(grid.window(rows, columns))
+    part = without_heights(grid.window(rows, columns))
     first, last = [], []
     for name, given, count in zip(("rows", "columns"), (rows, columns), grid.shape, strict=True):
         pixels = range(count)[validate.selection(name, given, ascending=True)]
@@ -69,7 +68,7 @@ def overview_of(store: Store, most: int, rows: slice, columns: slice) -> Heights
         for level in (1, *store.levels)
         if level <= factor
         and not any(start % level for start in first)
-        and all(n % level == 0 or n == most for n, most in zip(last, grid.shape, strict=True))
+        and all(n % level == 0 or n == count for n, count in zip(last, grid.shape, strict=True))
     )
     shape = level_shape(part.shape, factor)
     found = {name: np.empty(shape, np.float32) for name in (*LAYERS, _AMPLITUDE)}
@@ -114,10 +113,6 @@ def _heights(
         values[name] = np.nan_to_num(values[name])
     image = Image(pixels, plane.with_height(filled(values["height_m"], mask)))
     return Heights(**values, mask=mask, image=image, window_m=window_m)
-
-
-def _plane(grid: Grid) -> Grid:
-    return replace(grid, height_m=None)
 
 
 def _coarser(plane: Grid, factor: int, shape: tuple[int, int]) -> Grid:

@@ -101,14 +101,19 @@ class Request:
         object.__setattr__(self, name, value)
 
 
+def checked_tolerance_db(tolerance_db: float) -> float:
+    """Return a tolerance in dB; raise TypeError or ValueError if it is outside the limits."""
+    return validate.number(
+        "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
+    )
+
+
 def tolerance_in_db(
     tolerance_db: float | None, tolerance_wavelengths: float | None
 ) -> float | None:
     """Return the requested tolerance in dB, or None without one, after checking it."""
     if tolerance_db is not None:
-        return validate.number(
-            "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
-        )
+        return checked_tolerance_db(tolerance_db)
     if tolerance_wavelengths is None:
         return None
     least, most = (wavelengths(each) for each in (BEST_TOLERANCE_DB, WORST_TOLERANCE_DB))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, Literal
@@ -70,7 +69,7 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float | None = None) -
     import matplotlib as mpl
 
     options: Any = {"metadata": _DATES[kind]} if kind in _DATES else {}
-    drawn = io.BytesIO()  # if a file cannot grow, Matplotlib's writer of PDF hides the reason
+    drawn = BytesIO()  # if a file cannot grow, Matplotlib's writer of PDF hides the reason
     with mpl.rc_context(_SETTINGS):
         # "tight" includes labels that the layout leaves outside, such as those of square axes.
         figure.savefig(

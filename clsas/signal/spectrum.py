@@ -139,6 +139,11 @@ def measure_spectrum(
     )
 
 
+def middle_cycles_per_m(lines: RangeLines) -> float:
+    """Return the two-way phase per metre of range in the middle of the occupied band, cycles."""
+    return float(cycles_per_m_at(lines, measure_spectrum(lines).centre))
+
+
 def power_spectrum(lines: RangeLines) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return frequencies, cycles per sample, ascending in [-0.5, 0.5), and their power shares.
 
