@@ -7,10 +7,13 @@
  * factorized ones (ALIGNED).
  *
  * Build options: WIDTH and PERMUTE (vectors.h), HALF (samples.h), TAPS and WINDOWS (lookup.h), PHASE_TERMS (phases.h),
- * BEAM, ONE_CUBIC and NORMALISE (beam.h), OVERWRITE (pixels.h), ALIGNED (parts.h), BISTATIC and MOVING (antennas.h).
+ * BEAM, ONE_CUBIC and NORMALISE (beam.h), OVERWRITE (pixels.h), ALIGNED (parts.h), CORRECTED (with ALIGNED: ranges have
+ * corrections), BISTATIC and MOVING (antennas.h).
  *
  * lines, line_pitch     see samples.h.
  * ranges, reference_... see parts.h; the parts are groups.
+ * corrections           with CORRECTED: float [groups][channel_pitch], m that are added to ranges, from a group's first channel
+ *                       on; groups are those of `ranges`.
  * drift                 with ALIGNED: how much shorter every range becomes because receivers move, per metre along x y z.
  * geometry, centres     see antennas.h; `centres` holds those of all groups, from number first_range on those at work.
  * groups                number of groups at work.
@@ -104,6 +107,9 @@ __kernel void backproject_points(__global const sample_t *lines, int line_pitch,
                                  int first_range,
 #if ALIGNED
                                  int centre_sample, float3 drift,
+#if CORRECTED
+                                 __global const float *corrections, int channel_pitch,
+#endif
 #else
                                  __global const int *reference_sample, __global const float *reference_fraction,
                                  __global const float *reference_phase, int channel_pitch,
@@ -142,7 +148,11 @@ __kernel void backproject_points(__global const sample_t *lines, int line_pitch,
     for (int channel = part.begin; channel < part.end; channel++) {
         const int entry = channel - part.begin;
         const Antennas antennas = antennas_of(geometry, geometry_pitch, channel, centre);
-#if ALIGNED
+#if ALIGNED && CORRECTED
+        const size_t pair = (size_t)(first_range + group) * channel_pitch + entry;
+        const float correction = corrections[pair] * samples_per_m;
+        const Reference reference = {centre_sample, correction, correction * cycles_per_sample};
+#elif ALIGNED
         const Reference reference = {centre_sample, 0.0f, 0.0f};
 #else
         const size_t pair = (size_t)group * channel_pitch + entry;

@@ -431,11 +431,15 @@ class Grid:
         TypeError, ValueError
             If `most` is not a whole number of at least 1.
         """
+        return self.at(self.spread_indices(most))
+
+    def spread_indices(self, most: int) -> NDArray[np.int64]:
+        """Return the row-major indices of the sample points of `spread`, [n]."""
         most = validate.count("most", most)
         indices = [
             np.unique(np.linspace(0, n - 1, min(most, n)).round().astype(int)) for n in self.shape
         ]
-        return self.at(np.ravel_multi_index(np.ix_(*indices), self.shape).ravel())
+        return np.ravel_multi_index(np.ix_(*indices), self.shape).ravel()
 
     def window(self, rows: slice = _ALL, columns: slice = _ALL) -> Self:
         """Return the grid of some rows and columns. For points these are the first two axes.

@@ -98,6 +98,10 @@ class Groups:
         """Return the centres of some groups, float64 [parts, 3]."""
         return self.centre_m[parts]
 
+    def middle_pixels(self, parts: slice) -> NDArray[np.int64]:
+        """Return the index of one pixel of each of some groups, near its middle, [parts]."""
+        return self.index[parts, self.part_pixels // 2]
+
     def boxes(self, parts: slice) -> Boxes:
         """Return boxes that contain the centres and pixels of some groups."""
         axes, half_m = self._extents

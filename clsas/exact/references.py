@@ -57,6 +57,7 @@ def references_of(
     ranges: NDArray[np.int32],
     resampling: Resampling,
     blocks: Blocks,
+    correction_m: NDArray[np.float64] | None = None,
 ) -> dict[str, NDArray]:
     """Return the sample, its fraction and the phase of the echo of each centre in each line.
 
@@ -68,6 +69,8 @@ def references_of(
         First channel that each part needs, and the one after the last.
     resampling : Resampling
     blocks : Blocks
+    correction_m : float64 [parts, channels], optional
+        Corrections of the ranges.
 
     Returns
     -------
@@ -82,10 +85,14 @@ def references_of(
             centres_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
         )
         first_range_m = lines.first_range_m
+        if correction_m is not None:
+            range_m += correction_m
     else:
-        range_m, first_range_m = _windowed_ranges(
-            centres_m[visible], lines, ranges[visible, 0], count
-        )
+        first = ranges[visible, 0]
+        range_m, first_range_m = _windowed_ranges(centres_m[visible], lines, first, count)
+        if correction_m is not None:
+            channel = np.minimum(first[:, None] + np.arange(count), lines.channels - 1)
+            range_m += np.take_along_axis(correction_m[visible], channel, axis=1)
     position = (range_m - first_range_m) / lines.range_step_m + resampling.lead
     range_m *= lines.carrier_cycles_per_m
     cycles = range_m + position * resampling.centre_cycles_per_sample

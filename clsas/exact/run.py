@@ -287,7 +287,14 @@ class _Run:
         slot.fill("ranges", np.column_stack([ranges, ranges[:, 0]]))
         references = self.kept.get(
             (channels.start, channels.stop, parts.start, parts.stop, band.start, band.stop),
-            lambda: references_of(centres_m, lines, ranges, self.p.resampling, self.blocks),
+            lambda: references_of(
+                centres_m,
+                lines,
+                ranges,
+                self.p.resampling,
+                self.blocks,
+                self._correction_m(lines, parts),
+            ),
         )
         for name, values in references.items():
             slot.fill(name, values)
@@ -303,6 +310,14 @@ class _Run:
             parts,
             parts.start - band.start,
         )
+
+    def _correction_m(self, lines: RangeLines, parts: slice) -> NDArray[np.float64] | None:
+        """Return the corrections of ranges for some parts, [parts, channels], if there are any."""
+        water, layout = self.p.water, self.p.layout
+        if water is None or water.corrections is None or isinstance(layout, Tiles):
+            return None
+        at_nodes_m = water.corrections.at(layout.middle_pixels(parts))
+        return at_nodes_m @ water.corrections.weights(lines.phase_centres_m).T
 
     def _launch(self, job: _Job, pixels: dict[str, Any]) -> cl.Event:
         """Run the kernels of a job; `pixels` are the pixel and weight buffers of its band."""

@@ -113,7 +113,11 @@ def stage_lines(
 
 
 def leaf_tables(
-    virtual_channels: int, parts: int, points: int | None, beam: BeamWindow | None
+    virtual_channels: int,
+    parts: int,
+    points: int | None,
+    beam: BeamWindow | None,
+    corrected_channels: int = 0,
 ) -> Buffers:
     """Return the tables of leaves.
 
@@ -126,6 +130,8 @@ def leaf_tables(
     points : int or None
         Number of points in all groups; None on a plane.
     beam : BeamWindow or None
+    corrected_channels : int
+        Virtual channels of a leaf if ranges are corrected, else 0.
     """
     columns = virtual_channels + VECTOR_ROOM
     tables = {
@@ -137,6 +143,8 @@ def leaf_tables(
     if points is not None:
         tables["centres"] = Buffer((parts, 6), np.float32)
         tables["offsets"] = Buffer((3, points), np.float32)
+    if corrected_channels:
+        tables["corrections"] = Buffer((parts, channel_pitch(corrected_channels)), np.float32)
     return tables
 
 

@@ -90,6 +90,7 @@ class FactorizedImager:
             model.beam,
             track=known.track,
             surface=known.surface,
+            corrections=self._water.corrections,
         )
 
     def form(self, lines: RangeLines, progress: Callable[[int, int], None] | None = None) -> Image:

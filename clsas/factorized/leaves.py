@@ -197,7 +197,8 @@ class LeafStage:
             values["represented"] = represented(sector, self.geometry.track).reshape(1, -1)
         count = values["ranges"].size // 3
         points = values["offsets"].shape[1] if "offsets" in values else None
-        tables = leaf_tables(len(rows[0]), count, points, self.geometry.beam)
+        corrected = values["corrections"].shape[1] if "corrections" in values else 0
+        tables = leaf_tables(len(rows[0]), count, points, self.geometry.beam, corrected)
         for name, buffer in tables.items():
             slot.fill(name, buffer.holding(values[name]))
 

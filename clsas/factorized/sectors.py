@@ -25,6 +25,7 @@ from clsas.factorized.surface import Surface, surface_of
 from clsas.factorized.tree import channel_ranges
 from clsas.opencl.buffers import MARGIN
 from clsas.plans.factorization import Factorization
+from clsas.signal.ray_corrections import Corrections
 from clsas.sonar.beam import BeamWindow
 
 _FAR = 1 << 28  # samples; beyond the end of any line, and within int32
@@ -266,6 +267,8 @@ class Roots:
     beam : BeamWindow or None
     track, surface : optional
         Results of planning: see `geometry_of`.
+    corrections : Corrections, optional
+        Corrections of ranges along exact rays.
     """
 
     def __init__(
@@ -277,7 +280,9 @@ class Roots:
         *,
         track: MeanTrack | None = None,
         surface: Surface | None = None,
+        corrections: Corrections | None = None,
     ) -> None:
+        self.corrections = corrections
         self._given = lines, grid, factorization, beam, track, surface
         self._sectors: list[Sector] | None = None
         self._groups: LeafGroups | None = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
@@ -9,7 +11,8 @@ from numpy.typing import NDArray
 from clsas.factorized.leaf_groups import LeafGroups
 from clsas.factorized.leaves import Finish, LeafStage
 from clsas.factorized.sectors import Sector
-from clsas.opencl.buffers import VECTOR_ROOM, Slot, float_pairs
+from clsas.opencl.buffers import VECTOR_ROOM, Slot, channel_pitch, float_pairs
+from clsas.signal.ray_corrections import Corrections
 from clsas.sonar.beam import normalising
 
 _ALL = slice(None)
@@ -25,13 +28,24 @@ class SurfaceLeaves:
         The groups of points in all leaves.
     image : complex64 array
         The image, whose pixels are set.
+    corrections : Corrections, optional
+        Corrections of ranges along exact rays.
     """
 
-    def __init__(self, stage: LeafStage, leaves: LeafGroups, image: NDArray[np.complex64]) -> None:
+    def __init__(
+        self,
+        stage: LeafStage,
+        leaves: LeafGroups,
+        image: NDArray[np.complex64],
+        corrections: Corrections | None = None,
+    ) -> None:
         self.stage, self.leaves, self.image = stage, leaves, image
+        self.corrections = corrections
         self.geometry, self.device = stage.geometry, stage.device
         self.number = {tuple(root): n for n, root in enumerate(self.geometry.roots)}
         options = stage.options(leaves.groups)
+        if corrections is not None:
+            options["CORRECTED"] = 1
         self.backproject = self.device.kernel("backproject_points", **options)
 
     def _numbers(self, sector: Sector, batch: slice = _ALL) -> slice:
@@ -50,12 +64,34 @@ class SurfaceLeaves:
         groups = self._groups(roots)
         root, leaf = np.divmod(self.leaves.leaf[groups], sector.relative_m[-1].shape[1])
         root -= roots.start
-        parts = {
+        parts: dict[str, NDArray] = {
             "ranges": self.stage.ranges(sector, root, leaf),
             "centres": float_pairs(sector.relative_m[-1][root, leaf]),
             "offsets": self.leaves.groups.offset_m[groups].reshape(-1, 3).T,
         }
+        if self.corrections is not None:
+            parts["corrections"] = self._corrections_m(sector, groups, root, leaf)
         self.stage.fill(slot, sector, parts)
+
+    def _corrections_m(
+        self, sector: Sector, groups: slice, root: NDArray[np.int64], leaf: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return the corrections of groups for the virtual channels of their leaves.
+
+        The array is [groups, channels], from the first channel of every leaf on.
+        """
+        assert self.corrections is not None
+        at_nodes_m = self.corrections.at(self.leaves.groups.middle_pixels(groups))
+        positions_m = sector.virtual[-1].position_m
+        found = np.zeros((len(root), sector.stride(-1)))
+        for number in np.unique(root):
+            here = root == number
+            of_root_m = at_nodes_m[here] @ self.corrections.weights(positions_m[number]).T
+            first = sector.needs[-1].first[number, leaf[here]]
+            channel = first[:, None] + np.arange(found.shape[1])
+            last = of_root_m.shape[1] - 1
+            found[here] = np.take_along_axis(of_root_m, np.minimum(channel, last), axis=1)
+        return found
 
     def form(self, tables: Slot, sector: Sector, batch: slice, samples: cl.Buffer) -> Finish:
         """Start forming the pixels of some roots; see `Leaves.form`."""
@@ -75,6 +111,7 @@ class SurfaceLeaves:
                 ranges=tables["ranges"],
                 first_range=groups.start - first,
                 centre_sample=self.stage.level.centre,
+                **self._corrected(tables, sector),
                 drift=self.geometry.drift,
                 geometry=tables["geometry"],
                 geometry_pitch=sector.virtual[-1].coordinate.size + VECTOR_ROOM,
@@ -103,6 +140,13 @@ class SurfaceLeaves:
             return self._put(roots, formed[0])
 
         return finish
+
+    def _corrected(self, tables: Slot, sector: Sector) -> dict[str, Any]:
+        """Return the kernel's arguments for corrections, if there are any."""
+        if self.corrections is None:
+            return {}
+        pitch = channel_pitch(sector.stride(-1))
+        return {"corrections": tables["corrections"], "channel_pitch": pitch}
 
     def blank(self, sector: Sector, batch: slice) -> Finish:
         """Return a function that sets pixels to 0; see `Leaves.blank`."""

@@ -193,7 +193,7 @@ def autofocus(
     check_navigation(lines, 10, "autofocus", may_stand=True)
     bank = first_bank(lines)
     # Antennas move alike in the water of a profile and in the homogeneous water that replaces it.
-    water = homogeneous(bank, grid, beam, IMAGE_TOLERANCE_DB)
+    water = homogeneous(bank, grid, beam, IMAGE_TOLERANCE_DB, corrected=False)
     straight = water.lines(bank)
     readout = Readout.of(_of_unit_level(straight), READ_DB)
     passage = Passage.of(straight, names, mean_wavelength_m(readout))

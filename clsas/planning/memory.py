@@ -58,6 +58,8 @@ class BufferSizes:
         Bands of channels, stage by stage: see `clsas.aperture.virtual_channels.Bands`.
     line_pitch : int
         Samples of an upsampled line including the zeros around it.
+    corrected : bool
+        True if ranges are corrected along exact rays.
     filtered : bool
         True if the device upsamples the lines by filters.
     half_precision : bool
@@ -73,6 +75,7 @@ class BufferSizes:
     most_channels: tuple[int, ...]
     bands: tuple[int, ...]
     line_pitch: int
+    corrected: bool
     filtered: bool
     half_precision: bool
 
@@ -103,7 +106,9 @@ class BufferSizes:
             channels = self.root_channels[level]
         parts, pixels = self._parts()
         points = None if self.model.surface.is_plane else roots * pixels
-        return tables | leaf_tables(roots * channels, roots * parts, points, self.model.beam)
+        corrected = self.most_channels[-1] if self.corrected else 0
+        counts = roots * channels, roots * parts, points
+        return tables | leaf_tables(*counts, self.model.beam, corrected)
 
     def work(self, roots: int) -> Buffers:
         """Return the buffers in which `roots` roots are formed together."""

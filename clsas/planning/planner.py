@@ -222,7 +222,14 @@ def planned(request: Request) -> Planned:
     is_reached = reaches(request.lines, request.grid, request.beam, model.channels_along)
     costs = _known_costs(request, exact, device, is_reached)
     room = request.memory_bytes or device.info.memory_bytes // 2
-    conditions = Conditions(factorized_db, exact, device.for_stages(), costs.costs, room)
+    conditions = Conditions(
+        factorized_db,
+        exact,
+        device.for_stages(),
+        costs.costs,
+        room,
+        corrected=water.corrections is not None,
+    )
     if is_reached:
         found, track = _chosen(request, model, conditions)
     else:  # an image of zeros needs no search, nor memory

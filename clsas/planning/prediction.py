@@ -57,6 +57,8 @@ class Conditions:
     costs : Costs
     memory_bytes : int
         Device memory that may be used.
+    corrected : bool
+        True if ranges are corrected along exact rays.
     """
 
     tolerance_db: float | None
@@ -64,6 +66,7 @@ class Conditions:
     device: Device
     costs: Costs
     memory_bytes: int
+    corrected: bool = False
 
 
 def predicted_plan(
@@ -104,6 +107,7 @@ def predicted_plan(
         most_channels=tuple(math.ceil(_ROOM * each.most) for each in channels),
         bands=tuple(each.bands for each in channels),
         line_pitch=padded_length(lines.resampling),
+        corrected=conditions.corrected,
         filtered=lines.upsampler is not None,
         half_precision=half_precision,
     )

@@ -82,8 +82,7 @@ class Change:
         seen = sample.visible.any(axis=1)
         heights = sample.points_m[seen, 2]
         level = float(heights.min() + heights.max()) / 2
-        distance = sample.distances_m[sample.visible]
-        near, far = float(distance.min()), float(distance.max())
+        near, far = _limits_m(sample, level)
         speed = float(profile.at(level))
         tx_z = lines.tx_m[:, 2]
         rx_z, middle_s = lines.rx_m[:, 2], np.zeros(lines.channels)
@@ -178,6 +177,27 @@ class Change:
         lines = self.antennas(sample.lines, sample.channels)
         range_m = straight_m(lines, sample.points_m if points_m is None else points_m)
         return sample.error(lines, range_m + self.offsets_m(sample.channels, range_m.T).T)
+
+
+def _limits_m(sample: RaySample, level_m: float) -> tuple[float, float]:
+    """Return the distances between which a level has all ranges of the visible pixels, metres.
+
+    Pixels above the level are as far away as pixels of the level that are nearer, and pixels below
+    it as far away as farther ones. Distances do not go beyond the farthest pixel by more than rays
+    do.
+    """
+    distance = sample.distances_m
+    antenna_z = sample.lines.phase_centres_m[:, 2]
+    square = distance**2 + (sample.points_m[:, 2:] - antenna_z) ** 2 - (level_m - antenna_z) ** 2
+    on_level = np.sqrt(np.maximum(square, 0.0))[sample.visible]
+    distance = distance[sample.visible]
+    near, far = min(on_level.min(), distance.min()), max(on_level.max(), distance.max())
+    profile = sample.lines.sound_speed
+    assert profile is not None
+    for z in (antenna_z.min(), antenna_z.max()):
+        if not rays(profile, np.array([far]), z, level_m).exists.all():
+            far = distance.max()
+    return float(near), float(far)
 
 
 def _times(

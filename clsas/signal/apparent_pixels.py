@@ -10,11 +10,12 @@ from scipy.spatial import cKDTree
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
-from clsas.core.ray_tables import RayTable
 from clsas.core.rays import rays
 from clsas.core.sound_speed import SoundSpeed
+from clsas.core.threads import in_threads
 from clsas.signal.apparent_antennas import Change
 from clsas.signal.ray_delays import FLIGHT_STEPS, RaySample
+from clsas.signal.ray_times import RayTimes
 
 _MOVED_AT_ONCE = 1 << 15  # pixels whose apparent positions are found together; bounds memory
 _NEWTON_STEPS = 3  # the first one leaves micrometres for antennas decimetres apart
@@ -39,23 +40,31 @@ def apparent_grid(grid: Grid, lines: RangeLines, sample: RaySample, change: Chan
     if np.ptp(lines.tx_m[:, 2]) or np.ptp(lines.rx_m[:, 2]):
         change = Change.of(level, sample, None, middles_m)
     centres_m = level.phase_centres_m
-    places_m = grid.positions_m().reshape(-1, 3)
-    distance_m, nearest = cKDTree(centres_m[:, :2]).query(places_m[:, :2])
+    moved_m = grid.positions_m().reshape(-1, 3).copy()
+    distance_m, nearest = cKDTree(centres_m[:, :2]).query(moved_m[:, :2], workers=-1)
     bend = _curvature(profile, float(np.median(distance_m)), level.tx_m[0, 2], change.level_m)
-    delay = _delays_of(profile, level, distance_m, places_m[:, 2])
-    moved_m = places_m.copy()
-    for first in range(0, len(moved_m), _MOVED_AT_ONCE):
+    limits = [(float(each.min()), float(each.max())) for each in (distance_m, moved_m[:, 2])]
+    times = RayTimes(profile, limits[0], limits[1], expected=grid.size)
+    real_z_m = [float(each[0, 2]) for each in (level.tx_m, level.rx_m)]
+
+    def move(first: int) -> None:
         some = slice(first, first + _MOVED_AT_ONCE)
+        z_m = moved_m[some, 2]
+        delay_s = np.sum([times.between(distance_m[some], z, z_m) for z in real_z_m], axis=0)
+        # There is no ray only to pixels that no channel sees.
+        delay_s = np.where(np.isfinite(delay_s), delay_s, 0.0)
         channel, away_m = nearest[some], moved_m[some, :2] - sample.centre_m
-        above_m = moved_m[some, 2] - change.level_m
-        moved_m[some, :2] += bend * above_m[:, None] * away_m
-        wanted_m = change.sound_speed_m_s * delay[some] / 2
+        moved_m[some, :2] += bend * (z_m - change.level_m)[:, None] * away_m
+        wanted_m = change.sound_speed_m_s * delay_s / 2
         range_m = wanted_m.copy()
         for _ in range(FLIGHT_STEPS):
             range_m = wanted_m - change.offsets_m(channel, range_m[:, None])[:, 0]
         aside_m = np.linalg.norm(moved_m[some, :2] - centres_m[channel, :2], axis=1)
-        antennas_z_m = change.tx_z_m[channel], change.rx_z_m[channel]
-        moved_m[some, 2] = _heights(range_m, aside_m, antennas_z_m, change.level_m)
+        apparent_z_m = change.tx_z_m[channel], change.rx_z_m[channel]
+        moved_m[some, 2] = _heights(range_m, aside_m, apparent_z_m, change.level_m)
+
+    for _ in in_threads(move, range(0, len(moved_m), _MOVED_AT_ONCE)):
+        pass
     return Grid.points(moved_m.reshape(*grid.shape, 3), georeference=grid.georeference)
 
 
@@ -101,25 +110,3 @@ def _curvature(profile: SoundSpeed, distance_m: float, z_m: float, level_m: floa
         return 0.0
     fall_m = -around_m * found.other_slope_s_m / found.slowness_s_m
     return float(-2 * np.diff(fall_m)[0] / np.diff(around_m**2)[0])
-
-
-def _delays_of(
-    profile: SoundSpeed,
-    lines: RangeLines,
-    distance_m: NDArray[np.float64],
-    z_m: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return the delays over some distances for antennas at the heights of the first channel.
-
-    The delay is 0 where there is no ray, which happens only to pixels that no channel sees.
-    """
-    delay = np.zeros(len(z_m))
-    limits = [(float(each.min()), float(each.max())) for each in (distance_m, z_m)]
-    for antenna_z_m in (lines.tx_m[0, 2], lines.rx_m[0, 2]):
-        table = RayTable.of(profile, float(antenna_z_m), *limits)
-        if table is not None:
-            delay += table.times(distance_m, z_m)
-        else:
-            found = rays(profile, distance_m, antenna_z_m, z_m)
-            delay += np.where(found.exists, found.time_s, 0.0)
-    return delay

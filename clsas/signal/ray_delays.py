@@ -81,6 +81,30 @@ def one_way_s(
     return found.time_s
 
 
+def in_beam(
+    lines: RangeLines,
+    points_m: NDArray[np.float64],
+    beam: BeamWindow,
+    along: NDArray[np.float64],
+    slack_m: float,
+) -> NDArray[np.bool_]:
+    """Return which points may lie in the beam of channels, [points, channels].
+
+    Parameters
+    ----------
+    lines : RangeLines
+    points_m : float64 [points, 3]
+    beam : BeamWindow
+    along : float64 [channels, 3]
+        Directions of the beam.
+    slack_m : float
+        Distance from a point within which pixels count as well.
+    """
+    sine = sines(points_m, lines.phase_centres_m, along).T
+    around = _BEYOND_BEAM + slack_m / np.maximum(straight_m(lines, points_m), 1e-30)
+    return (sine > beam.limits[0] - around) & (sine < beam.limits[1] + around)
+
+
 @dataclass(frozen=True, eq=False)
 class RaySample:
     """Sample pixels and channels with their exact ranges, [points, channels].
@@ -113,22 +137,28 @@ class RaySample:
         ).astype(np.int64)
         part, points_m = lines.select(some), sample_points_m(grid)
         assert part.sound_speed is not None
-        straight_m = pairwise_range_m(
-            points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
-        )
         # Sound is faster or slower than the nominal speed, and pixels lie around the sample.
+        range_m = straight_m(part, points_m)
         ratio = part.sound_speed_m_s / part.sound_speed.speed_m_s
-        slack_m = np.ptp(points_m, axis=0).max() / max(POINTS - 1, 1)
-        visible = straight_m * ratio.max() + slack_m >= part.first_range_m
-        visible &= straight_m * ratio.min() - slack_m <= part.last_range_m
+        slack_m = float(np.ptp(points_m, axis=0).max()) / max(POINTS - 1, 1)
+        visible = range_m * ratio.max() + slack_m >= part.first_range_m
+        visible &= range_m * ratio.min() - slack_m <= part.last_range_m
         if beam is not None:
-            sine = sines(points_m, part.phase_centres_m, beam.directions(lines)[some]).T
-            around = _BEYOND_BEAM + slack_m / np.maximum(straight_m, 1e-30)
-            visible &= (sine > beam.limits[0] - around) & (sine < beam.limits[1] + around)
-        delay_s = np.zeros(visible.shape)
-        point, channel = np.nonzero(visible)
-        delay_s[visible] = delays_s(part, channel, points_m[point])
-        return cls(part, some, points_m, visible, delay_s)
+            visible &= in_beam(part, points_m, beam, beam.directions(lines)[some], slack_m)
+        return cls(part, some, points_m, visible, np.zeros(visible.shape)).at(points_m)
+
+    def at(self, points_m: NDArray[np.float64]) -> RaySample:
+        """Return the same pairs of channels and points, with the points elsewhere.
+
+        Raises
+        ------
+        ValueError
+            If no direct ray connects a visible pair.
+        """
+        delay_s = np.zeros(self.visible.shape)
+        point, channel = np.nonzero(self.visible)
+        delay_s[self.visible] = delays_s(self.lines, channel, points_m[point])
+        return replace(self, points_m=points_m, delay_s=delay_s)
 
     @property
     def distances_m(self) -> NDArray[np.float64]:
@@ -187,9 +217,14 @@ class RaySample:
         return float((2 * np.pi * highest_hz) ** 2 * (square.sum(axis=1) / seen).max())
 
 
+def sample_pixels(grid: Grid) -> NDArray[np.int64]:
+    """Return the indices of sample pixels all over a grid, [n]."""
+    return grid.spread_indices(POINTS if len(grid.shape) == 2 else POINTS**2)
+
+
 def sample_points_m(grid: Grid) -> NDArray[np.float64]:
     """Return sample pixels all over a grid, [n, 3], metres."""
-    return grid.spread(POINTS if len(grid.shape) == 2 else POINTS**2)
+    return grid.at(sample_pixels(grid))
 
 
 def straight_m(lines: RangeLines, points_m: NDArray[np.float64]) -> NDArray[np.float64]:

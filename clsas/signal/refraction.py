@@ -33,6 +33,7 @@ from clsas.core.sound_speed import check_reaches
 from clsas.signal.apparent_antennas import Change
 from clsas.signal.apparent_beam import apparent_beam
 from clsas.signal.apparent_pixels import apparent_grid
+from clsas.signal.ray_corrections import Corrections
 from clsas.signal.ray_delays import RaySample, at_speed, sample_points_m, straight_m
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import REFRACTION, SHARE
@@ -100,6 +101,9 @@ class Homogeneous:
         Upper bound of the relative error power of images.
     straight : StraightRays or None
         Straight rays of the mean speed and their errors; None without a profile.
+    corrections : Corrections or None
+        Ranges that apparent antennas lack, for groups of pixels; None where they are accurate
+        enough, and on level grids.
     """
 
     grid: Grid
@@ -108,6 +112,7 @@ class Homogeneous:
     change: Change | None = None
     error: float = 0.0
     straight: StraightRays | None = None
+    corrections: Corrections | None = None
     _converted: WeakKeyDictionary[RangeLines, RangeLines] = field(
         default_factory=WeakKeyDictionary, repr=False
     )
@@ -136,7 +141,12 @@ class Homogeneous:
 
 
 def homogeneous(
-    lines: RangeLines, grid: Grid, beam: BeamWindow | None, allowed_db: float | None
+    lines: RangeLines,
+    grid: Grid,
+    beam: BeamWindow | None,
+    allowed_db: float | None,
+    *,
+    corrected: bool = True,
 ) -> Homogeneous:
     """Return the homogeneous water in which to image lines with a profile.
 
@@ -148,6 +158,8 @@ def homogeneous(
     allowed_db : float or None
         Allowed relative rms error of the image, dB. With None, or if straight rays are not within
         a small share of its power, there are apparent antennas.
+    corrected : bool
+        Whether images will have the `corrections`.
 
     Raises
     ------
@@ -187,14 +199,25 @@ def homogeneous(
         error = change.error(sample, sample_points_m(moved))
         if error < best.error:
             best = replace(best, grid=moved, change=change, error=error)
+            if corrected and error > SHARE * allowed:
+                best = _corrected(best, lines, grid, sample)
     best = _with_beam(best, lines, sample)
     best = replace(best, error=best.error + power(change.accuracy_db))
     if allowed and best.error > allowed / 2:
         validate.warn(
             f"refraction leaves an error of up to {in_db(best.error):.0f} dB, and "
-            f"{allowed_db:.3g} dB are requested: form the image in parts, as clsas.mosaic does"
+            f"{allowed_db:.3g} dB are requested"
         )
     return best
+
+
+def _corrected(water: Homogeneous, lines: RangeLines, grid: Grid, sample: RaySample) -> Homogeneous:
+    """Return homogeneous water with corrections, if they reduce the error."""
+    assert water.change is not None
+    grids = grid, water.grid
+    corrections = Corrections.of(lines, water.beam, sample, water.change, grids)
+    error = corrections.error(sample)
+    return replace(water, corrections=corrections, error=error) if error < water.error else water
 
 
 def _is_level(grid: Grid) -> bool:

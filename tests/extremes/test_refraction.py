@@ -11,6 +11,8 @@ from factorizing import EXACT_IS_SLOW
 
 import clsas
 from clsas import Grid, RangeLines, SoundSpeed
+from clsas.core.decibels import in_db
+from clsas.signal.refraction import homogeneous
 from clsas.sonar.simplify import REFRACTION
 from clsas.trials import oracle
 
@@ -139,6 +141,92 @@ def test_images_are_those_of_exact_rays(name):
     image = clsas.factorize(lines, grid, plan)
     assert oracle.error_db(image.pixels, ideal) < -50
     assert REFRACTION not in plan.left_out
+
+
+@dataclass(frozen=True)
+class Relief:
+    """Waves of 25 m length, oblique to the track."""
+
+    case: Case
+    pixel_m: float
+    uncorrected_db: float  # at the worst pixel
+
+    def height_m(self, x, y):
+        phase = 2 * np.pi * (0.87 * x + 0.5 * y) / 25
+        return self.case.relief_m * np.sin(phase)
+
+
+RELIEFS = {
+    "gradient": Relief(
+        Case(300e3, 60, **gradient(-1.0), aperture_m=5, swath_m=14, relief_m=2.0), 0.018, -40
+    ),
+    "thermocline": Relief(
+        Case(300e3, 60, **THERMOCLINE, aperture_m=5, swath_m=14, relief_m=0.5), 0.018, -25
+    ),
+    "far thermocline": Relief(
+        Case(60e3, 300, **THERMOCLINE, aperture_m=60, swath_m=40, sonar_m=5, seabed_m=45,
+             relief_m=0.5), 0.08, -45
+    ),
+}  # fmt: skip
+
+
+@cache
+def relief_scene(name):
+    """Lines, a grid on waves, some of its pixels, and the ideal image there."""
+    relief = RELIEFS[name]
+    case = relief.case
+    random = np.random.default_rng(5)
+    middle_m = np.sqrt(case.range_m**2 - (case.seabed_m - case.sonar_m) ** 2)
+    half_m, count = case.swath_m / 2, round(case.swath_m / relief.pixel_m)
+    x = np.linspace(-0.5, 0.5, CHANNELS) * case.aperture_m
+    antennas = np.stack([x, 0 * x, 0 * x - case.sonar_m], axis=1)
+    ends = (middle_m - half_m, middle_m + half_m)
+    plane = Grid.plane((-half_m, half_m, count), (*ends, count), -case.seabed_m)
+    at = plane.positions_m()
+    grid = plane.with_height(relief.height_m(at[..., 0], at[..., 1]))
+    pixels = random.integers(grid.size, size=200)
+    places = random.uniform(-half_m, half_m, (POINTS, 2)) + [0, middle_m]
+    points = np.column_stack([places, relief.height_m(*places.T) - case.seabed_m])
+    farthest_m = np.hypot(ends[1], half_m + case.aperture_m / 2) + 1
+
+    def ranges(positions_m):
+        found = np.empty((CHANNELS, len(positions_m)))
+        for index, position in enumerate(positions_m):
+            times = travel_times(
+                case.depths_m, case.speeds_m_s, case.sonar_m, -position[2], farthest_m, 1500
+            )
+            distance = np.hypot(*(position[:2] - antennas[:, :2]).T)
+            found[:, index] = NOMINAL * times(distance)
+        return found
+
+    per_m = 2 * case.carrier_hz / NOMINAL
+    band = oracle.Band(per_m, 0.15 * per_m, 0.015 * per_m)
+    echoes = [oracle.Echo(ranges(points), random.normal(size=(POINTS, 2)) @ [1, 1j], [band])]
+    pixels_m = ranges(grid.at(pixels))
+    step_m = 1 / (0.32 * per_m)
+    first_m = min(pixels_m.min(), echoes[0].range_m.min()) - 80 * step_m
+    last_m = max(pixels_m.max(), echoes[0].range_m.max())
+    length = int((last_m - first_m) / step_m) + 80
+    lines = RangeLines(
+        oracle.samples(echoes, first_m, step_m, length, per_m), first_m, step_m, antennas, antennas,
+        case.carrier_hz, NOMINAL, sound_speed=SoundSpeed(case.depths_m, case.speeds_m_s),
+    )  # fmt: skip
+    return lines, grid, pixels, oracle.image(echoes, pixels_m)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(RELIEFS))
+def test_images_over_relief_are_those_of_exact_rays(name):
+    """Two heights of equal delay focus differently, which apparent antennas alone cannot do."""
+    lines, grid, pixels, ideal = relief_scene(name)
+    alone = homogeneous(lines, grid, None, None, corrected=False)
+    assert in_db(alone.error) > RELIEFS[name].uncorrected_db
+    exact = clsas.backproject(lines, grid, accuracy_db=-62)
+    assert oracle.error_db(exact.pixels.ravel()[pixels], ideal) < -50
+    plan = clsas.plan(lines, grid, tolerance_db=-55, costs=EXACT_IS_SLOW)
+    assert not plan.is_exact
+    image = clsas.factorize(lines, grid, plan)
+    assert oracle.error_db(image.pixels.ravel()[pixels], ideal) < -50
 
 
 BEAMS = [

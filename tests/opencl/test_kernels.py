@@ -21,7 +21,9 @@ PIXELS = [beam | {"ALIGNED": aligned} for beam in BEAMS for aligned in (0, 1)]
 STAGE = NUMBERS | {"APERTURE_TAPS": 4, "CHUNK": 16}
 OPTIONS = {
     "backproject_tiles": [NUMBERS | TILE | options for options in PIXELS],
-    "backproject_points": [NUMBERS | options for options in PIXELS],
+    "backproject_points": [
+        NUMBERS | options | {"CORRECTED": corrected} for options in PIXELS for corrected in (0, 1)
+    ],
     "expand_tiles": [NUMBERS | {"BEAM": beam} for beam in (0, 64)],
     "stage": [
         STAGE | {"SHIFTS_GIVEN": given, "RAMP": ramp} for given, ramp in ((0, 0), (1, 0), (1, 1))
