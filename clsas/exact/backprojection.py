@@ -179,7 +179,9 @@ def prepare(
     fixed = taps is not None and upsampling is not None
     allowed_db = None if fixed or full_model else accuracy_db
     water = water or homogeneous(lines, grid, beam, allowed_db)
-    model = simplify(water.lines(lines), water.grid, water.beam, allowed_db)
+    corrected = water.corrections is not None
+    scene = water.lines(lines), water.grid, water.beam
+    model = simplify(*scene, allowed_db, keeps_points=corrected)
     along = None if model.beam is None else model.beam.directions(model.lines)
     device = open_device(device)
     energy = line_energy(model.lines.samples)

@@ -17,6 +17,7 @@ from clsas.core.lines import RangeLines
 from clsas.exact.blocks import band_parts, blocks_of
 from clsas.exact.buffers import block_buffers, is_bistatic, part_buffers
 from clsas.exact.checks import check_numbers
+from clsas.exact.groups import Groups
 from clsas.exact.kept import Kept
 from clsas.exact.lookup import lookup_options
 from clsas.exact.preparation import Preparation
@@ -293,7 +294,7 @@ class _Run:
                 ranges,
                 self.p.resampling,
                 self.blocks,
-                self._correction_m(lines, parts),
+                self._correction_m(channels, parts),
             ),
         )
         for name, values in references.items():
@@ -311,13 +312,13 @@ class _Run:
             parts.start - band.start,
         )
 
-    def _correction_m(self, lines: RangeLines, parts: slice) -> NDArray[np.float64] | None:
+    def _correction_m(self, channels: slice, parts: slice) -> NDArray[np.float64] | None:
         """Return the corrections of ranges for some parts, [parts, channels], if there are any."""
         water, layout = self.p.water, self.p.layout
-        if water is None or water.corrections is None or isinstance(layout, Tiles):
+        if water is None or water.corrections is None:
             return None
-        at_nodes_m = water.corrections.at(layout.middle_pixels(parts))
-        return at_nodes_m @ water.corrections.weights(lines.phase_centres_m).T
+        assert isinstance(layout, Groups)
+        return water.corrections.of(layout.middle_pixels(parts), channels)
 
     def _launch(self, job: _Job, pixels: dict[str, Any]) -> cl.Event:
         """Run the kernels of a job; `pixels` are the pixel and weight buffers of its band."""

@@ -19,6 +19,7 @@ from clsas.core.wavelengths import band_wavelength_m
 from clsas.factorized.surface import Surface
 from clsas.factorized.tree import Division
 from clsas.plans.factorization import Factorization
+from clsas.signal.ray_corrections import Corrections
 from clsas.sonar.beam import BeamWindow
 
 _ON_TRACK = 1e-4  # distance within which channels lie on the mean track, wavelengths
@@ -64,6 +65,8 @@ class Geometry:
         True if the first stage turns the phases of channels along their lines.
     slack : float
         Largest difference of aperture coordinates at which a channel appears from two points.
+    corrections : Corrections or None
+        Corrections of ranges along exact rays.
     """
 
     lines: RangeLines
@@ -85,6 +88,7 @@ class Geometry:
     on_track: bool
     ramps: bool
     slack: float
+    corrections: Corrections | None = None
 
     @property
     def roots(self) -> NDArray[np.int64]:
@@ -106,6 +110,7 @@ def geometry_of(
     factorization: Factorization,
     beam: BeamWindow | None,
     track: MeanTrack | None = None,
+    corrections: Corrections | None = None,
 ) -> Geometry:
     """Return the geometry of a factorized image.
 
@@ -117,6 +122,8 @@ def geometry_of(
     beam : BeamWindow or None
     track : MeanTrack, optional
         The mean track of the lines, with the shape that the factorization names, if it is known.
+    corrections : Corrections, optional
+        Corrections of ranges along exact rays.
 
     Raises
     ------
@@ -166,6 +173,7 @@ def geometry_of(
         on_track=on_track,
         ramps=bool(ramps),
         slack=2 * off_m / max(slowest_m, 1e-9),
+        corrections=corrections,
     )
 
 

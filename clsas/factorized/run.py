@@ -115,4 +115,4 @@ def _leaves(
     stage = LeafStage.of(lines, uploaded, roots.geometry, device, allowed_db)
     if roots.geometry.surface.is_plane:
         return PlaneLeaves(stage, pixels)
-    return SurfaceLeaves(stage, roots.groups(device.info.width), pixels, roots.corrections)
+    return SurfaceLeaves(stage, roots.groups(device.info.width), pixels)

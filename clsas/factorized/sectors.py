@@ -220,6 +220,8 @@ def references(geometry: Geometry, sector: Sector) -> dict[str, NDArray]:
     virtual = sector.virtual[0]
     channels = geometry.channels[sector.channels]
     range_m = pairwise_range_m(sector.root_m, *antennas_of(geometry.lines, channels))
+    if geometry.corrections is not None:
+        range_m += _beyond_usual_m(geometry, sector, channels)
     position = (range_m - lines.first_range_m[channels]) / lines.range_step_m
     position += resampling.lead
     cycles = lines.carrier_cycles_per_m * range_m
@@ -239,6 +241,23 @@ def references(geometry: Geometry, sector: Sector) -> dict[str, NDArray]:
     if geometry.ramps:
         references["ramp"] = virtual.ordered(_ramp(geometry, sector)).astype(np.float32)
     return references
+
+
+def _beyond_usual_m(
+    geometry: Geometry, sector: Sector, channels: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the corrections of raw channels beyond those of virtual ones, [roots, channels].
+
+    Leaves correct the ranges of virtual channels, whose receivers are as far from transmitters as
+    usual.
+    """
+    corrections = geometry.corrections
+    assert corrections is not None
+    antennas = corrections.antennas[channels]
+    usual = corrections.usual(antennas[:, :3])
+    beyond = corrections.weights(antennas) - corrections.weights(usual)
+    middle = sector.roots + np.array(geometry.division.sides[0]) // 2
+    return corrections.at(geometry.surface.pixels_in(middle)) @ beyond.T
 
 
 def _ramp(geometry: Geometry, sector: Sector) -> NDArray[np.float64]:
@@ -282,16 +301,16 @@ class Roots:
         surface: Surface | None = None,
         corrections: Corrections | None = None,
     ) -> None:
-        self.corrections = corrections
-        self._given = lines, grid, factorization, beam, track, surface
+        self._given = lines, grid, factorization, beam, track, surface, corrections
         self._sectors: list[Sector] | None = None
         self._groups: LeafGroups | None = None
 
     @functools.cached_property
     def geometry(self) -> Geometry:
         """Geometry of lines and roots."""
-        lines, grid, factorization, beam, track, surface = self._given
-        return geometry_of(lines, surface or surface_of(grid), factorization, beam, track)
+        lines, grid, factorization, beam, track, surface, corrections = self._given
+        surface = surface or surface_of(grid)
+        return geometry_of(lines, surface, factorization, beam, track, corrections)
 
     def sectors(self, first: int, most: int) -> Iterator[Sector]:
         """Yield all roots in sectors: a first one of `first` roots, then up to `most` in each.

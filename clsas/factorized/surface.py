@@ -74,6 +74,21 @@ class Surface:
         inside = np.all(corners < self.plane.shape, axis=-1)
         return inside if self.is_plane else inside & (_at(self.counts(side), side, corners) > 0)
 
+    def pixels_in(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the index of a pixel in each cell [n, 2], or in the next cell that has one."""
+        inside = np.minimum(cells, np.array(self.plane.shape) - 1)
+        number = np.ravel_multi_index((inside[:, 0], inside[:, 1]), self.plane.shape)
+        if self.is_plane:
+            return number
+        last = len(self.cell) - 1
+        order = self._in_order
+        return order[np.minimum(np.searchsorted(self.cell, number, sorter=order), last)]
+
+    @functools.cached_property
+    def _in_order(self) -> NDArray[np.int64]:
+        """Pixels in the order of their cells."""
+        return np.argsort(self.cell, kind="stable")
+
     def relief_m(
         self, side: tuple[int, int], root: tuple[int, int] | None = None
     ) -> NDArray[np.float64]:

@@ -12,7 +12,6 @@ from clsas.factorized.leaf_groups import LeafGroups
 from clsas.factorized.leaves import Finish, LeafStage
 from clsas.factorized.sectors import Sector
 from clsas.opencl.buffers import VECTOR_ROOM, Slot, channel_pitch, float_pairs
-from clsas.signal.ray_corrections import Corrections
 from clsas.sonar.beam import normalising
 
 _ALL = slice(None)
@@ -28,8 +27,6 @@ class SurfaceLeaves:
         The groups of points in all leaves.
     image : complex64 array
         The image, whose pixels are set.
-    corrections : Corrections, optional
-        Corrections of ranges along exact rays.
     """
 
     def __init__(
@@ -37,14 +34,13 @@ class SurfaceLeaves:
         stage: LeafStage,
         leaves: LeafGroups,
         image: NDArray[np.complex64],
-        corrections: Corrections | None = None,
     ) -> None:
         self.stage, self.leaves, self.image = stage, leaves, image
-        self.corrections = corrections
+        self.corrections = stage.geometry.corrections
         self.geometry, self.device = stage.geometry, stage.device
         self.number = {tuple(root): n for n, root in enumerate(self.geometry.roots)}
         options = stage.options(leaves.groups)
-        if corrections is not None:
+        if self.corrections is not None:
             options["CORRECTED"] = 1
         self.backproject = self.device.kernel("backproject_points", **options)
 
@@ -82,11 +78,13 @@ class SurfaceLeaves:
         """
         assert self.corrections is not None
         at_nodes_m = self.corrections.at(self.leaves.groups.middle_pixels(groups))
-        positions_m = sector.virtual[-1].position_m
+        antennas = self.corrections.usual(sector.virtual[-1].position_m.reshape(-1, 3))
+        weights = self.corrections.weights(antennas)
+        weights = weights.reshape(*sector.virtual[-1].coordinate.shape, -1)
         found = np.zeros((len(root), sector.stride(-1)))
         for number in np.unique(root):
             here = root == number
-            of_root_m = at_nodes_m[here] @ self.corrections.weights(positions_m[number]).T
+            of_root_m = at_nodes_m[here] @ weights[number].T
             first = sector.needs[-1].first[number, leaf[here]]
             channel = first[:, None] + np.arange(found.shape[1])
             last = of_root_m.shape[1] - 1

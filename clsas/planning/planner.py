@@ -212,7 +212,8 @@ def planned(request: Request) -> Planned:
         given.lines, given.grid, given.beam, None if given.full_model else given.tolerance_db
     )
     request = given.with_scene(water.lines(given.lines), water.grid, water.beam)
-    scene = _simplified(request)
+    corrected = water.corrections is not None
+    scene = _simplified(request, keeps_points=corrected)
     model = model_of(
         scene.lines, scene.grid, scene.beam, OUTSIDE * power(request.tolerance_db or 0.0)
     )
@@ -228,7 +229,7 @@ def planned(request: Request) -> Planned:
         device.for_stages(),
         costs.costs,
         room,
-        corrected=water.corrections is not None,
+        corrected=corrected,
     )
     if is_reached:
         found, track = _chosen(request, model, conditions)
@@ -241,10 +242,12 @@ def planned(request: Request) -> Planned:
     return Planned(chosen, Known(scene, track, model.surface, water))
 
 
-def _simplified(request: Request) -> Model:
+def _simplified(request: Request, *, keeps_points: bool) -> Model:
     """Return the scene without effects whose errors lie far below the tolerance."""
     given = request.lines, request.grid, request.beam
-    return Model(*given) if request.full_model else simplify(*given, request.tolerance_db)
+    if request.full_model:
+        return Model(*given)
+    return simplify(*given, request.tolerance_db, keeps_points=keeps_points)
 
 
 def _left_to_methods_db(

@@ -27,9 +27,9 @@ from clsas.signal.ray_times import RayTimes
 from clsas.sonar.beam import BeamWindow
 
 _GROUP = 8  # rows and columns of the largest groups of pixels, which have 64
-_NODES = 24  # channels that see a pixel; 12 also leave less than -80 dB
+_NODES = 32  # channels that see a pixel; twice as many if receivers differ
 _MOST_NODES = 512  # bounds memory
-_NEAREST = 8  # nodes from which a position is interpolated
+_NEAREST = 12  # nodes from which others are interpolated
 _BESIDE = 4  # nodes beside the visible ones that are computed as well, to interpolate at the ends
 _SINGULAR = 1e-3  # relative extent across a row of nodes, squared, below which it does not count
 _PAIRS_AT_ONCE = 1 << 16  # rays that a thread finds together; bounds memory
@@ -50,6 +50,8 @@ class Corrections:
     beam : BeamWindow or None
     change : Change
         Apparent antennas.
+    antennas : float64 [channels, 6]
+        Phase centres of all channels in homogeneous water, and receivers relative to transmitters.
     grid, apparent : Grid
         Pixels, and their apparent positions.
     times : RayTimes
@@ -60,12 +62,13 @@ class Corrections:
     along: NDArray[np.float64] | None
     beam: BeamWindow | None
     change: Change
+    antennas: NDArray[np.float64]
     grid: Grid
     apparent: Grid
     times: RayTimes
 
     @classmethod
-    def of(
+    def between(
         cls,
         lines: RangeLines,
         beam: BeamWindow | None,
@@ -77,7 +80,8 @@ class Corrections:
         assert lines.sound_speed is not None
         seen = np.count_nonzero(sample.visible, axis=1)
         share = seen[seen > 0].min() / len(sample.channels)
-        nodes = some_channels(lines.channels, min(round(_NODES / share), _MOST_NODES))
+        count = (2 if np.ptp(lines.rx_m - lines.tx_m, axis=0).any() else 1) * _NODES
+        nodes = some_channels(lines.channels, min(round(count / share), _MOST_NODES))
         nodes = np.union1d(nodes, [0, lines.channels - 1])
         part = lines.select(nodes).without_samples()
         low_m, high_m = grids[0].bounds_m
@@ -88,7 +92,9 @@ class Corrections:
             expected=grids[0].size / _GROUP**2 * len(nodes),
         )
         along = None if beam is None else beam.directions(lines)[nodes]
-        return cls(part, nodes, along, beam, change, *grids, times)
+        apparent = change.antennas(lines.without_samples(), slice(None))
+        antennas = np.column_stack([apparent.phase_centres_m, apparent.rx_m - apparent.tx_m])
+        return cls(part, nodes, along, beam, change, antennas, *grids, times)
 
     def at(self, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the corrections of some pixels for all nodes, [pixels, nodes], metres of range.
@@ -106,17 +112,24 @@ class Corrections:
             pass
         return found
 
-    def weights(self, positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the weights with which antennas interpolate between nodes, [n, nodes].
+    def of(
+        self, pixels: NDArray[np.int64], channels: NDArray[np.int64] | slice
+    ) -> NDArray[np.float64]:
+        """Return the corrections of pixels for some channels, [pixels, channels], metres."""
+        return self.at(pixels) @ self.weights(self.antennas[channels]).T
 
-        The positions, [n, 3], are those of phase centres in homogeneous water.
-        """
-        centres_m = self.change.antennas(self.lines, self.nodes).phase_centres_m
-        count = min(_NEAREST, len(centres_m))
-        nearest = cKDTree(centres_m).query(positions_m, k=count)[1].reshape(-1, count)
-        weights = np.zeros((len(positions_m), len(centres_m)))
-        values = _interpolating(centres_m[nearest], positions_m)
-        np.put_along_axis(weights, nearest, values, axis=1)
+    def usual(self, centres_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return antennas [n, 6] at phase centres [n, 3], with receivers as far away as usual."""
+        apart_m = np.broadcast_to(self.antennas[:, 3:].mean(axis=0), centres_m.shape)
+        return np.concatenate([centres_m, apart_m], axis=1)
+
+    def weights(self, antennas: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the weights of nodes that interpolate to antennas [n, 6], [n, nodes]."""
+        nodes = self.antennas[self.nodes]
+        count = min(_NEAREST, len(nodes))
+        nearest = cKDTree(nodes).query(antennas, k=count)[1].reshape(-1, count)
+        weights = np.zeros((len(antennas), len(nodes)))
+        np.put_along_axis(weights, nearest, _interpolating(nodes[nearest], antennas), axis=1)
         return weights
 
     def error(self, sample: RaySample) -> float:
@@ -130,7 +143,7 @@ class Corrections:
         there = sample.at(self.grid.at(beside))
         antennas = self.change.antennas(there.lines, there.channels)
         range_m = straight_m(antennas, self.apparent.at(beside))
-        range_m += self.at(pixels) @ self.weights(antennas.phase_centres_m).T
+        range_m += self.of(pixels, there.channels)
         range_m += self.change.offsets_m(there.channels, range_m.T).T
         return there.error(antennas, range_m)
 
@@ -220,9 +233,9 @@ def _filled(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np
 
 
 def _interpolating(
-    nodes_m: NDArray[np.float64], positions_m: NDArray[np.float64]
+    nodes_m: NDArray[np.float64], wanted_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the weights of nodes [n, count, 3] that interpolate to positions [n, 3], [n, count].
+    """Return the weights of nodes [n, count, axes] that interpolate to [n, axes], [n, count].
 
     They are exact for cubics along the direction in which the nodes extend most, for quadratics
     across it, and for what is linear in the third direction, as far as the nodes extend there. Of
@@ -234,7 +247,7 @@ def _interpolating(
     scale_m = np.maximum(np.abs(offset_m).max(axis=(1, 2)), 1e-9)[:, None, None]
     axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset_m, offset_m))[1][..., ::-1]
     nodes = offset_m / scale_m @ axes
-    position = (positions_m[:, None] - middle_m) / scale_m @ axes
+    position = (wanted_m[:, None] - middle_m) / scale_m @ axes
     position = np.clip(position, nodes.min(axis=1, keepdims=True), nodes.max(axis=1, keepdims=True))
     square = np.sum((nodes - position) ** 2, axis=-1)
     closeness = 1 / (square + square.mean(axis=1, keepdims=True) / 4 + 1e-12)
@@ -246,8 +259,8 @@ def _interpolating(
 
 
 def _terms(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the polynomials of `_interpolating` at positions along three axes, [..., terms]."""
-    along, across, aside = np.moveaxis(position, -1, 0)
+    """Return the polynomials of `_interpolating` at positions along its axes, [..., terms]."""
+    along, across, aside = np.moveaxis(position, -1, 0)[:3]
     cubic = chebyshev.chebvander(along, 3)
     others = np.stack([across, along * across, across**2, aside], axis=-1)
     return np.concatenate([cubic, others], axis=-1)

@@ -39,6 +39,7 @@ from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import REFRACTION, SHARE
 
 _MOST_KEPT_BYTES = 256 << 20  # of the samples of lines whose conversion is kept
+_CORRECTED = 1 / 4  # of the allowed error power, above which ranges are corrected
 _LEVEL_M = 1e-6  # relief of a grid that counts as level
 
 
@@ -199,8 +200,8 @@ def homogeneous(
         error = change.error(sample, sample_points_m(moved))
         if error < best.error:
             best = replace(best, grid=moved, change=change, error=error)
-            if corrected and error > SHARE * allowed:
-                best = _corrected(best, lines, grid, sample)
+    if corrected and best.error > _CORRECTED * allowed:
+        best = _corrected(best, lines, grid, sample)
     best = _with_beam(best, lines, sample)
     best = replace(best, error=best.error + power(change.accuracy_db))
     if allowed and best.error > allowed / 2:
@@ -212,12 +213,19 @@ def homogeneous(
 
 
 def _corrected(water: Homogeneous, lines: RangeLines, grid: Grid, sample: RaySample) -> Homogeneous:
-    """Return homogeneous water with corrections, if they reduce the error."""
+    """Return homogeneous water with corrections, if they reduce the error.
+
+    Its pixels are then points, because only groups of points have corrections.
+    """
     assert water.change is not None
-    grids = grid, water.grid
-    corrections = Corrections.of(lines, water.beam, sample, water.change, grids)
+    points = water.grid
+    if points.points_m is None:
+        points = Grid.points(points.positions_m(), georeference=points.georeference)
+    corrections = Corrections.between(lines, water.beam, sample, water.change, (grid, points))
     error = corrections.error(sample)
-    return replace(water, corrections=corrections, error=error) if error < water.error else water
+    if error >= water.error:
+        return water
+    return replace(water, grid=points, corrections=corrections, error=error)
 
 
 def _is_level(grid: Grid) -> bool:

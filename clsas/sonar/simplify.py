@@ -83,7 +83,12 @@ class Model:
 
 
 def simplify(
-    lines: RangeLines, grid: Grid, beam: BeamWindow | None, allowed_db: float | None
+    lines: RangeLines,
+    grid: Grid,
+    beam: BeamWindow | None,
+    allowed_db: float | None,
+    *,
+    keeps_points: bool = False,
 ) -> Model:
     """Return the simplest model whose error is a small share of the allowed error.
 
@@ -93,6 +98,8 @@ def simplify(
         The full model.
     allowed_db : float or None
         Allowed relative rms error of the image, dB. With None nothing is left out.
+    keeps_points : bool
+        Whether the relief stays, however small, so that points remain points.
 
     Notes
     -----
@@ -119,7 +126,7 @@ def simplify(
                 simpler, amplitude = fitted
                 model = Model(simpler, grid, _with_directions(beam, lines), effects)
                 break
-    if not flat:
+    if not flat and not keeps_points:
         found = 2 * np.pi * highest * _relief_m(lines, grid, most / (2 * np.pi * highest))
         if found <= most and _plane(grid) is not None:
             amplitude += found

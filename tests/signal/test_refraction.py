@@ -8,6 +8,7 @@ from cases import along_x, lines_over
 import clsas
 from clsas import BeamWindow, ClsasWarning, Grid, SoundSpeed
 from clsas.core.decibels import in_db
+from clsas.exact.groups import gather
 from clsas.signal.ray_delays import RaySample, delays_s
 from clsas.signal.refraction import homogeneous
 from clsas.sonar.simplify import REFRACTION
@@ -37,6 +38,13 @@ def error_db(lines, grid=GRID, beam=None):
     range_m = clsas.core.geometry.bistatic_range_m(
         water.grid.at(pixel), *antennas, velocity, straight.sound_speed_m_s
     )
+    if water.corrections is not None:  # those of another pixel of the group
+        groups = gather(water.grid, np.inf, 16)
+        group = np.empty(grid.size, int)
+        group[groups.index.ravel()] = np.repeat(np.arange(groups.parts), groups.part_pixels)
+        given_m = water.corrections.at(groups.middle_pixels(slice(None)))[group[pixel]]
+        weights = water.corrections.weights(water.corrections.antennas[channel])
+        range_m += np.einsum("nk,nk->n", given_m, weights)
     offset_m = water.change.offsets_m(channel, range_m[:, None])[:, 0]
     away_s = 2 * (range_m + offset_m) / straight.sound_speed_m_s - delay_s
     rms = np.sqrt(np.mean((2 * np.pi * lines.carrier_hz * away_s) ** 2))
