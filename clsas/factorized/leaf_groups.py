@@ -26,17 +26,21 @@ class LeafGroups:
         Number of groups before each root, and in total.
     pixels_before : int64 [roots + 1]
         Number of pixels before each root, and in total.
+    corrections_m : float64 [groups, nodes] or None
+        Corrections of ranges of each group; see `clsas.signal.ray_corrections`.
     """
 
     groups: Groups
     leaf: NDArray[np.int64]
     ends: NDArray[np.int64]
     pixels_before: NDArray[np.int64]
+    corrections_m: NDArray[np.float64] | None
 
     @property
     def nbytes(self) -> int:
         """Memory of the groups, bytes."""
-        return self.groups.index.nbytes + self.groups.offset_m.nbytes
+        of_corrections = 0 if self.corrections_m is None else self.corrections_m.nbytes
+        return self.groups.index.nbytes + self.groups.offset_m.nbytes + of_corrections
 
 
 def leaf_groups(geometry: Geometry, width: int) -> LeafGroups:
@@ -48,12 +52,16 @@ def leaf_groups(geometry: Geometry, width: int) -> LeafGroups:
     leaves = _cells(geometry, corners, width)
     leaf, cell = (each.ravel()[surface.cell] for each in leaves)
     groups, of_leaf = groups_within(surface.grid, leaf, cell, middles_m, width)
+    corrections_m = None
+    if geometry.corrections is not None:
+        corrections_m = geometry.corrections.at(groups.middle_pixels(slice(None)))
     held = np.bincount(leaf // corners.shape[1], minlength=len(roots))
     return LeafGroups(
         groups,
         of_leaf,
         ends=np.searchsorted(of_leaf, np.arange(len(roots) + 1) * corners.shape[1]),
         pixels_before=np.concatenate([[0], np.cumsum(held)]),
+        corrections_m=corrections_m,
     )
 
 

@@ -77,7 +77,8 @@ class SurfaceLeaves:
         The array is [groups, channels], from the first channel of every leaf on.
         """
         assert self.corrections is not None
-        at_nodes_m = self.corrections.at(self.leaves.groups.middle_pixels(groups))
+        assert self.leaves.corrections_m is not None
+        at_nodes_m = self.leaves.corrections_m[groups]
         antennas = self.corrections.usual(sector.virtual[-1].position_m.reshape(-1, 3))
         weights = self.corrections.weights(antennas)
         weights = weights.reshape(*sector.virtual[-1].coordinate.shape, -1)
