@@ -251,11 +251,13 @@ def _interpolating(
     position = np.clip(position, nodes.min(axis=1, keepdims=True), nodes.max(axis=1, keepdims=True))
     square = np.sum((nodes - position) ** 2, axis=-1)
     closeness = 1 / (square + square.mean(axis=1, keepdims=True) / 4 + 1e-12)
+    closeness /= closeness.sum(axis=1, keepdims=True)
     terms, wanted = _terms(nodes), _terms(position)[:, 0]
     weighted = closeness[..., None] * terms
-    gram = np.einsum("nkt,nku->ntu", weighted, terms) / closeness.sum(axis=1)[:, None, None]
+    gram = np.einsum("nkt,nku->ntu", weighted, terms)
     solved = np.einsum("ntu,nu->nt", np.linalg.pinv(gram, rcond=_SINGULAR, hermitian=True), wanted)
-    return np.einsum("nkt,nt->nk", weighted, solved) / closeness.sum(axis=1)[:, None]
+    weights = np.einsum("nkt,nt->nk", weighted, solved)
+    return weights + (1 - weights.sum(axis=1, keepdims=True)) * closeness
 
 
 def _terms(position: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,7 +15,6 @@ COLUMNS = (
     "band, range",
     "sound speed",
     "seabed",
-    "mean speed dB",
     "apparent antennas dB",
     "corrected dB",
 )
@@ -112,6 +111,5 @@ def rows() -> Iterator[list[str]]:
             alone, corrected = (
                 homogeneous(lines, grid, None, None, corrected=each) for each in (False, True)
             )
-            assert alone.straight is not None
-            errors = alone.straight.error, alone.error, corrected.error
-            yield [scene.name, scene.water, seabed, *(f"{in_db(each):.0f}" for each in errors)]
+            errors = (f"{in_db(each.error):.0f}" for each in (alone, corrected))
+            yield [scene.name, scene.water, seabed, *errors]
