@@ -1,5 +1,7 @@
 """The buffers that a run allocates are those that its prediction of memory adds up."""
 
+from dataclasses import replace
+
 import pytest
 from factorizing import (
     BEAMS,
@@ -11,18 +13,30 @@ from factorizing import (
     straight,
 )
 
+from clsas.core.sound_speed import SoundSpeed
 from clsas.exact.backprojection import backproject
 from clsas.opencl.buffers import Slot
 from clsas.planning import exact_image, memory, prediction
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
+from clsas.signal.refraction import homogeneous
 from clsas.sonar.beam import BeamWindow
+
+
+def refracted_hills():
+    """Hills below a profile in which the ranges of groups are corrected."""
+    lines, grid = made(hills)
+    profile = SoundSpeed([0, 10, 11, 15], [1500, 1500, 1470, 1470], surface_z_m=1.0)
+    assert homogeneous(replace(lines, sound_speed=profile), grid, None, -60).corrections is not None
+    return replace(lines, sound_speed=profile), grid
+
 
 TOLERANCE = {"tolerance_db": -40, "costs": EXACT_IS_SLOW}
 NORMALISING = BeamWindow(20, "hann", normalise=True)
 CASES = {
     "plane": (straight, TOLERANCE),
     "relief": (hills, TOLERANCE),
+    "relief in a profile": (refracted_hills, TOLERANCE | {"tolerance_db": -60}),
     "moving receivers": (moving_array, TOLERANCE),
     "beam": (straight, TOLERANCE | {"beam": BEAMS[0]}),
     "normalising beam": (straight, TOLERANCE | {"beam": NORMALISING}),
