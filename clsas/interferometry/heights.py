@@ -23,7 +23,7 @@ from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.wavelengths import cycles_per_m_at
-from clsas.interferometry.baseline import Baseline, sight_lattice
+from clsas.interferometry.baseline import Baseline, Lattice, sight_lattice
 from clsas.interferometry.checks import (
     check_echoes,
     check_geometry,
@@ -49,6 +49,9 @@ from clsas.sonar.beam import BeamWindow
 
 LEAST_COHERENCE = 0.5
 """Default of the smallest coherence with a valid height."""
+
+BEYOND = {"lower": "below", "upper": "above"}
+"""Where the seabed seems to lie if the banks agree best at an end of the search."""
 
 _LOOKS = 50.0  # in the default window: a deviation of 0.1 rad at a coherence of 0.7
 _TRIAL_PIXELS = 9  # side of the window that measures the density of samples; arbitrary
@@ -223,15 +226,53 @@ def measure(
     pair: Pair, grid: Grid, request: Request, progress: Callable[[int, int], None] | None
 ) -> Heights:
     """Return the heights that a pair of banks shows."""
-    found, refined = measured(pair, grid, request, progress)
-    _warn(refined)
-    return found
+    found = measured(pair, grid, request, progress)
+    _warn_of_doubts(found.doubts)
+    _warn(found.refined)
+    return found.heights
+
+
+class Doubts(NamedTuple):
+    """What makes the cycles of the phase uncertain.
+
+    Attributes
+    ----------
+    end : {"lower", "upper"} or None
+        End of the search at which the banks agree best.
+    large_m : float or None
+        Side of the windows that decide between cycles, metres, if the grid is smaller.
+    ambiguity_m : float
+        Height of ambiguity.
+    """
+
+    end: str | None
+    large_m: float | None
+    ambiguity_m: float
+
+
+class Measured(NamedTuple):
+    """Heights, and how they were found.
+
+    Attributes
+    ----------
+    heights : Heights
+    refined : Refined
+        Includes pixels in shadow.
+    sights : Lattice
+        How the banks see the grid.
+    doubts : Doubts
+    """
+
+    heights: Heights
+    refined: Refined
+    sights: Lattice
+    doubts: Doubts
 
 
 def measured(
     pair: Pair, grid: Grid, request: Request, progress: Callable[[int, int], None] | None
-) -> tuple[Heights, Refined]:
-    """Return heights, and how they were refined, without a warning if that did not succeed.
+) -> Measured:
+    """Return heights, and how they were found, without a warning of what is doubtful.
 
     Raises
     ------
@@ -242,7 +283,9 @@ def measured(
     heights_m = _sweep_heights(task.search_m, task.ambiguity_m)
     total = len(heights_m) + PASSES
     report = progress or (lambda done, total: None)
-    relief = _first_relief(task, images, window_m, heights_m, lambda done: report(done, total))
+    relief, doubts = _first_relief(
+        task, images, window_m, heights_m, lambda done: report(done, total)
+    )
     sights = sight_lattice(task.baseline, grid, task.search_m)
     refined = refine(
         replace(task, pair=pair),
@@ -264,7 +307,7 @@ def measured(
         refined.image,
         window_m,
     )
-    return found, refined
+    return Measured(found, refined, sights, doubts)
 
 
 def windows(pair: Pair, grid: Grid, request: Request) -> tuple[float, Window, Window]:
@@ -324,7 +367,7 @@ def _first_relief(
     window_m: float,
     heights_m: NDArray[np.float64],
     progress: Callable[[int], None],
-) -> Relief:
+) -> tuple[Relief, Doubts]:
     """Return the relief that a sweep over heights finds, from some rows and columns of the grid.
 
     `images` are those on a level surface, which show how many independent samples there are.
@@ -335,16 +378,20 @@ def _first_relief(
     small = Window.of(coarser, window_m)
     looks = effective_looks(tuple(each[few, few] for each in images), small)
     large = _large_window(looks, small, task.relative_band, task.least_coherence)
+    large_m = None
     if task.search_m[1] - task.search_m[0] > task.ambiguity_m:
-        _check_size(coarser, large, task.ambiguity_m)
+        large_m = _larger_m(coarser, large)
     curves = Curves.over(task.baseline, coarser, heights_m)
     validate.memory("grid and search_m", 32 * len(heights_m) * curves.grid.size)
     found = sweep(task.pair.within(_SWEPT_DB), curves, small, large, progress)
     reliable = found.coherence >= noise_coherence(looks, _FALSE_ALARM / len(heights_m))
-    if reliable.mean() > 2 * _FALSE_ALARM:
-        _check_ends(found, task.ambiguity_m)
+    end = _end_of(found) if reliable.mean() > 2 * _FALSE_ALARM else None
     rows, columns = (np.arange(math.ceil((n - 1) / every) + 1.0) for n in task.grid.shape)
-    return _finer(found.relief(rows, columns, reliable, task.ambiguity_m), every, task.grid.shape)
+    relief = found.relief(rows, columns, reliable, task.ambiguity_m)
+    return (
+        _finer(relief, every, task.grid.shape),
+        Doubts(end, large_m, task.ambiguity_m),
+    )
 
 
 def _finer(relief: Relief, every: int, shape: tuple[int, ...]) -> Relief:
@@ -390,32 +437,40 @@ def _large_window(
     return window.scaled(math.sqrt(max(needed / looks, 1)))
 
 
-def _check_size(grid: Grid, large: Window, ambiguity_m: float) -> None:
-    """Warn if a grid is too small to tell the cycles of the phase apart."""
-    if large.rows > grid.shape[0] or large.columns > grid.shape[1]:
-        side_m = large.rows * float(np.linalg.norm(grid.vectors_m[1]))
-        validate.warn(
-            f"grid is smaller than the windows of {side_m:.2g} m that tell heights apart which "
-            f"differ by the height of ambiguity, {ambiguity_m:.3g} m, where the coherence is low: "
-            "make the grid larger or search_m smaller"
-        )
+def _larger_m(grid: Grid, large: Window) -> float | None:
+    """Return the side of windows that decide between cycles, m, if they are larger than a grid."""
+    if large.rows <= grid.shape[0] and large.columns <= grid.shape[1]:
+        return None
+    return large.rows * float(np.linalg.norm(grid.vectors_m[1]))
 
 
-def _check_ends(found: Sweep, ambiguity_m: float) -> None:
-    """Warn if the banks agree best at an end of the search, one height beyond which was imaged.
+def _end_of(found: Sweep) -> str | None:
+    """Return the end of the search at which the banks agree best; one height beyond was imaged.
 
     The phase cannot show this, but the magnitude of the coherence falls with the distance from the
     seabed. Averaged over an image, it does so clearly, even within a sixth of a cycle.
     """
     best = int(found.profile.argmax())
     if 0 < best < len(found.profile) - 1:
-        return
-    end, beyond = ("lower", "below") if best == 0 else ("upper", "above")
-    validate.warn(
-        f"search_m may not contain the seabed: the banks agree best at its {end} end, so that most "
-        f"of the seabed seems to lie {beyond} it. Heights may be wrong by multiples of the height "
-        f"of ambiguity, {ambiguity_m:.3g} m: search farther {beyond}"
-    )
+        return None
+    return "lower" if best == 0 else "upper"
+
+
+def _warn_of_doubts(doubts: Doubts) -> None:
+    if doubts.large_m is not None:
+        validate.warn(
+            f"grid is smaller than the windows of {doubts.large_m:.2g} m that tell heights apart "
+            f"which differ by the height of ambiguity, {doubts.ambiguity_m:.3g} m, where the "
+            "coherence is low: make the grid larger or search_m smaller"
+        )
+    if doubts.end is not None:
+        beyond = BEYOND[doubts.end]
+        validate.warn(
+            f"search_m may not contain the seabed: the banks agree best at its {doubts.end} end, "
+            f"so that most of the seabed seems to lie {beyond} it. Heights may be wrong by "
+            f"multiples of the height of ambiguity, {doubts.ambiguity_m:.3g} m: search farther "
+            f"{beyond}"
+        )
 
 
 def _warn(refined: Refined) -> None:

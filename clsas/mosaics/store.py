@@ -39,8 +39,10 @@ from clsas.mosaics.documents import (
 )
 from clsas.mosaics.levels import (
     LEVELS,
+    SHADOWED,
     WINDOW,
     layers_of,
+    shadowed_of,
     stored_levels,
 )
 from clsas.mosaics.metadata import GROUP, has_height
@@ -128,7 +130,8 @@ class Store:
     @property
     def layers(self) -> tuple[str, ...]:
         """Names of the arrays that `read_layer` can read, empty unless the mosaic has heights."""
-        return layers_of(read_document(self.path))
+        attributes = read_document(self.path)
+        return (*layers_of(attributes), *shadowed_of(attributes))
 
     @property
     def levels(self) -> tuple[int, ...]:
@@ -379,7 +382,8 @@ class Store:
         zarr_arrays().write_values(self.path, attributes, first.name, (rows, columns), pixels)
         factors = stored_levels(attributes).of_patches
         found = {1: Level(np.abs(pixels), pixels)} | levels(pixels, factors)
-        of_layers = layer_levels(layers, factors, attributes.get(WINDOW))
+        with_levels = {name: layers[name] for name in layers_of(attributes)}
+        of_layers = layer_levels(with_levels, factors, attributes.get(WINDOW)) | {1: layers}
         for array in others:
             window = array.window((row, column))
             level = found[array.factor]._replace(layers=of_layers[array.factor])
@@ -483,7 +487,7 @@ class Store:
             Pixels of the mosaic, or of the level.
         factor : int
             1, or one of `levels`, whose values are means of the pixels that have one; `sd_m` is the
-            standard deviation of the mean of the heights.
+            standard deviation of the mean of the heights. Heights of shadows have no levels.
 
         Returns
         -------
@@ -503,6 +507,8 @@ class Store:
                 f"({', '.join(self.layers) or 'none: it has no heights'}), got {name!r}"
             )
         if validate.count("factor", factor) != 1:
+            if name in SHADOWED:
+                raise ValueError(f"factor must be 1 for {name}, which has no levels, got {factor}")
             factor = self._checked_factor(factor)
         return self._read(f"{factor}x/{name}" if factor > 1 else name, rows, columns)
 
