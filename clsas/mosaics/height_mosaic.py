@@ -213,15 +213,20 @@ def _warn_of_doubts(records: dict[PatchIndex, Record]) -> None:
     measured = {index: each for index, each in known.items() if "reason" not in each}
     beyond = {index: each for index, each in measured.items() if each["best_end"]}
     if beyond:
+        of_ends = {
+            end: some
+            for end in heights.BEYOND
+            if (some := [index for index, each in beyond.items() if each["best_end"] == end])
+        }
+        sides = [heights.BEYOND[end] for end in of_ends]
         ends = [
             f"its {end} end in {_in_words(some)}, where most of the seabed seems to lie {side} it"
-            for end, side in heights.BEYOND.items()
-            if (some := [index for index, each in beyond.items() if each["best_end"] == end])
+            for (end, some), side in zip(of_ends.items(), sides, strict=True)
         ]
         validate.warn(
             f"search_m may not contain the seabed: of {len(records)} patches, the banks agree best "
             f"at {'; and at '.join(ends)}. Heights may be wrong by multiples of the height of "
-            f"ambiguity, {_span(beyond)}: search farther"
+            f"ambiguity, {_span(beyond)}: search farther {' and '.join(sides)}"
         )
     small = {index: each for index, each in measured.items() if each["large_m"] is not None}
     if small:

@@ -235,8 +235,9 @@ def test_one_warning_names_all_patches_that_miss_the_seabed(tmp_path):
     assert text.startswith(
         "search_m may not contain the seabed: of 6 patches, the banks agree best at its lower end "
         "in 6 (0,0; 0,1; 1,0; 1,1; ...), where most of the seabed seems to lie below it. Heights "
-        "may be wrong by multiples of the height of ambiguity, 2."
+        "may be wrong by multiples of the height of ambiguity, 1."
     )
+    assert text.endswith(" m: search farther below")
     assert measure() == text  # of patches that were measured before
 
 
