@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 import clsas
 from clsas.cli import options
@@ -107,7 +105,7 @@ def pair_errors(
         other=_measured(*other) if other else None, known_sd_m=known_sd_m,
         unknowns=unknowns or UNKNOWNS, tolerance_db=tolerance_db, beam=beam, device=device,
     )  # fmt: skip
-    clsas.save(output, _with_bank(lines, numbers[1], found.corrected(first, second)))
+    clsas.save(output, banks.with_bank(lines, numbers[1], found.corrected(first, second)))
     described = found.describe().replace("\n", "\n  ")
     report(as_json, f"{printable(output)}: {described}", file=output, **found.figures)
 
@@ -118,17 +116,3 @@ def _measured(
     """Return the lines of both banks of a track, and the heights measured from them."""
     lines, (first, second) = load_banks(lines_file)
     return lines.bank(first), lines.bank(second), load_heights(heights_file)
-
-
-def _with_bank(lines: clsas.RangeLines, number: int, bank: clsas.RangeLines) -> clsas.RangeLines:
-    """Return lines in which those of one bank have other samples, ranges and receivers."""
-    members = banks.members(lines.bank_numbers, number)
-
-    def put(name: str) -> Any:
-        values = np.array(getattr(lines, name))
-        values[members] = getattr(bank, name)
-        return values
-
-    return replace(
-        lines, samples=put("samples"), first_range_m=put("first_range_m"), rx_m=put("rx_m")
-    )

@@ -187,7 +187,9 @@ class ReliefPart:
         chosen = np.nonzero(self.valid[local] & may_be)
         place = np.array([rows[chosen[0]], columns[chosen[1]]])
         found = np.zeros(may_be.shape, bool)
-        found[chosen] = self._below(fine, place, self.most_m[local][chosen], tangent[:, *chosen], 1)
+        found[chosen] = self._below(
+            fine, place, self.most_m[local][chosen], tangent[:, chosen[0], chosen[1]], 1
+        )
         return found
 
     def _below(

@@ -65,7 +65,8 @@ class Layout:
 
     def indices(self) -> Iterator[PatchIndex]:
         """Yield the indices of all patches, row by row."""
-        return itertools.product(*map(range, self.shape))
+        rows, columns = self.shape
+        return itertools.product(range(rows), range(columns))
 
 
 @dataclass(frozen=True, eq=False)

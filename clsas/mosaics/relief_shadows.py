@@ -263,8 +263,11 @@ def _lattice(record: Record) -> Lattice:
     assert record.heights is not None
     stored = record.heights[_SIGHTS]
     tangent = np.array(stored["tangent"], np.float64)
-    axes = (np.array(stored[name], np.float64) for name in ("rows", "columns", "offset_m"))
-    return Lattice(*axes, np.concatenate([np.zeros_like(tangent[..., :1]), tangent], axis=-1))
+    rows, columns, offset_m = (
+        np.array(stored[name], np.float64) for name in ("rows", "columns", "offset_m")
+    )
+    values = np.concatenate([np.zeros_like(tangent[..., :1]), tangent], axis=-1)
+    return Lattice(rows, columns, offset_m, values)
 
 
 def _rounded(values: NDArray[np.float64]) -> NDArray[np.float64]:
