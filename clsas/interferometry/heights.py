@@ -36,12 +36,13 @@ from clsas.interferometry.coherence import (
     effective_looks,
     noise_coherence,
 )
+from clsas.interferometry.doubts import Doubts, end_of, larger_m
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.refinement import PASSES, Refined, filled, refine
 from clsas.interferometry.request import Request
 from clsas.interferometry.result import Heights
 from clsas.interferometry.shadows import in_shadow
-from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, Sweep, sweep
+from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, sweep
 from clsas.interferometry.task import Task
 from clsas.opencl.device import Device, open_device
 from clsas.signal.spectrum import measure_spectrum
@@ -49,9 +50,6 @@ from clsas.sonar.beam import BeamWindow
 
 LEAST_COHERENCE = 0.5
 """Default of the smallest coherence with a valid height."""
-
-BEYOND = {"lower": "below", "upper": "above"}
-"""Where the seabed seems to lie if the banks agree best at an end of the search."""
 
 _LOOKS = 50.0  # in the default window: a deviation of 0.1 rad at a coherence of 0.7
 _TRIAL_PIXELS = 9  # side of the window that measures the density of samples; arbitrary
@@ -227,27 +225,9 @@ def measure(
 ) -> Heights:
     """Return the heights that a pair of banks shows."""
     found = measured(pair, grid, request, progress)
-    _warn_of_doubts(found.doubts)
+    found.doubts.warn()
     _warn(found.refined)
     return found.heights
-
-
-class Doubts(NamedTuple):
-    """What makes the cycles of the phase uncertain.
-
-    Attributes
-    ----------
-    end : {"lower", "upper"} or None
-        End of the search at which the banks agree best.
-    large_m : float or None
-        Side of the windows that decide between cycles, metres, if the grid is smaller.
-    ambiguity_m : float
-        Height of ambiguity.
-    """
-
-    end: str | None
-    large_m: float | None
-    ambiguity_m: float
 
 
 class Measured(NamedTuple):
@@ -380,12 +360,12 @@ def _first_relief(
     large = _large_window(looks, small, task.relative_band, task.least_coherence)
     large_m = None
     if task.search_m[1] - task.search_m[0] > task.ambiguity_m:
-        large_m = _larger_m(coarser, large)
+        large_m = larger_m(coarser, large)
     curves = Curves.over(task.baseline, coarser, heights_m)
     validate.memory("grid and search_m", 32 * len(heights_m) * curves.grid.size)
     found = sweep(task.pair.within(_SWEPT_DB), curves, small, large, progress)
     reliable = found.coherence >= noise_coherence(looks, _FALSE_ALARM / len(heights_m))
-    end = _end_of(found) if reliable.mean() > 2 * _FALSE_ALARM else None
+    end = end_of(found) if reliable.mean() > 2 * _FALSE_ALARM else None
     rows, columns = (np.arange(math.ceil((n - 1) / every) + 1.0) for n in task.grid.shape)
     relief = found.relief(rows, columns, reliable, task.ambiguity_m)
     return (
@@ -435,42 +415,6 @@ def _large_window(
     per_look = math.sqrt(1.5 * (1 - least_coherence**2)) / (math.pi * least_coherence)
     needed = (_CYCLE_SD * per_look / (relative_band / 2)) ** 2
     return window.scaled(math.sqrt(max(needed / looks, 1)))
-
-
-def _larger_m(grid: Grid, large: Window) -> float | None:
-    """Return the side of windows that decide between cycles, m, if they are larger than a grid."""
-    if large.rows <= grid.shape[0] and large.columns <= grid.shape[1]:
-        return None
-    return large.rows * float(np.linalg.norm(grid.vectors_m[1]))
-
-
-def _end_of(found: Sweep) -> str | None:
-    """Return the end of the search at which the banks agree best; one height beyond was imaged.
-
-    The phase cannot show this, but the magnitude of the coherence falls with the distance from the
-    seabed. Averaged over an image, it does so clearly, even within a sixth of a cycle.
-    """
-    best = int(found.profile.argmax())
-    if 0 < best < len(found.profile) - 1:
-        return None
-    return "lower" if best == 0 else "upper"
-
-
-def _warn_of_doubts(doubts: Doubts) -> None:
-    if doubts.large_m is not None:
-        validate.warn(
-            f"grid is smaller than the windows of {doubts.large_m:.2g} m that tell heights apart "
-            f"which differ by the height of ambiguity, {doubts.ambiguity_m:.3g} m, where the "
-            "coherence is low: make the grid larger or search_m smaller"
-        )
-    if doubts.end is not None:
-        beyond = BEYOND[doubts.end]
-        validate.warn(
-            f"search_m may not contain the seabed: the banks agree best at its {doubts.end} end, "
-            f"so that most of the seabed seems to lie {beyond} it. Heights may be wrong by "
-            f"multiples of the height of ambiguity, {doubts.ambiguity_m:.3g} m: search farther "
-            f"{beyond}"
-        )
 
 
 def _warn(refined: Refined) -> None:

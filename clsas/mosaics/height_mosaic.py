@@ -27,6 +27,7 @@ from clsas.core.lines import RangeLines
 from clsas.interferometry import heights
 from clsas.interferometry.checks import check_grid, check_pair
 from clsas.interferometry.coherence import Window
+from clsas.interferometry.doubts import BEYOND
 from clsas.interferometry.heights import LEAST_COHERENCE
 from clsas.interferometry.request import Request
 from clsas.mosaics.arguments import beam_of_growing
@@ -215,10 +216,10 @@ def _warn_of_doubts(records: dict[PatchIndex, Record]) -> None:
     if beyond:
         of_ends = {
             end: some
-            for end in heights.BEYOND
+            for end in BEYOND
             if (some := [index for index, each in beyond.items() if each["best_end"] == end])
         }
-        sides = [heights.BEYOND[end] for end in of_ends]
+        sides = [BEYOND[end] for end in of_ends]
         ends = [
             f"its {end} end in {_in_words(some)}, where most of the seabed seems to lie {side} it"
             for (end, some), side in zip(of_ends.items(), sides, strict=True)

@@ -20,7 +20,7 @@ from clsas.mosaics.stored_arrays import StoredArrays, zarr_arrays
 
 @dataclass(frozen=True, eq=False)
 class PatchValues:
-    """What a store keeps of a patch.
+    """Pixels, layers and record of a patch, as a store keeps them.
 
     Attributes
     ----------

@@ -106,9 +106,12 @@ class Processed:
             If the file has changed since it was written, or the mosaic is damaged or does not fit
             into memory.
         """
-        if "store" in self["heights"].numbers:
-            return Store.opened(self["heights"].numbers["store"]).heights()
-        return self._result("heights", Heights)
+        record = self["heights"]
+        if "store" not in record.numbers:
+            return self._result("heights", Heights)
+        # The folder may have moved, with the store inside.
+        elsewhere = record.numbers["store"] if "store" in record.options else None
+        return Store.opened(elsewhere or self.folder / "heights.zarr").heights()
 
     def _result(self, name: str, kind: type) -> Any:
         record = self[name]
