@@ -1,7 +1,9 @@
 """The step `heights` of a processing: heights from the corrected lines of two receiver banks."""
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from clsas.core.validate import ClsasWarning
 from clsas.files.process_tables import checked_steps
 from clsas.files.scene_files import read_scene
 from clsas.mosaics.documents import read_document
+from clsas.processing.steps import is_mosaic
 
 pytest.importorskip("matplotlib")
 
@@ -359,6 +362,16 @@ def test_mistakes_of_pair_errors_are_named(scene, table, message):
     with pytest.raises(ValueError, match=message):
         clsas.process(scene)
     assert not scene.with_suffix("").exists()
+
+
+def test_the_example_of_the_documentation_is_a_scene(scene):
+    page = (Path(__file__).parents[2] / "docs" / "scene-files.md").read_text()
+    _, example = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    scene.write_text(SCENE[: SCENE.index("[process]")] + example)
+    described = read_scene(scene)
+    assert checked_steps(None, described.process)[-2:] == ("image", "heights")
+    assert described.process["steps"] == ("pair_errors", "heights")
+    assert is_mosaic("heights", described)
 
 
 def test_pair_errors_need_both_tables(scene):
