@@ -36,6 +36,14 @@ def load(path: Path, *kinds: type) -> Any:
     raise ValueError(f"{path} must hold {wanted}, got {type(obj).__name__}")
 
 
+def load_heights(path: Path) -> clsas.Heights:
+    """Return the heights of a file, or those of some pixels of every window of a store."""
+    if path.is_dir():
+        return clsas.Store.opened(path).sampled_heights()
+    heights: clsas.Heights = load(path, clsas.Heights)
+    return heights
+
+
 def load_lines(
     path: Path, bank: int | None, described: SceneFile | None = None
 ) -> clsas.RangeLines:

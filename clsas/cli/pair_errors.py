@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, load_banks, read_beam
+from clsas.cli.inputs import load_banks, load_heights, read_beam
 from clsas.cli.outputs import printable, report
-from clsas.cli.parameters import HDF5, INPUT, POSITION
+from clsas.cli.parameters import HDF5_OR_STORE, INPUT, POSITION, keep_out
 from clsas.core import banks, validate
 from clsas.files.scene_files import SceneFile
 from clsas.interferometry.pair_errors_result import UNKNOWNS
@@ -22,12 +20,12 @@ from clsas.interferometry.pair_errors_result import UNKNOWNS
 
 @click.command("pair-errors")
 @click.argument("lines_file", metavar="LINES.H5", type=INPUT)
-@click.argument("heights_file", metavar="HEIGHTS.H5", type=HDF5)
+@click.argument("heights_file", metavar="HEIGHTS", type=HDF5_OR_STORE)
 @options.output("Corrected range lines")
 @click.option(
     "--known-height-m",
     type=float,
-    help="Height of a level seabed above the grid of HEIGHTS.H5 (m).",
+    help="Height of a level seabed above the grid of HEIGHTS (m).",
 )
 @click.option(
     "--point",
@@ -40,8 +38,8 @@ from clsas.interferometry.pair_errors_result import UNKNOWNS
 @click.option(
     "--other",
     nargs=2,
-    type=HDF5,
-    metavar="LINES.H5 HEIGHTS.H5",
+    type=HDF5_OR_STORE,
+    metavar="LINES.H5 HEIGHTS",
     help="Range lines of the same sonar on another track, and heights of the same seabed.",
 )
 @click.option(
@@ -80,9 +78,10 @@ def pair_errors(
 ) -> None:
     """Correct phase, delay and roll of two receiver banks.
 
-    HEIGHTS.H5 has the heights that clsas heights measured from both banks of LINES.H5. They are
-    compared with --known-height-m, with control points, or with heights from another track. Then
-    measure the heights again.
+    HEIGHTS has the heights that clsas heights measured from both banks of LINES.H5: an HDF5 file,
+    or the store of a mosaic, of which some pixels of every window are read. They are compared with
+    --known-height-m, with control points, or with heights from another track. Then measure the
+    heights again.
 
     \b
     Example:  clsas pair-errors lines.h5 heights.h5 --known-height-m 0 -o corrected.h5
@@ -95,15 +94,18 @@ def pair_errors(
             "give one of --known-height-m, --point and --other, got "
             + (" and ".join(used) or "none")
         )
+    for store in (heights_file, *(other or ())[1:]):
+        if store.is_dir():
+            keep_out("--output", output, "the store", store)
     lines, numbers = load_banks(lines_file)
     first, second = (lines.bank(number) for number in numbers)
     found = clsas.pair_errors(
-        first, second, load(heights_file, clsas.Heights), known_height_m=known_height_m,
+        first, second, load_heights(heights_file), known_height_m=known_height_m,
         points_m=[(*point, 0.0)[:3] for point in points] or None,
         other=_measured(*other) if other else None, known_sd_m=known_sd_m,
         unknowns=unknowns or UNKNOWNS, tolerance_db=tolerance_db, beam=beam, device=device,
     )  # fmt: skip
-    clsas.save(output, _with_bank(lines, numbers[1], found.corrected(first, second)))
+    clsas.save(output, banks.with_bank(lines, numbers[1], found.corrected(first, second)))
     described = found.describe().replace("\n", "\n  ")
     report(as_json, f"{printable(output)}: {described}", file=output, **found.figures)
 
@@ -113,18 +115,4 @@ def _measured(
 ) -> tuple[clsas.RangeLines, clsas.RangeLines, clsas.Heights]:
     """Return the lines of both banks of a track, and the heights measured from them."""
     lines, (first, second) = load_banks(lines_file)
-    return lines.bank(first), lines.bank(second), load(heights_file, clsas.Heights)
-
-
-def _with_bank(lines: clsas.RangeLines, number: int, bank: clsas.RangeLines) -> clsas.RangeLines:
-    """Return lines in which those of one bank have other samples, ranges and receivers."""
-    members = banks.members(lines.bank_numbers, number)
-
-    def put(name: str) -> Any:
-        values = np.array(getattr(lines, name))
-        values[members] = getattr(bank, name)
-        return values
-
-    return replace(
-        lines, samples=put("samples"), first_range_m=put("first_range_m"), rx_m=put("rx_m")
-    )
+    return lines.bank(first), lines.bank(second), load_heights(heights_file)

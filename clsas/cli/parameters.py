@@ -180,8 +180,8 @@ class Store(File):
 class Hdf5(File):
     """An HDF5 file to read. If it is a scene file, the message shows the usual command."""
 
-    def __init__(self) -> None:
-        super().__init__(exists=True, dir_okay=False)
+    def __init__(self, *, or_store: bool = False) -> None:
+        super().__init__(exists=True, dir_okay=or_store)
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Path:
         """Return the path; a usage error if it is a scene file."""
@@ -200,6 +200,7 @@ class Hdf5(File):
 
 INPUT = File(exists=True, dir_okay=False)
 HDF5 = Hdf5()
+HDF5_OR_STORE = Hdf5(or_store=True)
 
 
 def keep_apart(one: str, path: Path | None, other: str, path_of_other: Path | None) -> None:

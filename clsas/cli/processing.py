@@ -47,10 +47,10 @@ def process(
     """Take a recording to a focused image, step by step.
 
     The table [process] of the scene names the recording and the steps: inspect, calibrate,
-    navigate, focus, image, heights and mosaic. The results go into one folder, where process.json
-    records inputs, versions and results of every step. After an interruption the same command
-    continues. It repeats a step only if something changed, and replaces only files that its record
-    lists.
+    navigate, focus, pair_errors, image, heights and mosaic. The results go into one folder, where
+    process.json records inputs, versions and results of every step. After an interruption the same
+    command continues. It repeats a step only if something changed, and replaces only files that its
+    record lists.
 
     \b
     Example:  clsas process scene.toml --lines lines.h5 -o processed
@@ -86,7 +86,7 @@ def _in_words(step: StepRecord) -> str:
     if step.name == "inspect":
         count = len(numbers["findings"])
         return f"; {count} finding{'s' * (count != 1)}"
-    if step.name == "calibrate":
+    if step.name in ("calibrate", "pair_errors"):
         pairs = zip(numbers["unknowns"], numbers["values"], numbers["sd"], strict=True)
         return "; " + ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, value, sd in pairs)
     if step.name == "navigate":

@@ -7,6 +7,7 @@ for a single bank.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -87,6 +88,20 @@ def pair(lines: RangeLines) -> tuple[RangeLines, RangeLines]:
     """Return the lines of the two banks from which heights are measured; see `first_two`."""
     first, second = first_two(lines.bank_numbers)
     return lines.bank(first), lines.bank(second)
+
+
+def with_bank(lines: RangeLines, number: int, bank: RangeLines) -> RangeLines:
+    """Return lines in which those of a bank have other samples, ranges and receivers."""
+    of_bank = members(lines.bank_numbers, number)
+
+    def put(name: str) -> NDArray:
+        values = np.array(getattr(lines, name))
+        values[of_bank] = getattr(bank, name)
+        return values
+
+    return replace(
+        lines, samples=put("samples"), first_range_m=put("first_range_m"), rx_m=put("rx_m")
+    )
 
 
 def together(lines: RangeLines) -> str | None:

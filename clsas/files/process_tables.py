@@ -13,20 +13,27 @@ from pydantic import Field
 from clsas.core import validate
 from clsas.files.tables import Table, Vector, located
 from clsas.interferometry.checks import checked_coherence, checked_search
+from clsas.interferometry.pair_errors_result import UNKNOWNS as OF_PAIRS
 from clsas.navigation.autofocus import UNKNOWNS as FOCUSED
 from clsas.navigation.known_points import UNKNOWNS as CALIBRATED
 from clsas.navigation.micronavigation import UNKNOWNS as NAVIGATED
 from clsas.planning.request import tolerance_in_db
 
-STEPS = ("inspect", "calibrate", "navigate", "focus", "image", "heights", "mosaic")
+STEPS = (
+    "inspect", "calibrate", "navigate", "focus", "pair_errors", "image", "heights", "mosaic"
+)  # fmt: skip
 """Steps of `clsas process`, in the order in which they run."""
 
-CORRECTIONS = ("calibrate", "navigate", "focus")
+CORRECTIONS = ("calibrate", "navigate", "focus", "pair_errors")
 """Steps that correct the lines."""
 
 _USUAL = ("inspect", "image")
 _OPTIONAL = (*CORRECTIONS, "heights")  # by default they run if their table exists
-_REQUIRED = {"calibrate": "points_m", "heights": "search_m"}  # key without which a step cannot run
+_REQUIRED = {  # tables without which a step cannot run, each with a key that it must have
+    "calibrate": {"calibrate": "points_m"},
+    "pair_errors": {"pair_errors": "known_height_m or points_m", "heights": "search_m"},
+    "heights": {"heights": "search_m"},
+}
 _Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
@@ -87,17 +94,48 @@ class _Focus(Table):
         return options
 
 
+class _PairErrors(Table):
+    known_height_m: float | None = None
+    points_m: list[Vector] | None = None
+    known_sd_m: float | None = None
+    unknowns: list[str] | None = None
+
+    def build(self) -> dict[str, Any]:
+        options = self.given()
+        with located("[process.pair_errors]"):
+            names = [name for name in ("known_height_m", "points_m") if name in options]
+            if len(names) != 1:
+                raise ValueError(
+                    "one of known_height_m and points_m must be given, got "
+                    + (" and ".join(names) or "none")
+                )
+            _check(options, validate.number, known_height_m="m")
+            if self.points_m is not None:
+                options["points_m"] = validate.array(
+                    "points_m", self.points_m, np.float64, (None, 3)
+                )
+            if self.known_sd_m is not None:
+                validate.number("known_sd_m", self.known_sd_m, "m", least=0.0)
+            _check_unknowns(options, OF_PAIRS)
+        return options
+
+
 class _Heights(Table):
     search_m: _Pair
     window_m: float | None = None
     least_coherence: float | None = None
     tolerance_db: float | None = None
+    patch_m: float | None = None
+    store: str | None = None
 
-    def build(self) -> dict[str, Any]:
+    def build(self, folder: Path) -> dict[str, Any]:
         options = self.given()
         with located("[process.heights]"):
             options["search_m"] = checked_search(self.search_m)
-            _check(options, validate.positive, window_m="m")
+            _check(options, validate.positive, window_m="m", patch_m="m")
+            if self.store is not None:
+                validate.suffix("store", Path(self.store), ".zarr")
+                options["store"] = folder / self.store
             if self.least_coherence is not None:
                 checked_coherence(self.least_coherence)
             tolerance_in_db(self.tolerance_db, None)
@@ -114,6 +152,7 @@ class ProcessTable(Table):
     calibrate: _Calibrate | None = None
     navigate: _Navigate | None = None
     focus: _Focus | None = None
+    pair_errors: _PairErrors | None = None
     heights: _Heights | None = None
 
     def build(self, folder: Path) -> dict[str, Any]:
@@ -129,7 +168,7 @@ class ProcessTable(Table):
                 options["bank"] = validate.count("bank", self.bank, least=0)
         for name in _OPTIONAL:
             if (table := getattr(self, name)) is not None:
-                options[name] = table.build()
+                options[name] = table.build(folder) if name == "heights" else table.build()
         with located("[process]"):
             if self.steps is not None:
                 options["steps"] = checked_steps(self.steps, options)
@@ -150,9 +189,10 @@ def checked_steps(steps: Sequence[str] | None, options: dict[str, Any]) -> tuple
         chosen = set(validate.named("steps", steps, STEPS))
     if not chosen:
         raise ValueError(f"steps must name at least one of {STEPS}, got none")
-    for name, key in _REQUIRED.items():
-        if name in chosen and name not in options:
-            raise ValueError(f"steps may include {name} only with {key} in [process.{name}]")
+    for name, tables in _REQUIRED.items():
+        for table, key in tables.items():
+            if name in chosen and table not in options:
+                raise ValueError(f"steps may include {name} only with {key} in [process.{table}]")
     return tuple(name for name in STEPS if name in chosen)
 
 

@@ -23,7 +23,7 @@ from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.wavelengths import cycles_per_m_at
-from clsas.interferometry.baseline import Baseline, sight_lattice
+from clsas.interferometry.baseline import Baseline, Lattice, sight_lattice
 from clsas.interferometry.checks import (
     check_echoes,
     check_geometry,
@@ -36,12 +36,13 @@ from clsas.interferometry.coherence import (
     effective_looks,
     noise_coherence,
 )
+from clsas.interferometry.doubts import Doubts, end_of, larger_m
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.refinement import PASSES, Refined, filled, refine
 from clsas.interferometry.request import Request
 from clsas.interferometry.result import Heights
 from clsas.interferometry.shadows import in_shadow
-from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, Sweep, sweep
+from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, sweep
 from clsas.interferometry.task import Task
 from clsas.opencl.device import Device, open_device
 from clsas.signal.spectrum import measure_spectrum
@@ -223,15 +224,35 @@ def measure(
     pair: Pair, grid: Grid, request: Request, progress: Callable[[int, int], None] | None
 ) -> Heights:
     """Return the heights that a pair of banks shows."""
-    found, refined = measured(pair, grid, request, progress)
-    _warn(refined)
-    return found
+    found = measured(pair, grid, request, progress)
+    found.doubts.warn()
+    _warn(found.refined)
+    return found.heights
+
+
+class Measured(NamedTuple):
+    """Heights, and how they were found.
+
+    Attributes
+    ----------
+    heights : Heights
+    refined : Refined
+        Includes pixels in shadow.
+    sights : Lattice
+        How the banks see the grid.
+    doubts : Doubts
+    """
+
+    heights: Heights
+    refined: Refined
+    sights: Lattice
+    doubts: Doubts
 
 
 def measured(
     pair: Pair, grid: Grid, request: Request, progress: Callable[[int, int], None] | None
-) -> tuple[Heights, Refined]:
-    """Return heights, and how they were refined, without a warning if that did not succeed.
+) -> Measured:
+    """Return heights, and how they were found, without a warning of what is doubtful.
 
     Raises
     ------
@@ -242,7 +263,9 @@ def measured(
     heights_m = _sweep_heights(task.search_m, task.ambiguity_m)
     total = len(heights_m) + PASSES
     report = progress or (lambda done, total: None)
-    relief = _first_relief(task, images, window_m, heights_m, lambda done: report(done, total))
+    relief, doubts = _first_relief(
+        task, images, window_m, heights_m, lambda done: report(done, total)
+    )
     sights = sight_lattice(task.baseline, grid, task.search_m)
     refined = refine(
         replace(task, pair=pair),
@@ -264,7 +287,7 @@ def measured(
         refined.image,
         window_m,
     )
-    return found, refined
+    return Measured(found, refined, sights, doubts)
 
 
 def windows(pair: Pair, grid: Grid, request: Request) -> tuple[float, Window, Window]:
@@ -324,7 +347,7 @@ def _first_relief(
     window_m: float,
     heights_m: NDArray[np.float64],
     progress: Callable[[int], None],
-) -> Relief:
+) -> tuple[Relief, Doubts]:
     """Return the relief that a sweep over heights finds, from some rows and columns of the grid.
 
     `images` are those on a level surface, which show how many independent samples there are.
@@ -335,16 +358,20 @@ def _first_relief(
     small = Window.of(coarser, window_m)
     looks = effective_looks(tuple(each[few, few] for each in images), small)
     large = _large_window(looks, small, task.relative_band, task.least_coherence)
+    large_m = None
     if task.search_m[1] - task.search_m[0] > task.ambiguity_m:
-        _check_size(coarser, large, task.ambiguity_m)
+        large_m = larger_m(coarser, large)
     curves = Curves.over(task.baseline, coarser, heights_m)
     validate.memory("grid and search_m", 32 * len(heights_m) * curves.grid.size)
     found = sweep(task.pair.within(_SWEPT_DB), curves, small, large, progress)
     reliable = found.coherence >= noise_coherence(looks, _FALSE_ALARM / len(heights_m))
-    if reliable.mean() > 2 * _FALSE_ALARM:
-        _check_ends(found, task.ambiguity_m)
+    end = end_of(found) if reliable.mean() > 2 * _FALSE_ALARM else None
     rows, columns = (np.arange(math.ceil((n - 1) / every) + 1.0) for n in task.grid.shape)
-    return _finer(found.relief(rows, columns, reliable, task.ambiguity_m), every, task.grid.shape)
+    relief = found.relief(rows, columns, reliable, task.ambiguity_m)
+    return (
+        _finer(relief, every, task.grid.shape),
+        Doubts(end, large_m, task.ambiguity_m),
+    )
 
 
 def _finer(relief: Relief, every: int, shape: tuple[int, ...]) -> Relief:
@@ -388,34 +415,6 @@ def _large_window(
     per_look = math.sqrt(1.5 * (1 - least_coherence**2)) / (math.pi * least_coherence)
     needed = (_CYCLE_SD * per_look / (relative_band / 2)) ** 2
     return window.scaled(math.sqrt(max(needed / looks, 1)))
-
-
-def _check_size(grid: Grid, large: Window, ambiguity_m: float) -> None:
-    """Warn if a grid is too small to tell the cycles of the phase apart."""
-    if large.rows > grid.shape[0] or large.columns > grid.shape[1]:
-        side_m = large.rows * float(np.linalg.norm(grid.vectors_m[1]))
-        validate.warn(
-            f"grid is smaller than the windows of {side_m:.2g} m that tell heights apart which "
-            f"differ by the height of ambiguity, {ambiguity_m:.3g} m, where the coherence is low: "
-            "make the grid larger or search_m smaller"
-        )
-
-
-def _check_ends(found: Sweep, ambiguity_m: float) -> None:
-    """Warn if the banks agree best at an end of the search, one height beyond which was imaged.
-
-    The phase cannot show this, but the magnitude of the coherence falls with the distance from the
-    seabed. Averaged over an image, it does so clearly, even within a sixth of a cycle.
-    """
-    best = int(found.profile.argmax())
-    if 0 < best < len(found.profile) - 1:
-        return
-    end, beyond = ("lower", "below") if best == 0 else ("upper", "above")
-    validate.warn(
-        f"search_m may not contain the seabed: the banks agree best at its {end} end, so that most "
-        f"of the seabed seems to lie {beyond} it. Heights may be wrong by multiples of the height "
-        f"of ambiguity, {ambiguity_m:.3g} m: search farther {beyond}"
-    )
 
 
 def _warn(refined: Refined) -> None:

@@ -53,7 +53,8 @@ def pair_errors(
     a, b : RangeLines
         Range lines of the two banks.
     found : Heights
-        Heights that `heights` measured from them.
+        Heights that `heights` measured from them. Of a mosaic of heights, `Store.sampled_heights`
+        are enough.
     known_height_m : float or array_like, [rows, columns], optional
         Known heights above the plane of `found`, metres, at its pixels, NaN where they are not
         known. A number stands for a level seabed.

@@ -36,6 +36,7 @@ from clsas.mosaics.levels import (
     IN_DB,
     LAYERS,
     LEVELS,
+    SHADOWED,
     WINDOW,
     Levels,
     PixelArray,
@@ -288,9 +289,10 @@ def _meaning(array: PixelArray) -> dict[str, Any]:
     """Return unit and meaning of the numbers of an array, as xarray shows them."""
     if array.name == IN_DB:
         return {"units": "dB", "long_name": "amplitude"}
-    if array.kind not in LAYERS:
+    known = LAYERS | SHADOWED
+    if array.kind not in known:
         return {}
-    units, meaning = LAYERS[array.kind]
+    units, meaning = known[array.kind]
     return {"units": units, "long_name": meaning} if units else {"long_name": meaning}
 
 

@@ -26,13 +26,17 @@ CHECKSUM = "crc32"
 
 FORMAT = "clsas mosaic"
 VERSION = 3
-READABLE = (2, 3, 4)  # version 1 had no checksums, version 2 no levels, and version 3 no heights
-
-HEIGHTS_VERSION = 4
+HEIGHTS_VERSION = 5
 """Version of mosaics of heights. Those of images are of version 3 still."""
+
+# Version 1 had no checksums, version 2 no levels, and version 4 no heights of pixels in shadow.
+READABLE = (2, VERSION, HEIGHTS_VERSION)
 
 DIGESTS = "metadata"
 """Attribute with a digest of every array's metadata. Stores of early versions lack it."""
+
+PARTS_OF_B = "parts_of_b"
+"""Input with the digests of the second bank's files, if they are not those of the first one."""
 
 VECTORS = "origin_m", "row_step_m", "column_step_m"
 """Vectors that define the plane of a grid."""
@@ -140,7 +144,7 @@ def read_document(path: Path) -> dict[str, Any]:
     if attributes.get("version") not in READABLE:
         raise ValueError(
             f"{path} is a mosaic of version {attributes.get('version')}, but this clsas works "
-            f"with versions {READABLE[0]} to {READABLE[-1]}: choose another path"
+            f"with versions {', '.join(map(str, READABLE))}: choose another path"
         )
     if not is_intact(attributes):
         raise ValueError(f"{path} is damaged: its attributes do not match their checksum")
@@ -179,8 +183,9 @@ def check_inputs(inputs: Any, shape: Sequence[int] | None) -> None:
     """
     validate.instance("inputs", inputs, dict)
     parts, pixels = inputs.get("parts"), inputs.get("pixels")
-    if not isinstance(parts, list):
-        raise ValueError(f"inputs must have a list 'parts', got {validate.shown(parts)}")
+    for name, each in (("parts", parts), (PARTS_OF_B, inputs.get(PARTS_OF_B, []))):
+        if not isinstance(each, list):
+            raise ValueError(f"inputs must have a list {name!r}, got {validate.shown(each)}")
     if not _is_shape(pixels) or (shape is not None and pixels != list(shape)):
         expected = "of two numbers" if shape is None else f"{list(shape)}, the shape of the grid"
         raise ValueError(f"inputs must have 'pixels' {expected}, got {validate.shown(pixels)}")

@@ -114,7 +114,7 @@ class Job:
         """Return the store, or None if there is none."""
         return None if self.store is None else Store.at(self.store)
 
-    def complete_levels(self) -> None:
+    def complete(self) -> None:
         """Compute the levels of the store that mix patches, once all patches are finished."""
         store = self.opened_store()
         if store is not None:

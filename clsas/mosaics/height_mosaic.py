@@ -27,15 +27,18 @@ from clsas.core.lines import RangeLines
 from clsas.interferometry import heights
 from clsas.interferometry.checks import check_grid, check_pair
 from clsas.interferometry.coherence import Window
+from clsas.interferometry.doubts import BEYOND
 from clsas.interferometry.heights import LEAST_COHERENCE
 from clsas.interferometry.request import Request
+from clsas.mosaics.arguments import beam_of_growing
 from clsas.mosaics.banks import Bank
 from clsas.mosaics.devices import open_devices
-from clsas.mosaics.documents import read_document
+from clsas.mosaics.documents import PARTS_OF_B, read_document
 from clsas.mosaics.height_patches import HeightsJob, seen
 from clsas.mosaics.levels import aligned_side, factors_of
 from clsas.mosaics.patches import Layout
 from clsas.mosaics.provenance import inputs_of
+from clsas.mosaics.record import PatchIndex, Record
 from clsas.mosaics.scheduling import Run, form_patches
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import open_survey
@@ -44,6 +47,7 @@ from clsas.sonar.beam import BeamWindow
 
 _SIDE = 1024  # pixels along a patch by default, which then takes about 0.6 GiB
 _TRIAL = 512  # largest side of the part of the grid that decides on the windows; arbitrary
+_NAMED = 4  # patches that a warning names; the others are only counted
 _MARGIN_WINDOWS = 2.0  # beside half a large one: for as many passes, of half a window each
 
 Lines = RangeLines | str | os.PathLike
@@ -67,8 +71,8 @@ def mosaic_heights(
     """Measure the heights of a seabed of any size patch by patch, and return their store.
 
     The store keeps every patch as it is finished. After an interruption, the same call continues
-    with the others. If files have been added to the survey since, finished patches to which their
-    channels contribute are measured again.
+    with the others. If files have been added since to the folder of the survey, or to those of both
+    banks, finished patches to which their channels contribute are measured again.
 
     Parameters
     ----------
@@ -81,7 +85,7 @@ def mosaic_heights(
     store : path
         Zarr store to write, or to continue.
     search_m, tolerance_db, least_coherence, beam
-        See `heights`. A beam's direction is computed from the whole track.
+        See `heights`. A beam's direction is computed from the whole track, as for `mosaic`.
     window_m : float, optional
         Side of the windows, metres. By default those in the middle of the grid contain about 50
         independent samples. The window is the same in all patches.
@@ -115,9 +119,9 @@ def mosaic_heights(
     Warns
     -----
     ClsasWarning
-        If a store is damaged, whose damaged patches are then measured again; or if, in a patch, the
-        banks agree best at an end of the search, or it is too small to tell heights of ambiguity
-        apart, as for `heights`.
+        If a store is damaged, whose damaged patches are then measured again; or once, at the end,
+        if there are patches in which the banks agree best at an end of the search, or which are too
+        small to tell heights of ambiguity apart, as for `heights`.
 
     See Also
     --------
@@ -130,9 +134,8 @@ def mosaic_heights(
     the cycles of the phase, and with all that lies at the same ranges within the search. So heights
     hardly depend on the division into patches: at most as much as they still change in the last
     pass, about 0.3 standard deviations. The number of independent samples is measured in every
-    patch, and with it the standard deviation and the threshold of the coherence. Shadows are an
-    exception: they are found from the relief of a patch and its margin. Where a shadow is longer
-    and reaches another patch, pixels in it may count as valid, as far as they are coherent.
+    patch, and with it the standard deviation and the threshold of the coherence. Shadows may be
+    longer than patches: once all are finished, they are found from the relief of all of them.
 
     Patches without lines, or whose geometry shows no heights, such as one below the track, contain
     NaN. `Record.flags` gives the reason.
@@ -169,7 +172,9 @@ def mosaic_heights(
     if patch_m is not None:
         patch_m = validate.positive("patch_m", patch_m, "m")
     validate.progress(progress)
-    banks = _banks(a, b, beam)
+    if request.beam is not None and any(_is_folder(each) for each in (a, b)):
+        request = replace(request, beam=beam_of_growing(request.beam))
+    banks = _banks(a, b, request.beam)
     check_pair(*(bank.geometry for bank in banks))
     grid = placed(banks[1].geometry, placed(banks[0].geometry, grid))
     opened = Store.at(validate.path("store", store))
@@ -199,7 +204,54 @@ def mosaic_heights(
     with closing(form_patches(run, finished)) as forming:
         for _ in forming:
             report(len(finished), len(layout))
+    _warn_of_doubts(finished)
     return opened
+
+
+def _warn_of_doubts(records: dict[PatchIndex, Record]) -> None:
+    """Warn once of all patches in which the cycles of the phase are uncertain."""
+    known = {index: each.heights for index, each in records.items() if each.heights is not None}
+    measured = {index: each for index, each in known.items() if "reason" not in each}
+    beyond = {index: each for index, each in measured.items() if each["best_end"]}
+    if beyond:
+        of_ends = {
+            end: some
+            for end in BEYOND
+            if (some := [index for index, each in beyond.items() if each["best_end"] == end])
+        }
+        sides = [BEYOND[end] for end in of_ends]
+        ends = [
+            f"its {end} end in {_in_words(some)}, where most of the seabed seems to lie {side} it"
+            for (end, some), side in zip(of_ends.items(), sides, strict=True)
+        ]
+        validate.warn(
+            f"search_m may not contain the seabed: of {len(records)} patches, the banks agree best "
+            f"at {'; and at '.join(ends)}. Heights may be wrong by multiples of the height of "
+            f"ambiguity, {_span(beyond)}: search farther {' and '.join(sides)}"
+        )
+    small = {index: each for index, each in measured.items() if each["large_m"] is not None}
+    if small:
+        large_m = max(each["large_m"] for each in small.values())
+        validate.warn(
+            f"of {len(records)} patches, {_in_words(list(small))}, even with their margins, are "
+            f"smaller than the windows of up to {large_m:.2g} m that tell heights apart which "
+            f"differ by the height of ambiguity, {_span(small)}, where the coherence is low: make "
+            "patch_m and the grid larger, or search_m smaller"
+        )
+
+
+def _in_words(indices: list[PatchIndex]) -> str:
+    """Return the number of patches, and the first of them."""
+    named = "; ".join(f"{row},{column}" for row, column in sorted(indices)[:_NAMED])
+    return f"{len(indices)} ({named}{'; ...' if len(indices) > _NAMED else ''})"
+
+
+def _span(measured: dict[PatchIndex, dict[str, Any]]) -> str:
+    """Return the heights of ambiguity of some patches, in words."""
+    least, most = (
+        f"{edge(each['ambiguity_m'] for each in measured.values()):.3g}" for edge in (min, max)
+    )
+    return f"{least} m" if least == most else f"{least} to {most} m"
 
 
 def _banks(a: Lines, b: Lines | None, beam: BeamWindow | None) -> tuple[Bank, Bank]:
@@ -226,6 +278,10 @@ def _banks(a: Lines, b: Lines | None, beam: BeamWindow | None) -> tuple[Bank, Ba
     return Bank.of(survey, both[0], beam), Bank.of(survey, both[1], beam)
 
 
+def _is_folder(lines: Any) -> bool:
+    return isinstance(lines, (str, os.PathLike)) and Path(lines).is_dir()
+
+
 def _source(name: str, lines: Any) -> RangeLines | Path:
     return lines if isinstance(lines, RangeLines) else validate.path(name, lines)
 
@@ -246,7 +302,7 @@ def _inputs(banks: tuple[Bank, Bank], grid: Grid, request: Request) -> dict[str,
     first, second = (bank.survey for bank in banks)
     inputs = inputs_of(first, grid, {"tolerance_db": request.tolerance_db}, request.beam)
     if second is not first:
-        inputs["parts"] += second.digests()
+        inputs[PARTS_OF_B] = second.digests()
     inputs |= {"search_m": list(request.search_m), "least_coherence": request.least_coherence}
     return json.loads(json.dumps(inputs))
 
@@ -266,7 +322,12 @@ def _decide(
 ) -> dict[str, Any]:
     """Return the window and the margin of a new mosaic, from images of the middle of the grid."""
     middle = grid.window(*(_middle(count) for count in grid.shape))
-    pair, _ = seen(banks, middle, request, device)
+    pair, known, silent = seen(banks, middle, request, device)
+    if silent:
+        raise ValueError(
+            f"{silent[0]} must contain echoes, got samples that are all zero or not finite in the "
+            f"{known['channels']} channels that receive from the middle of the grid"
+        )
     if pair is None:
         raise ValueError(
             "grid must lie where the lines reach it: no channel receives from its middle"

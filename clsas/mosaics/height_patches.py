@@ -23,13 +23,13 @@ from clsas.interferometry.baseline import Baseline
 from clsas.interferometry.errors import UnmeasurableError
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.request import Request
-from clsas.interferometry.result import Heights
 from clsas.interferometry.sweep import Curves
 from clsas.mosaics.banks import Bank
 from clsas.mosaics.devices import thread_device
-from clsas.mosaics.levels import LAYERS
-from clsas.mosaics.patches import PatchWindow
+from clsas.mosaics.levels import LAYERS, SHADOWED
+from clsas.mosaics.patches import PatchWindow, Wide
 from clsas.mosaics.record import Record
+from clsas.mosaics.relief_shadows import mask_shadows, of_shadows
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import largest_gap_m
 from clsas.mosaics.visibility import SurveyVisibility
@@ -48,10 +48,13 @@ class Seen(NamedTuple):
         Lines of both banks, or None if no channel of both has samples.
     known : dict
         Fields of the record of the patch.
+    silent : tuple of {"a", "b"}
+        Banks of which no channel has samples, though some receive from that part.
     """
 
     pair: Pair | None
     known: dict[str, Any]
+    silent: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,16 +92,17 @@ class HeightsJob:
         """Return the store."""
         return Store.at(self.store)
 
-    def complete_levels(self) -> None:
-        """Compute the levels of the store that mix patches, once all patches are finished."""
-        self.opened_store().complete_levels()
+    def complete(self) -> None:
+        """Find the shadows of the whole relief, then compute the levels that mix patches."""
+        store = self.opened_store()
+        mask_shadows(store)
+        store.complete_levels()
 
     def is_current(self, record: Record, window: PatchWindow) -> bool:
         """Return whether no channel that was added since a patch was measured contributes to it."""
         if record.survey_channels >= len(self.banks[0].members):
             return True
-        wide, _ = self._with_margin(window)
-        visible, _ = _swept(self.banks, wide, self.request)
+        visible, _ = _swept(self.banks, self._wide_grid(self._wide(window)), self.request)
         return not visible[record.survey_channels :].any()
 
     def form(self, window: PatchWindow) -> tuple[Record, Image | None]:
@@ -121,36 +125,33 @@ class HeightsJob:
     ) -> tuple[Record, NDArray[np.complex64], dict[str, NDArray[np.float32]]]:
         """Return the record, the pixels and the layers of a patch."""
         start = time.perf_counter()
-        wide, inside = self._with_margin(window)
-        pair, known = seen(self.banks, wide, self.request, device)
+        wide = self._wide(window)
+        grid = self._wide_grid(wide)
+        pair, known, _ = seen(self.banks, grid, self.request, device)
         pixels: NDArray[np.complex64] = np.zeros(window.grid.shape, np.complex64)
-        layers = {name: np.full(window.grid.shape, np.nan, np.float32) for name in LAYERS}
+        names = (*LAYERS, *SHADOWED)
+        layers = {name: np.full(window.grid.shape, np.nan, np.float32) for name in names}
         if pair is None:
             return Record(**known, seconds=time.perf_counter() - start), pixels, layers
         try:
-            found, refined = heights.measured(pair, wide, self.request, None)
+            measured = heights.measured(pair, grid, self.request, None)
         except UnmeasurableError as error:
             known["heights"] = {"reason": str(error)}
         else:
             scale = 1.0
             if self.beam is not None and self.beam.normalise:  # by the channels of this patch
                 scale = len(self.banks[0].members) / pair.a.channels
-            pixels = np.complex64(scale) * found.image.pixels[inside]
-            layers = {name: getattr(found, name)[inside].astype(np.float32) for name in LAYERS}
-            known["heights"] = _summary(found, inside) | {"converged": refined.converged}
+            pixels = np.complex64(scale) * measured.heights.image.pixels[wide.inside]
+            layers = _layers(measured, wide.inside)
+            known["heights"] = _summary(measured, layers, window.grid, wide.inside)
         known |= {"has_pixels": holds_any(pixels), "seconds": time.perf_counter() - start}
         return Record(**known), pixels, layers
 
-    def _with_margin(self, window: PatchWindow) -> tuple[Grid, tuple[slice, slice]]:
-        """Return the grid of a patch with its margin, and where the patch lies in it."""
-        outer, inner = [], []
-        for part, margin, count in zip(
-            (window.rows, window.columns), self.margin, self.grid.shape, strict=True
-        ):
-            begin = max(part.start - margin, 0)
-            outer.append(slice(begin, min(part.stop + margin, count)))
-            inner.append(slice(part.start - begin, part.stop - begin))
-        return self.grid.window(*outer), (inner[0], inner[1])
+    def _wide(self, window: PatchWindow) -> Wide:
+        return Wide.of(window, self.margin, self.grid.shape)
+
+    def _wide_grid(self, wide: Wide) -> Grid:
+        return self.grid.window(wide.rows, wide.columns)
 
 
 def seen(banks: tuple[Bank, Bank], grid: Grid, request: Request, device: Device) -> Seen:
@@ -175,7 +176,8 @@ def seen(banks: tuple[Bank, Bank], grid: Grid, request: Request, device: Device)
         "read_seconds": time.perf_counter() - start,
     }
     if missing.all():
-        return Seen(None, known)
+        silent = (name for name, each in (("a", lost), ("b", lost_too)) if each.all())
+        return Seen(None, known, tuple(silent))
     chosen = visible.copy()
     chosen[visible] = ~missing
     if missing.any():
@@ -227,10 +229,32 @@ def _box(grid: Grid, search_m: tuple[float, float]) -> Grid:
     return corners.with_height([ends_m, ends_m[::-1]])
 
 
-def _summary(found: Heights, inside: tuple[slice, slice]) -> dict[str, Any]:
+def _layers(
+    measured: heights.Measured, inside: tuple[slice, slice]
+) -> dict[str, NDArray[np.float32]]:
+    """Return the layers of a patch, with pixels that its own relief and its margin's shadow."""
+    found, refined = measured.heights, measured.refined
+    layers = {name: getattr(found, name) for name in LAYERS}
+    shadowed = refined.valid & ~found.mask
+    for name, values in zip(SHADOWED, (refined.offset_m, refined.sd_m), strict=True):
+        layers[name] = np.where(shadowed, values, np.nan)
+    return {name: values[inside].astype(np.float32) for name, values in layers.items()}
+
+
+def _summary(
+    measured: heights.Measured,
+    layers: dict[str, NDArray[np.float32]],
+    grid: Grid,
+    inside: tuple[slice, slice],
+) -> dict[str, Any]:
     """Return what a record says about heights, as types of JSON."""
-    return {
+    found, doubts = measured.heights, measured.doubts
+    summary = {
         "valid": float(found.mask[inside].mean()),
         "looks": float(np.median(found.looks[inside])),
         "ambiguity_m": float(2 * np.pi * np.median(np.abs(found.m_per_rad[inside]))),
+        "converged": measured.refined.converged,
+        "best_end": doubts.end,
+        "large_m": doubts.large_m,
     }
+    return summary | of_shadows(layers, grid, measured.sights)

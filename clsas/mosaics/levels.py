@@ -45,6 +45,15 @@ LAYERS = {
 They have the names and the meaning of the attributes of `clsas.Heights`.
 """
 
+SHADOWED = {
+    "shadow_height_m": ("m", "height of a pixel in shadow, which is not valid"),
+    "shadow_sd_m": ("m", "standard deviation of the height of a pixel in shadow"),
+}
+"""Arrays of a mosaic of heights without levels: what pixels in shadow show.
+
+Whether a pixel is in shadow depends on patches that may be measured later, or again.
+"""
+
 WINDOW = "window"
 """Attribute of mosaics of heights: rows and columns of the window behind each height."""
 
@@ -132,7 +141,7 @@ class PixelArray:
 
     @property
     def kind(self) -> str:
-        """Kind of numbers: "pixels", "amplitude", `IN_DB` or one of `LAYERS`."""
+        """Kind of numbers: "pixels", "amplitude", `IN_DB`, or one of `LAYERS` or `SHADOWED`."""
         return self.name.rpartition("/")[2]
 
     def window(self, index: tuple[int, int]) -> tuple[slice, slice]:
@@ -238,6 +247,11 @@ def layers_of(attributes: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(LAYERS) if WINDOW in attributes else ()
 
 
+def shadowed_of(attributes: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the layers without levels in the attributes of a store, `SHADOWED` or none."""
+    return tuple(SHADOWED) if WINDOW in attributes else ()
+
+
 def are_levels(attributes: Mapping[str, Any]) -> bool:
     """Return whether chunks and levels in the attributes of a store are as clsas writes them.
 
@@ -280,7 +294,7 @@ def patch_arrays(attributes: Mapping[str, Any]) -> list[PixelArray]:
     pixels = PixelArray("pixels", 1, "complex64", shape, chunk_shape, patch_shape)
     layers = [
         replace(pixels, name=name, data_type="float32", has_gaps=True)
-        for name in layers_of(attributes)
+        for name in (*layers_of(attributes), *shadowed_of(attributes))
     ]
     levels = stored_levels(attributes)
     return [pixels, *layers, *_level_arrays(attributes, levels, levels.of_patches)]

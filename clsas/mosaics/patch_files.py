@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from clsas.mosaics.documents import DamageError
 from clsas.mosaics.levels import IN_DB, PixelArray
 from clsas.mosaics.metadata import GROUP
 from clsas.mosaics.record import Checksums, PatchIndex, Record
+
+_Stamp = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,9 @@ class PatchFiles:
 
     path: Path
     arrays: tuple[PixelArray, ...]
+    _read: dict[PatchIndex, tuple[_Stamp, Checksums]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
 
     @property
     def pixels(self) -> PixelArray:
@@ -69,12 +74,20 @@ class PatchFiles:
         }
 
     def recorded(self) -> dict[PatchIndex, Checksums]:
-        """Return the checksums in all intact records."""
+        """Return the checksums in all intact records.
+
+        Records are read again only if their files have been replaced, by this or another process.
+        """
         found: dict[PatchIndex, Checksums] = {}
         for index in self.indices():
-            with suppress(DamageError):
-                if stored := Record.read(self.folder(index)):
-                    found[index] = stored[1]
+            with suppress(DamageError, FileNotFoundError):
+                stamp = _stamp(self.folder(index) / "zarr.json")
+                if self._read.get(index, (None, {}))[0] != stamp:
+                    stored = Record.read(self.folder(index))
+                    if stored is None:
+                        continue
+                    self._read[index] = stamp, stored[1]
+                found[index] = self._read[index][1]
         return found
 
     def record(
@@ -128,6 +141,12 @@ class PatchFiles:
                 _ = opened(array)[array.window(index)]
             except ValueError as error:  # Zarr's message about a checksum
                 raise DamageError(f"its {_words(array)} do not match their checksum") from error
+
+
+def _stamp(path: Path) -> _Stamp:
+    """Return what tells a file from another that has replaced it."""
+    status = path.stat()
+    return status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def _words(array: PixelArray) -> str:

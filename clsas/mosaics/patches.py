@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from clsas.core import validate
 from clsas.core.grid import Grid
@@ -60,6 +62,38 @@ class Layout:
             for i, side, most in zip(index, self.patch_shape, self.grid.shape, strict=True)
         )
         return PatchWindow(self.grid.window(rows, columns), *index, rows, columns)
+
+    def indices(self) -> Iterator[PatchIndex]:
+        """Yield the indices of all patches, row by row."""
+        rows, columns = self.shape
+        return itertools.product(range(rows), range(columns))
+
+
+@dataclass(frozen=True, eq=False)
+class Wide:
+    """A patch with a margin, as far as the grid of the mosaic reaches.
+
+    Attributes
+    ----------
+    rows, columns : slice
+        Its pixels in the mosaic.
+    inside : (rows, columns)
+        Where the patch lies in it.
+    """
+
+    rows: slice
+    columns: slice
+    inside: tuple[slice, slice]
+
+    @classmethod
+    def of(cls, window: PatchWindow, margin: tuple[int, int], shape: tuple[int, ...]) -> Self:
+        """Return a patch with so many rows and columns beyond each side."""
+        outer, inner = [], []
+        for part, side, count in zip((window.rows, window.columns), margin, shape, strict=True):
+            begin = max(part.start - side, 0)
+            outer.append(slice(begin, min(part.stop + side, count)))
+            inner.append(slice(part.start - begin, part.stop - begin))
+        return cls(outer[0], outer[1], (inner[0], inner[1]))
 
 
 def host_bytes(channels: int, length: int, pixels: int) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 
 from clsas.core.digests import grid_digest
 from clsas.core.grid import Grid
-from clsas.mosaics.documents import read_document
+from clsas.mosaics.documents import PARTS_OF_B, read_document
 from clsas.mosaics.survey import Survey
 from clsas.sonar.beam import BeamWindow
 
@@ -53,11 +53,16 @@ def differences(
     if attributes["patch_shape"] != list(patch_shape):
         mine, theirs = ("{} x {}".format(*s) for s in (attributes["patch_shape"], patch_shape))
         found.append(f"patches have {mine} pixels in the store, {theirs} given")
-    if given["parts"][: len(stored["parts"])] != stored["parts"]:
+    before, now = (
+        [each.get(name, []) for name in ("parts", PARTS_OF_B)] for each in (stored, given)
+    )
+    if any(new[: len(old)] != old for old, new in zip(before, now, strict=True)):
         found.append("the range lines differ")
+    elif stored.keys() & {PARTS_OF_B} != given.keys() & {PARTS_OF_B}:
+        found.append("the range lines of both banks were in one source, or are now")
     for name, theirs in given.items():
         mine = stored.get(name)
-        if name == "parts" or (name in _ADDED and name not in stored):
+        if name in ("parts", PARTS_OF_B) or (name in _ADDED and name not in stored):
             continue
         if name == "grid" and mine != theirs:
             if stored.get("pixels") == given["pixels"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,8 +64,8 @@ class PatchJob(Protocol):
     def opened_store(self) -> Store | None:
         """Return the store, or None if there is none."""
 
-    def complete_levels(self) -> None:
-        """Compute the levels of the store that mix patches."""
+    def complete(self) -> None:
+        """Compute what depends on several patches, once all are finished."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +183,7 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Form
     the caller stops early, patches that have been started are still completed in the store.
     """
     survey, layout, store = _GrowingSurvey(run), run.layout, run.job.store
-    todo = [index for index in _all(layout) if index not in finished]
+    todo = [index for index in layout.indices() if index not in finished]
     # For every patch, the number of channels in the survey when it was last formed or checked.
     known = {index: record.survey_channels for index, record in finished.items()}
     executor = run.executor()
@@ -199,7 +199,7 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Form
                     running[executor.submit(job.form, layout.window(index))] = index
                 known[index] = survey.channels
             if not running and not todo and survey.has_ended:
-                run.job.complete_levels()
+                run.job.complete()
                 return
             timeout_s = None if survey.has_ended and running else POLL_S
             done = wait(running or [Future()], timeout_s)
@@ -233,11 +233,6 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Form
                 for future in begun:
                     if future.exception() is None:
                         finished[running[future]] = future.result()[0]
-
-
-def _all(layout: Layout) -> Iterator[PatchIndex]:
-    rows, columns = layout.shape
-    return ((row, column) for row in range(rows) for column in range(columns))
 
 
 def wait_for_first_file(growth: Growth) -> None:

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core import reprs, validate
-from clsas.core.atomic import sync_folder
 from clsas.core.digests import grid_digest
 from clsas.core.extras import needed
 from clsas.core.grid import Grid
@@ -30,7 +29,6 @@ from clsas.mosaics.documents import (
     DIGESTS,
     DamageError,
     check_inputs,
-    check_own,
     check_place,
     is_there,
     read_document,
@@ -39,14 +37,15 @@ from clsas.mosaics.documents import (
 )
 from clsas.mosaics.levels import (
     LEVELS,
-    WINDOW,
+    SHADOWED,
     layers_of,
+    shadowed_of,
     stored_levels,
 )
 from clsas.mosaics.metadata import GROUP, has_height
 from clsas.mosaics.overview import Reading, reduced, step_of
+from clsas.mosaics.patch_writing import PatchValues, write_patch
 from clsas.mosaics.provenance import OtherInputsError, differences
-from clsas.mosaics.pyramid import Level, layer_levels, levels
 from clsas.mosaics.record import (
     PatchIndex,
     Record,
@@ -128,7 +127,8 @@ class Store:
     @property
     def layers(self) -> tuple[str, ...]:
         """Names of the arrays that `read_layer` can read, empty unless the mosaic has heights."""
-        return layers_of(read_document(self.path))
+        attributes = read_document(self.path)
+        return (*layers_of(attributes), *shadowed_of(attributes))
 
     @property
     def levels(self) -> tuple[int, ...]:
@@ -343,49 +343,11 @@ class Store:
         OSError
             If the disk is full or the store is not writable.
         """
-        row, column = (
-            validate.count(name, index, least=0, most=most - 1)
-            for name, index, most in zip(
-                ("row", "column"), (row, column), self._arrays.files.shape, strict=True
-            )
+        _ = self.pixels  # raises if their metadata are damaged
+        patch = PatchValues.checked(
+            self._arrays, (row, column), (rows, columns), pixels, record, layers
         )
-        own = self._arrays.files.pixels.window((row, column))
-        for name, given, part, count in zip(
-            ("rows", "columns"), (rows, columns), own, self.pixels.shape, strict=True
-        ):
-            if range(count)[validate.selection(name, given, ascending=True)] != range(count)[part]:
-                raise ValueError(
-                    f"{name} must be {part.start}:{part.stop} for patch {row},{column}, got "
-                    f"{validate.shown(given)}"
-                )
-        shape = tuple(part.stop - part.start for part in own)
-        pixels = validate.array("pixels", pixels, np.complex64, shape)
-        validate.instance("record", record, Record)
-        validate.instance("layers", layers, Mapping)
-        if set(layers) != set(self.layers):
-            raise ValueError(
-                f"layers must be {', '.join(self.layers) or 'left out'} for {self.path}, got "
-                f"{', '.join(layers) or 'none'}"
-            )
-        layers = {name: _layer(name, values, shape) for name, values in layers.items()}
-        folder = self._arrays.files.folder((row, column))
-        check_own(self.path, folder)
-        # Remove the old record first, so that it never stands beside pixels of the new patch.
-        if (folder / "zarr.json").exists():
-            (folder / "zarr.json").unlink()
-            sync_folder(folder)
-        attributes = read_document(self.path)
-        first, *others = self._arrays.files.arrays
-        zarr_arrays().write_values(self.path, attributes, first.name, (rows, columns), pixels)
-        factors = stored_levels(attributes).of_patches
-        found = {1: Level(np.abs(pixels), pixels)} | levels(pixels, factors)
-        of_layers = layer_levels(layers, factors, attributes.get(WINDOW))
-        for array in others:
-            window = array.window((row, column))
-            level = found[array.factor]._replace(layers=of_layers[array.factor])
-            values = level.values_of(array)
-            zarr_arrays().write_values(self.path, attributes, array.name, window, values)
-        write_attributes(folder, record.attributes(self._arrays.files.checksums((row, column))))
+        write_patch(self._arrays, patch)
 
     def complete_levels(self, progress: Callable[[int, int], object] | None = None) -> bool:
         """Compute the levels that mix patches, unless they already are those of the patches.
@@ -483,7 +445,7 @@ class Store:
             Pixels of the mosaic, or of the level.
         factor : int
             1, or one of `levels`, whose values are means of the pixels that have one; `sd_m` is the
-            standard deviation of the mean of the heights.
+            standard deviation of the mean of the heights. Heights of shadows have no levels.
 
         Returns
         -------
@@ -503,6 +465,8 @@ class Store:
                 f"({', '.join(self.layers) or 'none: it has no heights'}), got {name!r}"
             )
         if validate.count("factor", factor) != 1:
+            if name in SHADOWED:
+                raise ValueError(f"factor must be 1 for {name}, which has no levels, got {factor}")
             factor = self._checked_factor(factor)
         return self._read(f"{factor}x/{name}" if factor > 1 else name, rows, columns)
 
@@ -573,6 +537,28 @@ class Store:
             If a file cannot be read.
         """
         return stored_heights.window_of(self, rows, columns)
+
+    def sampled_heights(self, per_window: int = 6) -> Heights:
+        """Return the heights of some pixels of every window of a mosaic of heights.
+
+        Heights of neighbouring pixels share most of their windows, so that these contain nearly all
+        that the mosaic shows, in less memory. They suffice for `pair_errors`.
+
+        Parameters
+        ----------
+        per_window : int
+            Largest number of pixels along each side of a window. With 3 instead of 6, the phase and
+            the delay that `pair_errors` tells apart have twice the deviation.
+
+        Raises
+        ------
+        ValueError
+            If the mosaic is one of images, a finished patch is damaged, or the heights do not fit
+            into memory.
+        OSError
+            If a file cannot be read.
+        """
+        return stored_heights.sampled(self, validate.count("per_window", per_window))
 
     def overview_heights(
         self,
@@ -700,17 +686,6 @@ class Store:
         if not (self.path / LEVELS / "zarr.json").exists() or not self._is_complete():
             return {}
         return _completing().damage(self.path, read_document(self.path))
-
-
-def _layer(name: str, values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return a layer of a patch as float32; raise TypeError or ValueError unless it is one."""
-    validate.instance(name, values, np.ndarray)
-    if values.dtype.kind != "f" or values.shape != shape or np.isinf(values).any():
-        raise ValueError(
-            f"layers must have real numbers of shape {shape}, finite or NaN, got "
-            f"{validate.shown(values)} for {name}"
-        )
-    return values.astype(np.float32)
 
 
 def _completing() -> ModuleType:

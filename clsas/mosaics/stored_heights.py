@@ -45,6 +45,15 @@ def window_of(store: Store, rows: slice, columns: slice) -> Heights:
     return _heights(plane, store.read(rows, columns), layers, _window_m(store))
 
 
+def sampled(store: Store, per_window: int) -> Heights:
+    """Return the heights of some pixels of every window; see `Store.sampled_heights`."""
+    check_heights(store)
+    rows, columns = (
+        slice(None, None, max(side // per_window, 1)) for side in read_document(store.path)[WINDOW]
+    )
+    return window_of(store, rows, columns)
+
+
 def overview_of(store: Store, most: int, rows: slice, columns: slice) -> Heights:
     """Return the heights of a part of a store at fewer pixels; see `Store.overview_heights`."""
     check_heights(store)

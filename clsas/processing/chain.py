@@ -23,6 +23,7 @@ from clsas.files.process_tables import CORRECTIONS, STEPS, checked_steps
 from clsas.files.scene_files import SceneFile, read_scene
 from clsas.interferometry.checks import check_grid
 from clsas.interferometry.result import Heights
+from clsas.mosaics.store import Store
 from clsas.opencl.device import Device, open_device
 from clsas.processing.folders import check_folder, checked_records, folder_of, made
 from clsas.processing.record import StepRecord, file_digest, step_digest, write_records
@@ -34,7 +35,9 @@ from clsas.processing.steps import (
     Outcome,
     check_banks,
     check_pictures,
+    is_mosaic,
     options_of,
+    store_of,
 )
 from clsas.signal.echoes import Echoes
 
@@ -93,16 +96,22 @@ class Processed:
 
     @property
     def heights(self) -> Heights:
-        """Heights of the seabed, read from the folder.
+        """Heights of the seabed, read from the folder or, all of them, from the store of a mosaic.
 
         Raises
         ------
         KeyError
             If the step "heights" did not run.
         ValueError
-            If the file has changed since it was written.
+            If the file has changed since it was written, or the mosaic is damaged or does not fit
+            into memory.
         """
-        return self._result("heights", Heights)
+        record = self["heights"]
+        if "store" not in record.numbers:
+            return self._result("heights", Heights)
+        # The folder may have moved, with the store inside.
+        elsewhere = record.numbers["store"] if "store" in record.options else None
+        return Store.opened(elsewhere or self.folder / "heights.zarr").heights()
 
     def _result(self, name: str, kind: type) -> Any:
         record = self[name]
@@ -120,11 +129,12 @@ def process(
 ) -> Processed:
     """Return the results of processing a recording to a focused image.
 
-    The steps are inspect, calibrate, navigate, focus, image, heights and mosaic. Every step is
-    recorded in `process.json` in the folder `output`: its inputs and options, the version of clsas,
-    its numbers, warnings and files. A step is not run again if it ran before with the same inputs,
-    options and version, and its files have not changed. The files of a step appear together once it
-    is done, and replace all files that it wrote before.
+    The steps are inspect, calibrate, navigate, focus, pair_errors, image, heights and mosaic. Every
+    step is recorded in `process.json` in the folder `output`: its inputs and options, the version
+    of clsas, its numbers, warnings and files. A step is not run again if it ran before with the
+    same inputs, options and version, and its files have not changed. The files of a step appear
+    together once it is done, and replace all files that it wrote before. Mosaics of images and of
+    heights continue a store instead.
 
     Parameters
     ----------
@@ -186,22 +196,23 @@ def process(
     of_scene = checked_steps(scene.process.get("steps"), scene.process)
     chosen = of_scene if steps is None else checked_steps(steps, scene.process)
     names = _with_corrections(chosen, of_scene)
-    if {"focus", "image", "heights", "mosaic"} & set(names):
+    if {"focus", "pair_errors", "image", "heights", "mosaic"} & set(names):
         (grid,) = scene.need("grid")
         if "image" in names:
             validate.memory("[grid]", 16 * grid.size)  # two images
-        if "heights" in names:
-            with _naming(scene, "heights"):
-                check_grid(grid)
+    of_banks = [name for name in ("pair_errors", "heights") if name in names]
+    if of_banks:
+        with _naming(scene, of_banks[0]):
+            check_grid(grid)
     recording = Recording.of(scene, lines)
     folder = folder_of(scene, output)
     check_folder(folder, recording)
     check_pictures()
     with made(folder):
         records = checked_records(scene, folder, names)
-        if "heights" in names and "heights" not in records:
+        if not set(of_banks) <= records.keys():
             uncorrected = recording.read()  # which stays in memory for the first step
-            with _naming(scene, "heights"):  # before other steps, which may take hours
+            with _naming(scene, of_banks[0]):  # before other steps, which may take hours
                 check_banks(uncorrected)
         chain = _Chain(scene, folder, recording, open_device(device), records)
         for name in STEPS:
@@ -247,7 +258,7 @@ class _Chain:
         digest = self._digest(name, options)
         record = self.records.get(name)
         # A mosaic always runs: it has its own records, and forms only the missing patches.
-        kept = record is not None and record.digest == digest and name != "mosaic"
+        kept = record is not None and record.digest == digest and not is_mosaic(name, self.scene)
         messages: tuple[str, ...] = ()
         if record is None or not kept or not record.is_intact(self.folder):
             record = self._run(name, digest, options, progress)
@@ -291,11 +302,13 @@ class _Chain:
     ) -> StepRecord:
         lines = self.lines()  # raises for a damaged recording, before anything is written
         start = time.perf_counter()
+        store = store_of(name, self.scene)
         with staging(self.folder) as staged:
             job = Job(
                 scene=self.scene,
                 folder=staged,
-                store=self.scene.mosaic.get("store") or self.folder / "mosaic.zarr",
+                store=store or self.folder / f"{name}.zarr",
+                is_store_inside=store is None,
                 given=self.recording.read,
                 lines=lines,
                 corrections=self.corrections,

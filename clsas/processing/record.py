@@ -37,7 +37,7 @@ class StepRecord:
     Attributes
     ----------
     name : str
-        The step: "inspect", "calibrate", "navigate", "focus", "image", "heights" or
+        The step: "inspect", "calibrate", "navigate", "focus", "pair_errors", "image", "heights" or
         "mosaic".
     digest : str
         Digest of the inputs, the options and the version of clsas.

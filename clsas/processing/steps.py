@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from clsas import plot
 from clsas.core import banks
@@ -24,8 +24,12 @@ from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS
 from clsas.inspection.inspection import inspect
 from clsas.interferometry.heights import heights
-from clsas.mosaics.mosaic import mosaic
+from clsas.interferometry.pair_errors import pair_errors
+from clsas.interferometry.result import Heights
+from clsas.mosaics.height_mosaic import mosaic_heights
+from clsas.mosaics.mosaic import Mosaic, mosaic
 from clsas.mosaics.provenance import OtherInputsError, stored_digest
+from clsas.mosaics.store import Store
 from clsas.navigation.autofocus import autofocus
 from clsas.navigation.known_points import calibrate_track
 from clsas.navigation.micronavigation import micronavigate
@@ -37,6 +41,8 @@ from clsas.plans.factorization import ExactImage
 from clsas.processing import numbers
 from clsas.processing.record import StepRecord
 from clsas.processing.tracks import csv_of_track
+
+_Begun = TypeVar("_Begun", Mosaic, Store)
 
 Progress = Callable[[int, int], None] | None
 
@@ -51,7 +57,9 @@ class Job:
     folder : Path
         Folder for the step's files, from which they are moved once the step is done.
     store : Path
-        Store of the mosaic, which is continued if it exists.
+        Store of a mosaic of images or heights, which is continued if it exists.
+    is_store_inside : bool
+        True if it has its default place in the folder of the processing.
     given : Callable
         Returns the uncorrected lines of the recording.
     lines : RangeLines
@@ -67,6 +75,7 @@ class Job:
     scene: SceneFile
     folder: Path
     store: Path
+    is_store_inside: bool
     given: Callable[[], RangeLines]
     lines: RangeLines
     corrections: tuple[str, ...]
@@ -128,11 +137,13 @@ class Outcome:
 def options_of(step: str, scene: SceneFile) -> dict[str, Any]:
     """Return all options of a scene that a step depends on, as JSON types or arrays."""
     options = dict(scene.process.get(step, {}))
-    if step in ("inspect", "focus", "image", "heights", "mosaic"):
+    if step in ("inspect", "focus", "pair_errors", "image", "heights", "mosaic"):
         options["grid"] = None if scene.grid is None else grid_digest(scene.grid)
         if scene.georeference is not None:
             options["georeference"] = str(scene.georeference)
         options["beam"] = scene.image.get("beam")
+    if step == "pair_errors":
+        options["heights"] = scene.process["heights"]
     if step == "inspect":
         options["element_length_m"] = None if scene.sonar is None else scene.sonar.element_length_m
     if step in ("image", "mosaic"):
@@ -142,6 +153,19 @@ def options_of(step: str, scene: SceneFile) -> dict[str, Any]:
     if step == "mosaic":
         options |= scene.mosaic
     return options
+
+
+def is_mosaic(step: str, scene: SceneFile) -> bool:
+    """Return whether a step fills a store, which has records of its own, patch by patch."""
+    if step == "heights":
+        return not {"patch_m", "store"}.isdisjoint(scene.process.get("heights", {}))
+    return step == "mosaic"
+
+
+def store_of(step: str, scene: SceneFile) -> Path | None:
+    """Return the store that a scene demands for a step, or None if it may lie in the folder."""
+    options = scene.process.get("heights", {}) if step == "heights" else scene.mosaic
+    return options.get("store")
 
 
 def request_of(scene: SceneFile) -> dict[str, Any]:
@@ -219,19 +243,62 @@ def imaged(job: Job) -> Outcome:
     return Outcome(found, files)
 
 
+def paired(job: Job) -> Outcome:
+    """Find phase, delay and roll of the second receiver bank from heights of the first two."""
+    first, second = check_banks(job.lines)
+    if is_mosaic("heights", job.scene):
+        with staging(job.folder) as temporary:
+            found = _height_mosaic(job, temporary / "heights.zarr").sampled_heights()
+    else:
+        found = _heights(job)
+    errors = pair_errors(
+        first, second, found, beam=job.scene.image.get("beam"), **job.options("pair_errors"),
+        **_given(job.options("heights"), "tolerance_db"), device=job.device,
+    )  # fmt: skip
+    number = banks.first_two(job.lines.bank_numbers)[1]
+    corrected = banks.with_bank(job.lines, number, errors.corrected(first, second))
+    return Outcome(errors.figures, lines=corrected)
+
+
 def measured(job: Job) -> Outcome:
     """Measure the heights of the seabed from the first two receiver banks."""
+    files, described = [], {}
+    if is_mosaic("heights", job.scene):
+        store = _replacing_own(job, lambda: _height_mosaic(job, job.store))
+        found = store.overview_heights()
+        described = {"store": str(job.store), "inputs": stored_digest(job.store.resolve())}
+    else:
+        found = _heights(job)
+        save(job.folder / "heights.h5", found)
+        files = ["heights.h5"]
+    if found.mask.any():
+        files += job.draw("heights.png", lambda: plot.heights(found, title=job.title))
+    return Outcome(numbers.of_heights(found) | described, files)
+
+
+def _heights(job: Job) -> Heights:
+    """Return the heights that the lines show, in memory."""
     (grid,) = job.scene.need("grid")
     first, second = check_banks(job.lines)
-    found = heights(
+    return heights(
         first, second, grid, beam=job.scene.image.get("beam"), **job.options("heights"),
         device=job.device, progress=job.progress,
     )  # fmt: skip
-    save(job.folder / "heights.h5", found)
-    files = ["heights.h5"]
-    if found.mask.any():
-        files += job.draw("heights.png", lambda: plot.heights(found, title=job.title))
-    return Outcome(numbers.of_heights(found), files)
+
+
+def _height_mosaic(job: Job, store: Path) -> Store:
+    """Return a store with the heights that the lines show, after measuring missing patches."""
+    (grid,) = job.scene.need("grid")
+    first, second = check_banks(job.lines)
+    options = job.options("heights") | {"store": store}
+    return mosaic_heights(
+        first, second, grid, **options, beam=job.scene.image.get("beam"), device=job.device,
+        progress=job.progress,
+    )  # fmt: skip
+
+
+def _given(options: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {name: options[name] for name in names if name in options}
 
 
 def check_banks(lines: RangeLines) -> tuple[RangeLines, RangeLines]:
@@ -255,13 +322,7 @@ def joined(job: Job) -> Outcome:
         patches=scene.mosaic.get("patches"), memory_bytes=memory_mib and memory_mib << 20,
         device=job.device,
     )  # fmt: skip
-    try:
-        formed = begin()
-    except OtherInputsError:
-        if not _is_own_store(job):
-            raise
-        _remove_store(job.store)
-        formed = begin()
+    formed = _replacing_own(job, begin)
     count, errors = formed.shape[0] * formed.shape[1], []
     done = len(formed.finished)
     for patch in formed:
@@ -279,6 +340,17 @@ def joined(job: Job) -> Outcome:
     )
 
 
+def _replacing_own(job: Job, begin: Callable[[], _Begun]) -> _Begun:
+    """Return the mosaic that is begun, after removing one that this step made of other inputs."""
+    try:
+        return begin()
+    except OtherInputsError:
+        if not _is_own_store(job):
+            raise
+        _remove_store(job.store)
+        return begin()
+
+
 def _is_own_store(job: Job) -> bool:
     """Return whether an earlier run of this step made the store, so that it may be replaced.
 
@@ -288,7 +360,7 @@ def _is_own_store(job: Job) -> bool:
     if job.former is None or "store" not in job.former.numbers:
         return False
     recorded = str(job.former.numbers["store"])
-    if "store" not in job.scene.mosaic:
+    if job.is_store_inside:
         # Compare names only: the folder may have moved, or its path be relative.
         return Path(recorded).name == job.store.name
     if recorded != str(job.store):
@@ -308,6 +380,7 @@ RUN: dict[str, Callable[[Job], Outcome]] = {
     "calibrate": calibrated,
     "navigate": navigated,
     "focus": focused,
+    "pair_errors": paired,
     "image": imaged,
     "heights": measured,
     "mosaic": joined,
@@ -320,6 +393,7 @@ FILES: dict[str, tuple[str, ...]] = {
     "calibrate": ("calibrate.h5",),
     "navigate": ("navigate.csv", "navigate-track.png", "navigate-coherence.png", "navigate.h5"),
     "focus": ("focus.csv", "focus-track.png", "focus-sharpness.png", "focus.h5"),
+    "pair_errors": ("pair_errors.h5",),
     "image": ("image.h5", "image.png", "before.h5", "before-and-after.png"),
     "heights": ("heights.h5", "heights.png"),
     "mosaic": (),

@@ -34,7 +34,7 @@ pytest.importorskip("matplotlib")
 
 ROOT = Path(__file__).parents[2]
 TOUR = (ROOT / "docs" / "tour.md").read_text()
-(EXAMPLE,) = re.findall(
+EXAMPLE, *_ = re.findall(
     r"```toml\n(.*?)```", (ROOT / "docs" / "scene-files.md").read_text(), re.DOTALL
 )
 SMALL = cases.Case(48, 8.25e-3, 1e6, 100e3, (-0.2, 0.2), (40.0, 40.4), 64)

@@ -55,6 +55,29 @@ def test_command_corrects_the_second_bank(files, tmp_path):
     assert "mm in heights at" in text
 
 
+def test_heights_may_be_those_of_a_store(files, tmp_path):
+    output, store = tmp_path / "corrected.h5", tmp_path / "heights.zarr"
+    lines = clsas.load(files / "lines.h5")
+    pair = lines.bank(1), lines.bank(3)
+    clsas.mosaic_heights(*pair, GRID, store, search_m=(-0.5, 0.5), window_m=0.2, patch_m=0.6)
+    given = files / "lines.h5", store, "--unknown", "phase", "-o", output
+    known = "--known-height-m", 0
+    results = json.loads(run("pair-errors", *given, *known, "--json").stdout)
+    whole = clsas.load(files / "heights.h5")
+    (expected,) = clsas.pair_errors(*pair, whole, known_height_m=0, unknowns=["phase"]).values
+    assert results["values"] == [pytest.approx(expected, abs=0.3 * results["sd"][0])]
+    points = "--other", files / "lines.h5", store
+    same = run("pair-errors", *given, *points, code=1)
+    assert "phase is not observable from these heights" in same.stderr
+    inside = run("pair-errors", *given[:-1], store / "a.h5", *known, code=2)
+    assert "--output must not lie in the store" in inside.stderr
+    clsas.mosaic(pair[0], GRID, tmp_path / "image.zarr", tolerance_db=-20).image()
+    images = run("pair-errors", given[0], tmp_path / "image.zarr", *given[2:], *known, code=1)
+    assert "must be a mosaic of heights" in images.stderr
+    swapped = run("pair-errors", *given, "--other", store, store, code=1)
+    assert "heights.zarr" in swapped.stderr
+
+
 def test_control_points_and_warnings(files, tmp_path):
     output = tmp_path / "corrected.h5"
     points = "--point", "0,32", "--point", "0.3,31.8,0.0"

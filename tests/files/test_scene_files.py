@@ -20,7 +20,7 @@ from clsas.sonar.sampling import check_sampling
 from clsas.sonar.system import BARKER_13
 
 DOCS = Path(__file__).parents[2] / "docs" / "scene-files.md"
-(EXAMPLE,) = re.findall(r"```toml\n(.*?)```", DOCS.read_text(), re.DOTALL)
+EXAMPLE, *_ = re.findall(r"```toml\n(.*?)```", DOCS.read_text(), re.DOTALL)
 
 TRACK = """
 [track]

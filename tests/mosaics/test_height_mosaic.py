@@ -19,7 +19,8 @@ import clsas
 from clsas.core.digests import grid_digest
 from clsas.core.validate import ClsasWarning
 from clsas.mosaics import pyramid
-from clsas.mosaics.levels import LAYERS
+from clsas.mosaics.documents import read_document
+from clsas.mosaics.levels import LAYERS, SHADOWED
 from clsas.mosaics.patches import Layout
 from clsas.mosaics.record import Record
 
@@ -92,7 +93,7 @@ def test_a_store_has_what_heights_have(tmp_path):
         progress=lambda *done: calls.append(done),
     )  # fmt: skip
     assert calls == [(done, 6) for done in range(7)]
-    assert store.layers == tuple(LAYERS)
+    assert store.layers == (*LAYERS, *SHADOWED)
     assert store.patch_shape == (27, 31)
     found, whole = store.heights(), clsas.heights(first, second, GRID, **{
         name: REQUEST[name] for name in ("search_m", "window_m")
@@ -174,6 +175,72 @@ def test_patches_are_measured_again_if_files_were_added(tmp_path):
     assert files_of(store.path) == files
 
 
+def test_folders_of_both_banks_may_grow(tmp_path):
+    names = "first", "second"
+    halves = halves_of(*flat_banks())
+    for name in names:
+        (tmp_path / name).mkdir()
+
+    def add(number, some=names):
+        for name in some:
+            bank = replace(halves[number].bank(names.index(name)), bank_numbers=None)
+            clsas.save(tmp_path / name / f"{number}.h5", bank)
+
+    def measure(path):
+        request = REQUEST | {"patch_m": 5.0}
+        folders = (tmp_path / name for name in names)
+        return clsas.mosaic_heights(*folders, GRID, tmp_path / path, **request)
+
+    add(0)
+    early = measure("a.zarr").records()[0, 0]
+    add(1, ["first"])
+    with pytest.raises(ValueError, match="a and b must contain the same pings"):
+        measure("a.zarr")
+    add(1, ["second"])
+    store = measure("a.zarr")
+    assert store.records()[0, 0].survey_channels == 2 * early.survey_channels
+    found, expected = store.heights(), measure("b.zarr").heights()
+    assert np.array_equal(found.height_m, expected.height_m, equal_nan=True)
+    (tmp_path / "second" / "0.h5").unlink()
+    (tmp_path / "first" / "0.h5").unlink()
+    with pytest.raises(ValueError, match="the range lines differ"):
+        measure("a.zarr")
+
+
+def test_beams_of_folders_do_not_change_as_they_grow(tmp_path):
+    (tmp_path / "lines").mkdir()
+    clsas.save(tmp_path / "lines" / "a.h5", halves_of(*flat_banks())[0])
+    beam = clsas.BeamWindow(20.0, "hann")
+    store = clsas.mosaic_heights(
+        tmp_path / "lines", None, GRID, tmp_path / "a.zarr", **REQUEST | {"patch_m": 5.0}, beam=beam
+    )
+    assert read_document(store.path)["inputs"]["beam"]["track_pings"] == 101
+    with pytest.raises(ValueError, match="beam must not normalise for a folder"):
+        clsas.mosaic_heights(
+            tmp_path / "lines", None, GRID, tmp_path / "b.zarr", **REQUEST,
+            beam=replace(beam, normalise=True),
+        )  # fmt: skip
+
+
+def test_one_warning_names_all_patches_that_miss_the_seabed(tmp_path):
+    request = REQUEST | {"search_m": (0.8, 2.0)}
+
+    def measure():
+        with pytest.warns(ClsasWarning) as caught:
+            clsas.mosaic_heights(*flat_banks(), GRID, tmp_path / "a.zarr", **request)
+        (text,) = (str(each.message) for each in caught)
+        return text
+
+    text = measure()
+    assert text.startswith(
+        "search_m may not contain the seabed: of 6 patches, the banks agree best at its lower end "
+        "in 6 (0,0; 0,1; 1,0; 1,1; ...), where most of the seabed seems to lie below it. Heights "
+        "may be wrong by multiples of the height of ambiguity, 1."
+    )
+    assert text.endswith(" m: search farther below")
+    assert measure() == text  # of patches that were measured before
+
+
 def test_the_search_may_start_from_a_relief(tmp_path):
     low = clsas.Grid.plane((-0.6, 0.6, 61), (31.2, 32.8, 81), z=-0.4)
     start = low.with_height(0.4 + np.linspace(-0.05, 0.05, 81)[:, None] + np.zeros(61))
@@ -241,10 +308,10 @@ def test_a_killed_run_continues_bit_for_bit(tmp_path):
     assert len(finished) <= 20 + 3  # the number finished before is reported once for every run
     store = clsas.Store.opened(tmp_path / "a.zarr")
     whole = clsas.mosaic_heights(*wish[:3], tmp_path / "whole.zarr", **wish[3])
-    for name in (*LAYERS, "amplitude_db", "pixels"):
+    for name in (*LAYERS, *SHADOWED, "amplitude_db", "pixels"):
         one, other = (files_of(each.path / name) for each in (store, whole))
         assert one == other
-        assert len(one) > 1
+        assert len(one) > 1 or name in SHADOWED  # chunks without shadow do not exist
     assert not store.damage()
     assert not store.array_damage()
 
@@ -284,9 +351,12 @@ def test_patches_without_heights_say_why(tmp_path):
 def filled_store(path, patch_shape, seed=0):
     """A store of heights with random numbers, of which some are missing, and their layers."""
     random = np.random.default_rng(seed)
-    layers = {name: random.uniform(1, 2, SMALL.shape).astype(np.float32) for name in LAYERS}
+    names = (*LAYERS, *SHADOWED)
+    layers = {name: random.uniform(1, 2, SMALL.shape).astype(np.float32) for name in names}
     for name in ("height_m", "sd_m"):
         layers[name][10:37, 20:50] = np.nan
+    for name in SHADOWED:
+        layers[name][:20] = np.nan
     layers["coherence"] -= 1
     store = clsas.Store.at(path)
     inputs = {
@@ -471,6 +541,17 @@ class TestBadInput:
         self.refused(tmp_path, "apart across the line of sight", first, first)
         both = replace(first, bank_numbers=np.arange(first.channels) % 2)
         self.refused(tmp_path, "a must have the lines of one bank", both, second)
+
+    @pytest.mark.parametrize("name", ["a", "b"])
+    def test_a_bank_without_echoes(self, tmp_path, name):
+        lines = list(flat_banks())
+        number = "ab".index(name)
+        lines[number] = replace(lines[number], samples=np.zeros_like(lines[number].samples))
+        match = f"{name} must contain echoes, got samples that are all zero"
+        self.refused(tmp_path, match, *lines)
+        for own, each in zip("ab", lines, strict=True):
+            clsas.save(tmp_path / f"{own}.h5", each)
+        self.refused(tmp_path, match, tmp_path / "a.h5", tmp_path / "b.h5")
 
     def test_options(self, tmp_path):
         self.refused(tmp_path, "search_m must be .lowest, highest.", search_m=(1, 0))

@@ -194,6 +194,33 @@ def test_levels_that_mix_patches_follow_the_patches(tmp_path):
     np.testing.assert_allclose(store.read_level(8), expected(8, other)[0], rtol=1e-6)
 
 
+def test_records_are_read_again_only_if_they_have_changed(tmp_path, monkeypatch):
+    finished(tmp_path / "a.zarr", MIXED)
+    store, read, count = clsas.Store.opened(tmp_path / "a.zarr"), Record.read, []
+
+    def counted(folder):
+        count.append(folder.name)
+        return read(folder)
+
+    monkeypatch.setattr(Record, "read", counted)
+    assert store.levels == (2, 4, 8)
+    patches = len(patches_of(MIXED))
+    assert len(count) == patches
+    for _ in range(3):
+        store.read_level(8)
+    assert len(count) == patches
+    # Another process forms a patch again.
+    other, changed = clsas.Store.opened(tmp_path / "a.zarr"), patches_of(MIXED)[5]
+    write(other, changed, 2 * PIXELS)
+    count.clear()
+    assert store.levels == (2, 4)
+    assert count == [f"{changed.row}.{changed.column}"]
+    other.complete_levels()
+    assert store.levels == (2, 4, 8)
+    shutil.rmtree(tmp_path / "a.zarr" / "patches" / "1.1")
+    assert store.levels == (2, 4)
+
+
 def test_the_overview_reads_the_level_that_makes_up_its_pixels(tmp_path, monkeypatch):
     store = finished(tmp_path / "a.zarr", OF_PATCHES)
     plain = {}

@@ -1,7 +1,9 @@
 """The step `heights` of a processing: heights from the corrected lines of two receiver banks."""
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +15,8 @@ from clsas.cli import main
 from clsas.core.validate import ClsasWarning
 from clsas.files.process_tables import checked_steps
 from clsas.files.scene_files import read_scene
+from clsas.mosaics.documents import read_document
+from clsas.processing.steps import is_mosaic
 
 pytest.importorskip("matplotlib")
 
@@ -277,3 +281,107 @@ def test_files_of_others_are_never_replaced(scene, name):
     with pytest.raises(ValueError, match=f"contains {name}, which heights would replace"):
         clsas.process(scene)
     assert (folder / name).read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_heights_larger_than_memory_are_a_mosaic(scene):
+    """Its patches are continued, and it is replaced if options have changed."""
+    change(scene, '"image", "heights"', '"heights"')
+    change(scene, "window_m = 0.2", "window_m = 0.2\npatch_m = 0.6")
+    found = clsas.process(scene)
+    store = clsas.Store.opened(found.folder / "heights.zarr")
+    assert len(store.records()) == 4
+    assert {path.name for path in found.folder.iterdir()} == {
+        "process.json", "heights.zarr", "heights.png"
+    }  # fmt: skip
+    grid = read_scene(scene).grid
+    expected = clsas.heights(*flat_banks(), grid, search_m=(-0.5, 0.5), window_m=0.2)
+    np.testing.assert_allclose(
+        np.nanmedian(found.heights.height_m), np.nanmedian(expected.height_m), atol=1e-3
+    )
+    assert found["heights"].numbers["valid"] > 0.9
+    before = {path: path.read_bytes() for path in store.path.rglob("*") if path.is_file()}
+    assert clsas.process(scene).repeated == ("heights",)
+    assert {path: path.read_bytes() for path in store.path.rglob("*") if path.is_file()} == before
+    change(scene, "[-0.5, 0.5]", "[-0.4, 0.5]")
+    clsas.process(scene)
+    assert read_document(store.path)["inputs"]["search_m"] == [-0.4, 0.5]
+    # A store elsewhere that somebody else made is not replaced.
+    clsas.mosaic_heights(
+        *flat_banks(), grid, scene.parent / "own.zarr", search_m=(-0.3, 0.3), window_m=0.2
+    )
+    change(scene, "patch_m = 0.6", 'store = "own.zarr"')
+    with pytest.raises(ValueError, match=r"heights.*own.zarr was made with other inputs"):
+        clsas.process(scene)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("patches", [False, True])
+def test_errors_of_the_pair_are_corrected(scene, patches):
+    """A phase of the second bank displaces heights, until a level seabed corrects it."""
+    low, high = flat_banks()
+    shifted = together([low, high.weighted(np.full(high.channels, np.exp(0.5j)))])
+    change(scene, '"image", "heights"', '"heights"')
+    if patches:
+        change(scene, "window_m = 0.2", "window_m = 0.2\npatch_m = 0.6")
+    displaced = clsas.process(scene, lines=shifted).heights
+    assert abs(np.nanmedian(displaced.height_m)) > 0.1
+    change(scene, 'steps = ["heights"]', 'steps = ["heights", "pair_errors"]')
+    of_pair = '[process.pair_errors]\nknown_height_m = 0.0\nunknowns = ["phase"]\n\n'
+    change(scene, "[process.heights]", of_pair + "[process.heights]")
+    found = clsas.process(scene, lines=shifted)
+    assert found.repeated == ("pair_errors", "heights")
+    assert found["heights"].corrections == ("pair_errors",)
+    numbers = found["pair_errors"].numbers
+    assert numbers["unknowns"] == ["phase"]
+    assert abs(numbers["values"][0] - 0.5) < 4 * numbers["sd"][0]
+    assert abs(np.nanmedian(found.heights.height_m)) < 5e-3
+    assert found.lines.banks == 2
+    np.testing.assert_array_equal(found.lines.bank(0).samples, low.samples)
+    names = {path.name for path in found.folder.iterdir()}
+    assert names - {"heights.zarr", "heights.h5"} == {
+        "process.json", "pair_errors.h5", "heights.png"
+    }  # fmt: skip
+    printed = CliRunner().invoke(main, ["process", str(scene)])
+    assert printed.exit_code == 0, printed.output
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("", "one of known_height_m and points_m must be given, got none"),
+        ("known_height_m = 0.0\npoints_m = [[0, 32, 0]]", "got known_height_m and points_m"),
+        ("known_height_m = 0.0\nknown_sd_m = -1", "known_sd_m must be"),
+        ('known_height_m = 0.0\nunknowns = ["heave"]', "unknowns"),
+        ("points_m = [[0, 32]]", "points_m"),
+        ("height = 0", "unknown key 'height'"),
+    ],
+)
+def test_mistakes_of_pair_errors_are_named(scene, table, message):
+    scene.write_text(scene.read_text() + f"\n[process.pair_errors]\n{table}\n")
+    with pytest.raises(ValueError, match=message):
+        clsas.process(scene)
+    assert not scene.with_suffix("").exists()
+
+
+def test_the_example_of_the_documentation_is_a_scene(scene):
+    page = (Path(__file__).parents[2] / "docs" / "scene-files.md").read_text()
+    _, example = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    scene.write_text(SCENE[: SCENE.index("[process]")] + example)
+    described = read_scene(scene)
+    assert checked_steps(None, described.process)[-2:] == ("image", "heights")
+    assert described.process["steps"] == ("pair_errors", "heights")
+    assert is_mosaic("heights", described)
+
+
+def test_pair_errors_need_both_tables(scene):
+    change(scene, '"image", "heights"', '"pair_errors"')
+    with pytest.raises(ValueError, match=r"known_height_m or points_m in \[process.pair_errors\]"):
+        clsas.process(scene)
+    change(
+        scene,
+        SCENE[SCENE.index("[process.heights]") :],
+        "[process.pair_errors]\nknown_height_m = 0",
+    )
+    with pytest.raises(ValueError, match=r"only with search_m in \[process.heights\]"):
+        clsas.process(scene)

@@ -141,6 +141,9 @@ def files(folder: Path) -> dict[str, Call]:
         "Store.heights": Call(
             of_heights.heights, {"rows": slice(0, 4), "columns": slice(1, 5)}, may_be_nan=True
         ),
+        "Store.sampled_heights": Call(
+            of_heights.sampled_heights, {"per_window": 2}, may_be_nan=True
+        ),
         "Store.overview_heights": Call(
             of_heights.overview_heights,
             {"most": 2, "rows": slice(0, 4), "columns": slice(1, 5)},
@@ -162,7 +165,9 @@ def store_of_heights(folder: Path, inputs: dict[str, Any], record: Record) -> cl
 
 def _layers(shape: tuple[int, ...]) -> dict[str, np.ndarray]:
     names = ("height_m", "sd_m", "coherence", "looks", "m_per_rad")
-    return {name: np.full(shape, 0.5, np.float32) for name in names}
+    layers = {name: np.full(shape, 0.5, np.float32) for name in names}
+    shadows = ("shadow_height_m", "shadow_sd_m")
+    return layers | {name: np.full(shape, np.nan, np.float32) for name in shadows}
 
 
 def store_with_levels(folder: Path, inputs: dict[str, Any], record: Record) -> clsas.Store:
