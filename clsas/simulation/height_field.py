@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
 from clsas.core import validate
+
+Elevations = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 _CLEAR = -1e30  # height beyond the lattice, where nothing casts shadows
 
@@ -52,7 +55,12 @@ class HeightField:
         heights = map_coordinates(self.heights_m, where, order=1, mode="constant", cval=np.nan)
         return heights.reshape(x.shape)
 
-    def lit(self, offsets_m: NDArray[np.float64], eye_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def lit(
+        self,
+        offsets_m: NDArray[np.float64],
+        eye_m: NDArray[np.float64],
+        elevations: Elevations | None = None,
+    ) -> NDArray[np.bool_]:
         """Return a mask of the points with a clear line of sight to a position, bool [points].
 
         A polar fan of rays surrounds the position. A point is lit if its elevation is not below the
@@ -64,6 +72,11 @@ class HeightField:
             Points relative to the position.
         eye_m : float64 [3]
             The position.
+        elevations : callable, optional
+            elevations(ground_m [n], rise_m [n]) is a measure of the elevation at which bent rays to
+            horizontal distances and relative heights leave the position: the same along a ray, and
+            growing with the height. It is NaN without a ray: such points count as lit, and cast no
+            shadows. By default rays are straight.
         """
         x, y, z = offsets_m
         lowest = eye_m[2] + min(z.min(initial=0.0), 0.0)
@@ -101,12 +114,25 @@ class HeightField:
             mode="constant",
             cval=_CLEAR,
         )
-        highest = np.maximum.accumulate(
-            (fan - np.float32(eye_m[2] - self._level_m)) / ranges.astype(np.float32), axis=1
-        )
-
-        elevation = z / np.maximum(ground, np.finfo(float).tiny)
+        fan -= np.float32(eye_m[2] - self._level_m)
+        if elevations is None:
+            fan /= ranges.astype(np.float32)
+            elevation = z / np.maximum(ground, np.finfo(float).tiny)
+        else:
+            fan = self._bent(fan, ranges, elevations)
+            elevation = np.nan_to_num(elevations(ground, z), nan=np.inf)
+        highest = np.maximum.accumulate(fan, axis=1)
         return (before < 0) | (elevation >= highest[ray, np.maximum(before, 0)])
+
+    def _bent(
+        self, fan: NDArray[np.float32], ranges: NDArray[np.float64], elevations: Elevations
+    ) -> NDArray[np.float32]:
+        """Return the elevations of relative heights [rays, ranges] along bent rays."""
+        covered = fan > _CLEAR / 2
+        found = np.full(fan.shape, np.float32(_CLEAR))
+        along = np.broadcast_to(ranges, fan.shape)[covered]
+        found[covered] = np.nan_to_num(elevations(along, fan[covered].astype(float)), nan=_CLEAR)
+        return found
 
     @property
     def _level_m(self) -> float:
