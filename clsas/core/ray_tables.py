@@ -59,7 +59,20 @@ def quantity_of(
     antenna_z_m: NDArray[np.float64] | float,
     z_m: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return a quantity of rays; all arguments broadcast. Values without a ray are undefined."""
+    """Return a quantity of rays; all arguments broadcast. Without a ray it is NaN."""
+    values = _existing(quantity, found, profile, horizontal_m, antenna_z_m, z_m)
+    return np.where(found.exists, values, np.nan)
+
+
+def _existing(
+    quantity: Quantity,
+    found: Rays,
+    profile: SoundSpeed,
+    horizontal_m: NDArray[np.float64],
+    antenna_z_m: NDArray[np.float64] | float,
+    z_m: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return a quantity of rays as far as they exist."""
     if quantity is Q.TIME:
         return found.time_s
     rise_m = z_m - antenna_z_m
@@ -110,10 +123,11 @@ class RayTable:
         horizontal_m: Extent,
         z_m: Extent,
         quantities: tuple[Quantity, ...] = TIMES,
+        times_error: float = 1.0,
     ) -> RayTable | None:
         """Return a table for distances and heights between limits.
 
-        It is None if there are shadow zones between these limits, or if the rays are not smooth
+        Errors may be `times_error` times the usual ones. It is None if there are shadow zones between these limits, or if the rays are not smooth
         enough for a table; `rays` must then be called itself.
         """
         check_reaches(profile, np.array([antenna_z_m, *z_m]))
@@ -123,7 +137,7 @@ class RayTable:
         edges = edges if len(edges) > 1 else np.repeat(edges, 2)
         found = []
         for heights in pairwise(map(float, edges)):
-            layer = _layer(profile, antenna_z_m, horizontal_m, heights, quantities)
+            layer = _layer(profile, antenna_z_m, horizontal_m, heights, quantities, times_error)
             if layer is None:
                 return None
             found.append(layer)
@@ -152,31 +166,36 @@ class RayTable:
         self, horizontal: NDArray[np.float64], z: NDArray[np.float64], read: NDArray[np.float64]
     ) -> None:
         if len(self.coefficients) == 1:
-            read[:] = self._interpolated(0, horizontal, z)
+            self._interpolate(0, horizontal, z, read)
         else:
             layer = np.searchsorted(self.edges_z_m[1:-1], z)
             for index in np.unique(layer):
-                here = layer == index
-                read[:, here] = self._interpolated(index, horizontal[here], z[here])
+                here = np.flatnonzero(layer == index)
+                values = np.empty((len(read), len(here)))
+                self._interpolate(index, horizontal[here], z[here], values)
+                read[:, here] = values
         for quantity, values in zip(self.quantities, read, strict=True):
             if quantity is Q.TIME:
                 values *= horizontal**2 + (z - self.antenna_z_m) ** 2
             if quantity in (Q.TIME, Q.SPREADING):
                 np.sqrt(np.maximum(values, 0.0, out=values), out=values)
 
-    def _interpolated(
-        self, index: int, horizontal: NDArray[np.float64], z: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return what is tabulated, at positions in one layer, [quantities, n]."""
+    def _interpolate(
+        self,
+        index: int,
+        horizontal: NDArray[np.float64],
+        z: NDArray[np.float64],
+        values: NDArray[np.float64],
+    ) -> None:
+        """Write what is tabulated, at positions in one layer, to values [quantities, n]."""
         coefficients = self.coefficients[index]
         heights = self.edges_z_m[index], self.edges_z_m[index + 1]
         most = np.max([each.shape for each in coefficients], axis=0)
         along = _polynomials(_scaled(horizontal, self.horizontal_m), most[0])
         up = _polynomials(_scaled(z, heights), most[1])
-        return np.stack([
-            np.einsum("jn,jn->n", each.T @ along[: each.shape[0]], up[: each.shape[1]])
-            for each in coefficients
-        ])  # fmt: skip
+        for row, each in zip(values, coefficients, strict=True):
+            parts = each.T @ along[: each.shape[0]]
+            np.einsum("jn,jn->n", parts, up[: each.shape[1]], out=row)
 
 
 def table_around(
@@ -185,6 +204,7 @@ def table_around(
     horizontal_m: NDArray[np.float64],
     z_m: NDArray[np.float64],
     quantities: tuple[Quantity, ...] = TIMES,
+    times_error: float = 1.0,
 ) -> RayTable | None:
     """Return a table that contains some positions, or None; see `RayTable.of`.
 
@@ -193,7 +213,7 @@ def table_around(
     lowest, highest = float(profile.z_m[-1]), float(profile.z_m[0])
     far = _rounded(float(horizontal_m.min()), float(horizontal_m.max()), (0.0, np.inf))
     heights = _rounded(float(z_m.min()), float(z_m.max()), (lowest, highest))
-    return _kept_table(profile, antenna_z_m, far, heights, quantities)
+    return _kept_table(profile, antenna_z_m, far, heights, quantities, times_error)
 
 
 @lru_cache(maxsize=64)
@@ -203,8 +223,9 @@ def _kept_table(
     horizontal_m: Extent,
     z_m: Extent,
     quantities: tuple[Quantity, ...],
+    times_error: float,
 ) -> RayTable | None:
-    return RayTable.of(profile, antenna_z_m, horizontal_m, z_m, quantities)
+    return RayTable.of(profile, antenna_z_m, horizontal_m, z_m, quantities, times_error)
 
 
 def _rounded(low: float, high: float, limits: Extent) -> Extent:
@@ -243,6 +264,7 @@ def _layer(
     horizontal: Extent,
     heights: Extent,
     quantities: tuple[Quantity, ...],
+    times_error: float,
 ) -> tuple[NDArray[np.float64], ...] | None:
     """Return the coefficients of one layer, by quantity.
 
@@ -263,7 +285,9 @@ def _layer(
         low, high = limits
         return np.clip((low + high + (high - low) * scaled) / 2, low, high)
 
-    allowed = [TABLE_ERROR_S if each is Q.TIME else TABLE_ERROR for each in quantities]
+    allowed = [
+        times_error * (TABLE_ERROR_S if each is Q.TIME else TABLE_ERROR) for each in quantities
+    ]
     both = horizontal, heights
     for attempt in range(_ATTEMPTS):
         counts = [

@@ -95,8 +95,8 @@ class ElementPatterns:
         bends = legs.bends
 
         def component(end: int, axis: int) -> NDArray:
-            offset_m = points[:, axis] - ends_m[end][axis]
-            return bends[end].level_1_m * offset_m + bends[end].lift * up[axis]
+            found = bends[end].level_1_m * (points[:, axis] - ends_m[end][axis])
+            return found + bends[end].lift * up[axis] if up[axis] else found
 
         in_front = (component(0, 1) > 0) & (component(1, 1) > 0)
         return in_front, [component(end, axis) for _, end, axis in self.elements]

@@ -16,6 +16,7 @@ from clsas.sonar.track import Channels
 
 # Points of a block from which on a table is faster. It takes as long as some thousand rays.
 _WORTH_A_TABLE = 4096
+_OF_SIGHT = 1e3  # times the error of tables, for sightlines: 1e-5 of directions
 _FLIGHT_STEPS = 4  # each multiplies the error of a moving receiver's delay by v/c
 _TINY_M = 1e-300  # distance that stands for 0, which callers refuse
 
@@ -115,7 +116,7 @@ class BlockRays:
         found = values_of(self.profile, distance_m, antenna_z_m, self.z_m, quantities)
         values = dict(zip(quantities, found, strict=True))
         time_s = values[Q.TIME]
-        if np.isinf(time_s).any():
+        if np.isnan(time_s).any():
             self._refuse(distance_m, antenna_z_m, time_s)
         spreading_m, level_1_m, lift = length_m, 1 / length_m, np.zeros_like(length_m)
         focused = False
@@ -133,7 +134,7 @@ class BlockRays:
         antenna_z_m: NDArray[np.float64] | float,
         time_s: NDArray[np.float64],
     ) -> None:
-        dark = np.flatnonzero(np.isinf(time_s))
+        dark = np.flatnonzero(np.isnan(time_s))
         nearest = int(dark[distance_m[dark].argmin()])
         at_z = float(np.broadcast_to(antenna_z_m, distance_m.shape)[nearest])
         place = float(distance_m[nearest]), at_z, float(self.z_m[nearest])
@@ -178,32 +179,46 @@ class Sightlines:
             Angle between neighbouring rays relative to that of straight paths, at least 1.
         """
         length_m = np.maximum(np.linalg.norm(offsets_m, axis=1), np.finfo(float).tiny)
-        level, lift, spreading, time_s = self._values(
+        level, lift, spreading = self._values(
             np.hypot(offsets_m[:, 0], offsets_m[:, 1]), offsets_m[:, 2],
-            (Q.LEVEL, Q.LIFT, Q.SPREADING, Q.TIME),
+            (Q.LEVEL, Q.LIFT, Q.SPREADING),
         )  # fmt: skip
-        exists = np.isfinite(time_s)
-        level[~exists], lift[~exists], spreading[~exists] = 1.0, 0.0, 1.0
+        dark = np.isnan(lift)
+        level[dark], lift[dark], spreading[dark] = 1.0, 0.0, 1.0
         directions = offsets_m / length_m[:, None]
         directions[:, :2] *= level[:, None]
         directions[:, 2] += lift
         return directions, np.clip(spreading, 1 / MOST_FOCUS, 1.0) ** -2
 
-    def arrivals(self, offsets_m: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return the directions in which rays arrive at points, unit vectors [3, points].
+    def arrivals(
+        self, offsets_m: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Return the directions in which rays arrive at points, and the elevations they leave at.
 
-        They are straight to points without a ray.
+        Parameters
+        ----------
+        offsets_m : float64 [3, points]
+            Points relative to the sonar.
+
+        Returns
+        -------
+        directions : float32 [3, points]
+            Unit vectors, straight to points without a ray.
+        elevations : float64 [points]
+            As for `elevations`.
         """
-        level, lift, time_s = self._values(
-            np.hypot(offsets_m[0], offsets_m[1]), offsets_m[2],
-            (Q.LEVEL_THERE, Q.LIFT_THERE, Q.TIME),
-        )  # fmt: skip
-        exists = np.isfinite(time_s)
-        level[~exists], lift[~exists] = 1.0, 0.0
-        directions = offsets_m / np.sqrt(np.einsum("ip,ip->p", offsets_m, offsets_m))
-        directions[:2] *= level
-        directions[2] += lift
-        return directions.astype(np.float32)
+        ground_m = np.sqrt(offsets_m[0] ** 2 + offsets_m[1] ** 2)
+        level, lift, leaving = self._values(
+            ground_m, offsets_m[2], (Q.LEVEL_THERE, Q.LIFT_THERE, Q.LIFT)
+        )
+        dark = np.isnan(lift)
+        level[dark], lift[dark] = 1.0, 0.0
+        length_m = np.maximum(np.sqrt(ground_m**2 + offsets_m[2] ** 2), _TINY_M)
+        straight = offsets_m[2] / length_m
+        level /= length_m
+        lift += straight
+        directions = np.stack([level * offsets_m[0], level * offsets_m[1], lift])
+        return directions.astype(np.float32), straight + leaving
 
     def elevations(
         self, ground_m: NDArray[np.float64], rise_m: NDArray[np.float64]
@@ -213,9 +228,8 @@ class Sightlines:
         At one horizontal distance they grow with the height, so that rays pass above whatever has a
         smaller elevation. Without a ray they are NaN.
         """
-        lift, time_s = self._values(ground_m, rise_m, (Q.LIFT, Q.TIME))
-        straight = rise_m / np.maximum(np.hypot(ground_m, rise_m), _TINY_M)
-        return np.where(np.isfinite(time_s), straight + lift, np.nan)
+        (lift,) = self._values(ground_m, rise_m, (Q.LIFT,))
+        return lift + rise_m / np.maximum(np.sqrt(ground_m**2 + rise_m**2), _TINY_M)
 
     def _values(
         self,
@@ -224,7 +238,7 @@ class Sightlines:
         quantities: tuple[Quantity, ...],
     ) -> NDArray[np.float64]:
         return values_of(
-            self.profile, ground_m, self.eye_z_m, self.eye_z_m + rise_m, quantities
+            self.profile, ground_m, self.eye_z_m, self.eye_z_m + rise_m, quantities, _OF_SIGHT
         )
 
 
@@ -234,15 +248,18 @@ def values_of(
     antenna_z_m: NDArray[np.float64] | float,
     z_m: NDArray[np.float64],
     quantities: tuple[Quantity, ...],
+    times_error: float = 1.0,
 ) -> NDArray[np.float64]:
-    """Return quantities of rays, [quantities, points]; times are infinite without a ray.
+    """Return quantities of rays, [quantities, points]; they are NaN without a ray.
 
     The antenna may have another height for every point. For many points, tables for the lowest and
     the highest are used: over the centimetres of a climb, quantities are linear in the height.
     """
     if len(distance_m) >= _WORTH_A_TABLE:
         ends = sorted({float(np.min(antenna_z_m)), float(np.max(antenna_z_m))})
-        tables = [table_around(profile, z, distance_m, z_m, quantities) for z in ends]
+        tables = [
+            table_around(profile, z, distance_m, z_m, quantities, times_error) for z in ends
+        ]
         read = [table.read(distance_m, z_m) for table in tables if table is not None]
         if len(read) == len(ends) == 1:
             return read[0]

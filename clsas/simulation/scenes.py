@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
-from clsas.simulation.height_field import HeightField
+from clsas.simulation.height_field import BentRays, HeightField
 from clsas.simulation.refraction import Sightlines
 from clsas.simulation.scatterers import Scatterers, draw_scatterers
 
@@ -348,13 +348,15 @@ class Seabed:
         chosen = np.arange(counts.sum()) + np.repeat(first - np.cumsum(counts) + counts, counts)
         positions = scatterers.positions_m[:, chosen]
         offsets = positions - observer.position_m[:, None]
-        bent = observer.sightlines
-        rays = offsets.astype(np.float32) if bent is None else bent.arrivals(offsets)
+        if observer.sightlines is None:
+            rays, bent = offsets.astype(np.float32), None
+        else:
+            rays, elevations = observer.sightlines.arrivals(offsets)
+            bent = BentRays(elevations, observer.sightlines.elevations)
         # Lambert's law: the amplitude falls with the cosine of the angle of incidence.
         facing = -np.einsum("ip,ip->p", scatterers.normals[:, chosen], rays)
         facing /= np.sqrt(np.einsum("ip,ip->p", rays, rays))
-        elevations = None if bent is None else bent.elevations
-        in_sight = self._surface.lit(offsets, observer.position_m, elevations)
+        in_sight = self._surface.lit(offsets, observer.position_m, bent)
         lit = np.flatnonzero((facing > 0) & in_sight)
         return positions[:, lit].T, scatterers.amplitudes[chosen[lit]] * facing[lit]
 
