@@ -20,6 +20,8 @@ class Bend(NamedTuple):
         Added to this component, times the component of the axis that points up.
     spreading_m : ndarray
         Length whose inverse is the amplitude; see `clsas.core.rays.Rays`.
+    speed_m_s : float
+        Sound speed at the antenna.
     focused : bool
         True if the amplitude was limited near a caustic.
     """
@@ -27,11 +29,13 @@ class Bend(NamedTuple):
     level_1_m: NDArray[np.float64]
     lift: NDArray[np.float64]
     spreading_m: NDArray[np.float64]
+    speed_m_s: float
     focused: bool = False
 
     def at(self, kept: NDArray[np.bool_]) -> Bend:
         """Return the rays to some of the points."""
-        return Bend(self.level_1_m[kept], self.lift[kept], self.spreading_m[kept], self.focused)
+        level_1_m, lift, spreading_m, *others = self
+        return Bend(level_1_m[kept], lift[kept], spreading_m[kept], *others)
 
 
 class Legs(NamedTuple):

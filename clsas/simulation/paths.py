@@ -120,8 +120,10 @@ class Paths:
         if velocity is not None:
             turn = 2 * float(np.linalg.norm(velocity[group[0]])) / self.sound_speed_m_s
 
+        shorter = 1.0 if bent is None else self.sound_speed_m_s / bent.speed_m_s
+
         def gain(directions: NDArray, slack: NDArray | float) -> NDArray:
-            return patterns.bound(ping, directions, slack + turn)
+            return patterns.bound(ping, shorter * directions, shorter * (slack + turn))
 
         return Observer(middle, radius, gain, bent)
 

@@ -77,7 +77,8 @@ class ElementPatterns:
         -------
         in_front : bool [points]
         sines : list of float64 [points]
-            sin theta for each one-way pattern of `self.elements`.
+            sin theta for each one-way pattern of `self.elements`, times the sonar's sound speed
+            over that at the element.
         """
         tx, rx, velocity = elements
         at_reception = rx[:, None]
@@ -93,10 +94,12 @@ class ElementPatterns:
             ]
 
         bends = legs.bends
+        # Patterns depend on the wavelength at the elements.
+        shorter = [self.sonar.sound_speed_m_s / bend.speed_m_s for bend in bends]
 
         def component(end: int, axis: int) -> NDArray:
-            found = bends[end].level_1_m * (points[:, axis] - ends_m[end][axis])
-            return found + bends[end].lift * up[axis] if up[axis] else found
+            found = shorter[end] * bends[end].level_1_m * (points[:, axis] - ends_m[end][axis])
+            return found + bends[end].lift * (shorter[end] * up[axis]) if up[axis] else found
 
         in_front = (component(0, 1) > 0) & (component(1, 1) > 0)
         return in_front, [component(end, axis) for _, end, axis in self.elements]

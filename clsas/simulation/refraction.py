@@ -126,7 +126,8 @@ class BlockRays:
         if Q.LEVEL in values:
             lift = values[Q.LIFT] + (1 - values[Q.LEVEL]) * rise_m * level_1_m
             level_1_m = level_1_m * values[Q.LEVEL]
-        return _Leg(time_s, length_m, Bend(level_1_m, lift, spreading_m, focused))
+        speed_m_s = float(self.profile.at(np.mean(antenna_z_m)))
+        return _Leg(time_s, length_m, Bend(level_1_m, lift, spreading_m, speed_m_s, focused))
 
     def _refuse(
         self,
@@ -160,6 +161,11 @@ class Sightlines:
 
     profile: SoundSpeed
     eye_z_m: float
+
+    @property
+    def speed_m_s(self) -> float:
+        """Sound speed at the sonar."""
+        return float(self.profile.at(self.eye_z_m))
 
     def departures(
         self, offsets_m: NDArray[np.float64]
