@@ -48,7 +48,7 @@ class Quantity(Enum):
 
 
 Q = Quantity
-TIMES = (Q.TIME,)
+TIMES: tuple[Quantity, ...] = (Q.TIME,)
 
 
 def quantity_of(
@@ -122,13 +122,15 @@ class RayTable:
         antenna_z_m: float,
         horizontal_m: Extent,
         z_m: Extent,
+        *,
         quantities: tuple[Quantity, ...] = TIMES,
         times_error: float = 1.0,
     ) -> RayTable | None:
         """Return a table for distances and heights between limits.
 
-        Errors may be `times_error` times the usual ones. It is None if there are shadow zones between these limits, or if the rays are not smooth
-        enough for a table; `rays` must then be called itself.
+        Errors may be `times_error` times the usual ones. The result is None if there are shadow
+        zones between these limits, or if the rays are not smooth enough for a table; `rays` must
+        then be called itself.
         """
         check_reaches(profile, np.array([antenna_z_m, *z_m]))
         low, high = z_m
@@ -225,7 +227,9 @@ def _kept_table(
     quantities: tuple[Quantity, ...],
     times_error: float,
 ) -> RayTable | None:
-    return RayTable.of(profile, antenna_z_m, horizontal_m, z_m, quantities, times_error)
+    return RayTable.of(
+        profile, antenna_z_m, horizontal_m, z_m, quantities=quantities, times_error=times_error
+    )
 
 
 def _rounded(low: float, high: float, limits: Extent) -> Extent:

@@ -117,8 +117,8 @@ def rays(
     for first in range(0, distance.size, at_once):
         some = slice(first, first + at_once)
         found[:, some] = _some_rays(profile, *(each[some] for each in flat))
-    *values, exists = found.reshape(6, *distance.shape)
-    return Rays(*values, exists > 0)
+    time, slowness, of_one, of_other, spreading, exists = found.reshape(6, *distance.shape)
+    return Rays(time, slowness, of_one, of_other, spreading, exists > 0)
 
 
 def farthest_m(profile: SoundSpeed, one_z_m: float, other_z_m: float) -> float:
@@ -380,7 +380,7 @@ def _turning(
             is_beyond = sign * (turned(middle, some)[0] - distance[some]) > 0
             low, high = np.where(is_beyond, low, middle), np.where(is_beyond, middle, high)
         _, time, slowness, parts = turned(high, some)
-        spread = sum(part.turned_slope(layer) for part in parts) / slowness
+        spread = np.sum([part.turned_slope(int(layer)) for part in parts], axis=0) / slowness
         order = np.argsort(-time)  # so that the first to arrive is kept
         earlier = order[time[order] < best_time[some[order]]]
         best_time[some[earlier]], best_slowness[some[earlier]] = time[earlier], slowness[earlier]

@@ -114,12 +114,11 @@ def _least_squares(
     for piece, (first, last) in enumerate(pairwise([0, *(kept[1:-1]), len(depth)])):
         d = depth[first:last] - edges[piece]
         later = d**2 / (2 * thickness[piece])
-        reduced = np.linalg.qr(
-            np.column_stack([np.ones_like(d), d - later, later, wanted[first:last]]), mode="r"
-        )[:3]
-        rows = reduced[:, :1] * of_starts[piece]
-        rows[:, piece : piece + 2] += reduced[:, 1:3]
-        equations.append(rows)
+        rows = np.column_stack([np.ones_like(d), d - later, later, wanted[first:last]])
+        reduced = np.asarray(np.linalg.qr(rows, mode="r"))[:3]
+        equation = reduced[:, :1] * of_starts[piece]
+        equation[:, piece : piece + 2] += reduced[:, 1:3]
+        equations.append(equation)
         values.append(reduced[:, 3])
     return np.linalg.lstsq(np.concatenate(equations), np.concatenate(values), rcond=None)[0]
 

@@ -15,6 +15,7 @@ from clsas.core import validate
 
 Elevations = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
+
 class BentRays(NamedTuple):
     """Elevations at which bent rays leave a position.
 

@@ -34,8 +34,11 @@ class Bend(NamedTuple):
 
     def at(self, kept: NDArray[np.bool_]) -> Bend:
         """Return the rays to some of the points."""
-        level_1_m, lift, spreading_m, *others = self
-        return Bend(level_1_m[kept], lift[kept], spreading_m[kept], *others)
+        return self._replace(
+            level_1_m=self.level_1_m[kept],
+            lift=self.lift[kept],
+            spreading_m=self.spreading_m[kept],
+        )
 
 
 class Legs(NamedTuple):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from clsas.core import validate
 from clsas.core.geometry import legs_m
-from clsas.core.ray_tables import TIMES, Q
+from clsas.core.ray_tables import TIMES, Q, Quantity
 from clsas.core.sound_speed import SoundSpeed
 from clsas.core.threads import in_threads
 from clsas.simulation.legs import Legs
@@ -110,7 +110,8 @@ class Paths:
         tx, rx = tx[group], rx[group]
         middle = (tx.mean(axis=0) + rx.mean(axis=0)) / 2
         patterns = self.patterns
-        bent = self.sound_speed and Sightlines(self.sound_speed, float(middle[2]))
+        profile = self.sound_speed
+        bent = None if profile is None else Sightlines(profile, float(middle[2]))
         if patterns is None:
             return Observer(middle, sightlines=bent)
         radius = max(np.linalg.norm(end - middle, axis=1).max() for end in (tx, rx))
@@ -133,7 +134,7 @@ class Paths:
         Both are relative to the observer and along the axes of the elements.
         """
         observer, patterns = self.observer(group), self.patterns
-        quantities = TIMES
+        quantities: tuple[Quantity, ...] = TIMES
         if patterns is not None:
             quantities += (Q.LEVEL, Q.LIFT)
         if self.spreading:

@@ -55,9 +55,7 @@ class BlockRays:
     quantities: tuple[Quantity, ...] = TIMES
     _latest: dict[bytes, _Leg] = field(default_factory=dict)
 
-    def legs(
-        self, elements: Channels, tx_z_m: float, rx_z_m: float, rx_climb_m_s: float
-    ) -> Legs:
+    def legs(self, elements: Channels, tx_z_m: float, rx_z_m: float, rx_climb_m_s: float) -> Legs:
         """Return the rays to all points for one channel.
 
         Parameters
@@ -263,9 +261,7 @@ def values_of(
     """
     if len(distance_m) >= _WORTH_A_TABLE:
         ends = sorted({float(np.min(antenna_z_m)), float(np.max(antenna_z_m))})
-        tables = [
-            table_around(profile, z, distance_m, z_m, quantities, times_error) for z in ends
-        ]
+        tables = [table_around(profile, z, distance_m, z_m, quantities, times_error) for z in ends]
         read = [table.read(distance_m, z_m) for table in tables if table is not None]
         if len(read) == len(ends) == 1:
             return read[0]

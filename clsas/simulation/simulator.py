@@ -106,7 +106,7 @@ def simulate(
     Warns
     -----
     ClsasWarning
-        If no echo arrives within the receive window.
+        If no echo arrives within the receive window, or spreading is limited near a caustic.
 
     See Also
     --------
@@ -120,8 +120,17 @@ def simulate(
     that middle, the edge of a shadow is displaced by e d/r, where r is the range of the object that
     casts the shadow and d the distance of the edge behind it.
 
-    With `sound_speed`, delays are those of exact rays. Element patterns, spreading and shadows of a
-    seabed are those of straight paths.
+    With `sound_speed`, delays are those of exact rays. Element patterns weigh the direction in
+    which a ray leaves the transmitter and arrives at the receiver, at the wavelength there. The
+    angle of incidence on a seabed and its shadows are those of rays too. Spreading follows from
+    neighbouring rays: 1/(R_tx R_rx) becomes 1/(L_tx L_rx) with
+
+        L^2 = D |dD/dp| sin(a) sin(b)/(p c_a c_b)
+
+    for the horizontal distance D, the horizontal slowness p, and the angles to the horizontal a, b
+    and sound speeds c_a, c_b at the two ends (Jensen et al., "Computational Ocean Acoustics", 2011,
+    section 3.3.5). Near caustics, amplitudes are limited to 10 dB above those of straight paths.
+    Phase jumps at caustics are left out.
 
     References
     ----------

@@ -75,7 +75,7 @@ def test_casts_of_a_hundred_thousand_depths_need_little_memory():
 
 @pytest.mark.parametrize("kept", [[0, 499], [0, 3, 4, 90, 300, 499], [0, 1, 2, 498, 499]])
 def test_the_fit_is_that_of_all_depths(kept):
-    """With one column per kept depth: the integral of the polygon that is 1 there and 0 elsewhere."""
+    """With a column per kept depth: the integral of the polygon that is 1 there, 0 elsewhere."""
     speed, kept = cast(0.002).speed_m_s, np.array(kept)
     hats = np.stack([np.interp(DEPTH, DEPTH[kept], unit) for unit in np.eye(len(kept))], axis=1)
     matrix = cumulative_trapezoid(hats, DEPTH, axis=0, initial=0.0)

@@ -68,6 +68,7 @@ def test_an_echo_is_that_of_the_direction_and_distance_in_which_it_appears(per_s
     assert np.abs(spectrum(straight) - spectrum(expected)).max() > 3e-3 * loud
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle_deg", [-3.3, -2.0, 4.0, 8.0, 20.0, 60.0])
 def test_spreading_is_that_of_a_tube_of_rays(angle_deg):
     """L^2 = D |dz/d angle| for the height z at which rays of neighbouring angles arrive."""
@@ -130,7 +131,7 @@ def test_a_caustic_is_bounded_and_named():
 
 def test_tables_keep_their_error():
     quantities = tuple(Q)
-    table = RayTable.of(LAYERS, -6.0, (20.0, 110.0), (-40.0, -8.0), quantities)
+    table = RayTable.of(LAYERS, -6.0, (20.0, 110.0), (-40.0, -8.0), quantities=quantities)
     random = np.random.default_rng(4)
     distance, z = random.uniform(20, 110, 3000), random.uniform(-40, -8, 3000)
     found = rays(LAYERS, distance, -6.0, z)
@@ -204,7 +205,7 @@ def marched(seabed, points, eye, per_s, steps=800):
     return clear
 
 
-@pytest.mark.parametrize("per_s", [-1.0, 0.12])
+@pytest.mark.parametrize("per_s", [-1.0, 1.0])
 def test_shadows_are_those_of_marched_circles(per_s):
     seabed, eye = hilly(wide_m2=(1.0, 4.0)), np.array([1.0, 0, -10])
     points = np.random.default_rng(5).uniform([-4, 100, 0], [4, 116, 0], (6000, 3))
@@ -218,7 +219,7 @@ def test_shadows_are_those_of_marched_circles(per_s):
     assert abs(found.mean() - expected.mean()) < 0.01
 
 
-@pytest.mark.parametrize("per_s", [-1.0, 0.12])
+@pytest.mark.parametrize("per_s", [-1.0, 1.0])
 def test_a_wall_casts_the_shadow_of_the_circle_through_its_top(per_s):
     """A wall of 1 m ends at y = 101 m; along straight rays, its shadow would end elsewhere."""
     y = np.linspace(98, 120, 221)
@@ -236,7 +237,7 @@ def test_a_wall_casts_the_shadow_of_the_circle_through_its_top(per_s):
     assert abs(straight - expected) > 1.0
 
 
-@pytest.mark.parametrize("per_s", [-1.0, 0.12])
+@pytest.mark.parametrize("per_s", [-1.0, 1.0])
 def test_the_angle_of_incidence_is_that_of_the_ray(per_s):
     """Lambert's law: on a level seabed amplitudes fall with the sine at which rays arrive."""
     flat = Seabed((-4, 4), (100, 116), np.full((17, 9), -22.0), density_m2=40)
