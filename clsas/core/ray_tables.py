@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from functools import lru_cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -26,6 +27,16 @@ TABLE_ERROR = 1e-8
 """Largest error of all other quantities: for elements of 30 wavelengths, 1e-6 of their pattern."""
 
 Extent = tuple[float, float]
+
+
+class Accuracy(NamedTuple):
+    """Largest errors of tabulated times, seconds, and of all other quantities."""
+
+    time_s: float = TABLE_ERROR_S
+    other: float = TABLE_ERROR
+
+
+USUAL = Accuracy()
 
 
 class Quantity(Enum):
@@ -124,13 +135,12 @@ class RayTable:
         z_m: Extent,
         *,
         quantities: tuple[Quantity, ...] = TIMES,
-        times_error: float = 1.0,
+        accuracy: Accuracy = USUAL,
     ) -> RayTable | None:
         """Return a table for distances and heights between limits.
 
-        Errors may be `times_error` times the usual ones. The result is None if there are shadow
-        zones between these limits, or if the rays are not smooth enough for a table; `rays` must
-        then be called itself.
+        The result is None if there are shadow zones between these limits, or if the rays are not
+        smooth enough for a table; `rays` must then be called itself.
         """
         check_reaches(profile, np.array([antenna_z_m, *z_m]))
         low, high = z_m
@@ -139,7 +149,7 @@ class RayTable:
         edges = edges if len(edges) > 1 else np.repeat(edges, 2)
         found = []
         for heights in pairwise(map(float, edges)):
-            layer = _layer(profile, antenna_z_m, horizontal_m, heights, quantities, times_error)
+            layer = _layer(profile, antenna_z_m, horizontal_m, heights, quantities, accuracy)
             if layer is None:
                 return None
             found.append(layer)
@@ -206,7 +216,7 @@ def table_around(
     horizontal_m: NDArray[np.float64],
     z_m: NDArray[np.float64],
     quantities: tuple[Quantity, ...] = TIMES,
-    times_error: float = 1.0,
+    accuracy: Accuracy = USUAL,
 ) -> RayTable | None:
     """Return a table that contains some positions, or None; see `RayTable.of`.
 
@@ -215,7 +225,7 @@ def table_around(
     lowest, highest = float(profile.z_m[-1]), float(profile.z_m[0])
     far = _rounded(float(horizontal_m.min()), float(horizontal_m.max()), (0.0, np.inf))
     heights = _rounded(float(z_m.min()), float(z_m.max()), (lowest, highest))
-    return _kept_table(profile, antenna_z_m, far, heights, quantities, times_error)
+    return _kept_table(profile, antenna_z_m, far, heights, quantities, accuracy)
 
 
 @lru_cache(maxsize=64)
@@ -225,10 +235,10 @@ def _kept_table(
     horizontal_m: Extent,
     z_m: Extent,
     quantities: tuple[Quantity, ...],
-    times_error: float,
+    accuracy: Accuracy,
 ) -> RayTable | None:
     return RayTable.of(
-        profile, antenna_z_m, horizontal_m, z_m, quantities=quantities, times_error=times_error
+        profile, antenna_z_m, horizontal_m, z_m, quantities=quantities, accuracy=accuracy
     )
 
 
@@ -268,7 +278,7 @@ def _layer(
     horizontal: Extent,
     heights: Extent,
     quantities: tuple[Quantity, ...],
-    times_error: float,
+    accuracy: Accuracy,
 ) -> tuple[NDArray[np.float64], ...] | None:
     """Return the coefficients of one layer, by quantity.
 
@@ -289,9 +299,7 @@ def _layer(
         low, high = limits
         return np.clip((low + high + (high - low) * scaled) / 2, low, high)
 
-    allowed = [
-        times_error * (TABLE_ERROR_S if each is Q.TIME else TABLE_ERROR) for each in quantities
-    ]
+    allowed = [accuracy.time_s if each is Q.TIME else accuracy.other for each in quantities]
     both = horizontal, heights
     for attempt in range(_ATTEMPTS):
         counts = [

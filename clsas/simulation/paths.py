@@ -158,7 +158,7 @@ class Paths:
                     rays = None
                     if self.sound_speed is not None:
                         z_m = positions[block, 2]
-                        rays = BlockRays(self.sound_speed, points_m, z_m, quantities)
+                        rays = BlockRays(self.sound_speed, points_m, z_m, quantities, part.error)
                     yield PointBlock(points_m, amplitudes[block], part.error, axes[:, 2], rays)
 
         return [local(channel) for channel in group], blocks()

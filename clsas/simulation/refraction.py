@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.ray_tables import TIMES, Q, Quantity, quantity_of, table_around
+from clsas.core.ray_tables import TIMES, USUAL, Accuracy, Q, Quantity, quantity_of, table_around
 from clsas.core.rays import rays, shadow
 from clsas.core.sound_speed import SoundSpeed
 from clsas.simulation.legs import Bend, Legs
@@ -16,7 +16,7 @@ from clsas.sonar.track import Channels
 
 # Points of a block from which on a table is faster. It takes as long as some thousand rays.
 _WORTH_A_TABLE = 4096
-_OF_SIGHT = 1e3  # times the error of tables, for sightlines: 1e-5 of directions
+_OF_SIGHT = Accuracy(2e-9, 1e-5)  # of sightlines
 _FLIGHT_STEPS = 4  # each multiplies the error of a moving receiver's delay by v/c
 _TINY_M = 1e-300  # distance that stands for 0, which callers refuse
 
@@ -47,12 +47,15 @@ class BlockRays:
     quantities : tuple of Quantity
         What is needed of the rays: the time, and for `Bend` its direction and spreading. What is
         not needed is that of straight paths.
+    error : float
+        Relative error that the sum over these points may have.
     """
 
     profile: SoundSpeed
     points_m: NDArray[np.float64]
     z_m: NDArray[np.float64]
     quantities: tuple[Quantity, ...] = TIMES
+    error: float = 0.0
     _latest: dict[bytes, _Leg] = field(default_factory=dict)
 
     def legs(self, elements: Channels, tx_z_m: float, rx_z_m: float, rx_climb_m_s: float) -> Legs:
@@ -87,6 +90,13 @@ class BlockRays:
             back = self._leg(moved_m, rx_z_m + rx_climb_m_s * delay, quantities)
         return _legs(out, back)
 
+    @property
+    def _accuracy(self) -> Accuracy:
+        """Accuracy of tables: phases to a tenth of the error at 800 kHz, directions to less."""
+        return Accuracy(
+            USUAL.time_s * max(1.0, 1e4 * self.error), USUAL.other * max(1.0, 1e5 * self.error)
+        )
+
     def _outward(self, tx_m: NDArray[np.float64], z_m: float) -> _Leg:
         """Return the leg from a transmitter, which the channels of a ping usually share."""
         key = tx_m.tobytes()
@@ -111,7 +121,9 @@ class BlockRays:
         square = np.einsum("ni,ni->n", offset_m, offset_m)
         length_m = np.maximum(np.sqrt(square), _TINY_M)
         distance_m = np.sqrt(np.maximum(square - rise_m**2, 0.0))
-        found = values_of(self.profile, distance_m, antenna_z_m, self.z_m, quantities)
+        found = values_of(
+            self.profile, distance_m, antenna_z_m, self.z_m, quantities, self._accuracy
+        )
         values = dict(zip(quantities, found, strict=True))
         time_s = values[Q.TIME]
         if np.isnan(time_s).any():
@@ -252,7 +264,7 @@ def values_of(
     antenna_z_m: NDArray[np.float64] | float,
     z_m: NDArray[np.float64],
     quantities: tuple[Quantity, ...],
-    times_error: float = 1.0,
+    accuracy: Accuracy = USUAL,
 ) -> NDArray[np.float64]:
     """Return quantities of rays, [quantities, points]; they are NaN without a ray.
 
@@ -261,7 +273,7 @@ def values_of(
     """
     if len(distance_m) >= _WORTH_A_TABLE:
         ends = sorted({float(np.min(antenna_z_m)), float(np.max(antenna_z_m))})
-        tables = [table_around(profile, z, distance_m, z_m, quantities, times_error) for z in ends]
+        tables = [table_around(profile, z, distance_m, z_m, quantities, accuracy) for z in ends]
         read = [table.read(distance_m, z_m) for table in tables if table is not None]
         if len(read) == len(ends) == 1:
             return read[0]
