@@ -40,7 +40,7 @@ USUAL = Accuracy()
 
 
 class Quantity(Enum):
-    """What a table contains of rays from an antenna to points.
+    """Quantity of the rays from an antenna to points, as a table contains it.
 
     All but the time are relative to the straight path, whose length is R: they hardly vary, and are
     1 or 0 in homogeneous water. The direction of a ray is that in which it leaves the antenna;

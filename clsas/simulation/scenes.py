@@ -187,7 +187,9 @@ class Seabed:
     the maximum on the nearest ray, up to one or two lattice steps before the scatterer. Rays lie at
     most one step apart, so the sides of a shadow are accurate to half a step. The error of its far
     end is the change that the shadow would have if the object were two steps shorter. Objects
-    thinner than two steps do not cast reliable shadows.
+    thinner than two steps do not cast reliable shadows. If the sound speed varies with depth, the
+    elevations are those at which rays leave the sonar, and the angle of incidence is that at which
+    they arrive.
 
     Examples
     --------
