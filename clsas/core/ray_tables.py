@@ -220,12 +220,20 @@ def table_around(
 ) -> RayTable | None:
     """Return a table that contains some positions, or None; see `RayTable.of`.
 
-    Its limits are rounded, so that it can serve again for positions in nearly the same place.
+    Its limits are rounded, so that it can serve again for positions in nearly the same place. They
+    are exact if there are shadow zones beyond the positions.
     """
     lowest, highest = float(profile.z_m[-1]), float(profile.z_m[0])
-    far = _rounded(float(horizontal_m.min()), float(horizontal_m.max()), (0.0, np.inf))
-    heights = _rounded(float(z_m.min()), float(z_m.max()), (lowest, highest))
-    return _kept_table(profile, antenna_z_m, far, heights, quantities, accuracy)
+    exact = [(float(each.min()), float(each.max())) for each in (horizontal_m, z_m)]
+    rounded = [
+        _rounded(*limits, most)
+        for limits, most in zip(exact, ((0.0, np.inf), (lowest, highest)), strict=True)
+    ]
+    for far, heights in (rounded, exact):
+        table = _kept_table(profile, antenna_z_m, far, heights, quantities, accuracy)
+        if table is not None:
+            return table
+    return None
 
 
 @lru_cache(maxsize=64)

@@ -8,7 +8,7 @@ from bent import shot
 
 import clsas
 from clsas import Pointing, PointTargets, Pulse, Sonar, SoundSpeed, Track, simulate, simulate_lines
-from clsas.core.ray_tables import TABLE_ERROR, Q, RayTable, quantity_of
+from clsas.core.ray_tables import TABLE_ERROR, Q, RayTable, quantity_of, table_around
 from clsas.core.rays import farthest_m, rays
 from clsas.simulation.height_field import BentRays
 from clsas.simulation.recording import FOCUSED
@@ -138,6 +138,19 @@ def test_tables_keep_their_error():
     for quantity, read in zip(quantities, table.read(distance, z), strict=True):
         error = np.abs(read - quantity_of(quantity, found, LAYERS, distance, -6.0, z)).max()
         assert error < 2 * (2e-12 if quantity is Q.TIME else TABLE_ERROR)
+
+
+def test_tables_serve_up_to_a_shadow_zone():
+    """Although their limits are otherwise rounded outwards."""
+    profile = gradient(1.0)
+    far = farthest_m(profile, -10.0, -22.0)
+    distance, z = np.array([100.0, 0.99 * far]), np.array([-22.0, -22.0])
+    table = table_around(profile, -10.0, distance, z)
+    assert table is not None
+    assert table.horizontal_m == (100.0, 0.99 * far)
+    wide = table_around(profile, -10.0, distance / 2, z)
+    assert wide is not None
+    assert wide.horizontal_m[1] > distance[1] / 2
 
 
 def hilly(y_m=(100, 116), z=-22.0, wide_m2=(0.2, 1.0), **others):
