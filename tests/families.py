@@ -21,7 +21,7 @@ from sums import SPEED_M_S, BentChannels, Channels, Echoes, Noise, Points, Sampl
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
-from clsas.core.sound_speed import SoundSpeed
+from clsas.core.sound_speed import STEEPEST_PER_S, SoundSpeed
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import oracle
 
@@ -262,6 +262,8 @@ def _in_water(
     elif kind == "thermocline":
         change = np.array([0.0, 0.0, -1.0, -1.0 + 0.05 * rng.normal()])
     change *= rng.uniform(0.1, 1.0) * min(top - bottom, 30.0) / np.ptp(change)
+    steepest_per_s = np.max(np.abs(np.diff(change) / np.diff(share * (top - bottom))))
+    change *= min(1.0, STEEPEST_PER_S / (1.01 * steepest_per_s))  # as profiles allow
     surface_z_m = top + rng.uniform(0, 10)
     depth_m = surface_z_m - top + share * (top - bottom)
     found = BentChannels(

@@ -14,6 +14,14 @@ v = 1/(p C)^2 - 1, X falls as v grows, and 1/X^2 is almost linear in v: a few st
 method find the ray. Its time, taken as sum(t) + p (D - X) for the distance D, is stationary in p
 (Fermat), so that it is accurate to rounding.
 
+The energy between neighbouring rays spreads out: the amplitude falls as 1/L, with
+
+    L^2 = D |dD/dp| w_1 w_2/(p c_1 c_2)
+
+for the speeds c and sines w at the two ends ([1]_, section 3.3.5). Sound takes the same loss both
+ways, and in homogeneous water L is the length of the path. In a linear gradient g it is
+sqrt(c_1 c_2) sinh(g t)/g. At caustics, where neighbouring rays cross, L is 0.
+
 .. [1] Jensen, Kuperman, Porter, Schmidt, "Computational Ocean Acoustics", 2nd edition, Springer,
    2011, section 3.3.
 """
@@ -34,6 +42,7 @@ _CLOSE = 1e-14  # relative error of the distance at which a ray counts as found
 _VERTICAL = 1e-9  # least horizontal distance over height, for which a time differs by 1e-18
 _TURNS = 32  # depths per layer at which turning rays are tried before they are refined
 _HALVINGS = 50  # of the interval between two of them
+_LEVEL = 1e-100  # sine of angles that stands for 0, so that limits need no formula of their own
 _AT_ONCE = 1 << 15  # rays that are computed together; bounds memory
 _PIECES_AT_ONCE = 1 << 22  # of rays, one per layer; bounds memory for profiles of many depths
 _TURNING_AT_ONCE = 1 << 9
@@ -51,6 +60,9 @@ class Rays:
         Horizontal slowness: the change of the travel time per metre of horizontal distance.
     one_slope_s_m, other_slope_s_m : float64
         Change of the travel time per metre that one (the other) end moves up.
+    spreading_m : float64
+        Length whose inverse is the amplitude relative to that at 1 m: the distance in homogeneous
+        water, 0 at caustics.
     exists : bool
         False in shadow zones.
     """
@@ -59,6 +71,7 @@ class Rays:
     slowness_s_m: NDArray[np.float64]
     one_slope_s_m: NDArray[np.float64]
     other_slope_s_m: NDArray[np.float64]
+    spreading_m: NDArray[np.float64]
     exists: NDArray[np.bool_]
 
 
@@ -98,14 +111,14 @@ def rays(
     for z in (one, other):
         check_reaches(profile, z)
     profile = thinned(profile)
-    found = np.empty((5, distance.size))
+    found = np.empty((6, distance.size))
     flat = [np.ravel(each) for each in (distance, one, other)]
     at_once = max(min(_AT_ONCE, _PIECES_AT_ONCE // len(profile.depth_m)), 1)
     for first in range(0, distance.size, at_once):
         some = slice(first, first + at_once)
         found[:, some] = _some_rays(profile, *(each[some] for each in flat))
-    time, slowness, of_one, of_other, exists = found.reshape(5, *distance.shape)
-    return Rays(time, slowness, of_one, of_other, exists > 0)
+    time, slowness, of_one, of_other, spreading, exists = found.reshape(6, *distance.shape)
+    return Rays(time, slowness, of_one, of_other, spreading, exists > 0)
 
 
 def farthest_m(profile: SoundSpeed, one_z_m: float, other_z_m: float) -> float:
@@ -173,10 +186,12 @@ class _Way:
 
     @cached_property
     def _excess(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """1 - (c/C)^2 at the upper and lower ends, with C the largest speed."""
-        top = self.fastest
-        above, below = ((top - c) * (top + c) / top**2 for c in (self.above, self.below))
-        return above, below
+        """The excess at the upper and lower end of every piece."""
+        return self.excess(self.above), self.excess(self.below)
+
+    def excess(self, speed: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return 1 - (c/C)^2 for speeds c, with C the largest speed."""
+        return (self.fastest - speed) * (self.fastest + speed) / self.fastest**2
 
     def distance(self, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the horizontal distance for v = 1/(p C)^2 - 1, and its derivative, [rays]."""
@@ -186,6 +201,16 @@ class _Way:
             pieces = np.where(self.thickness > 0, pieces, 0.0)
             slopes = np.where(self.thickness > 0, -pieces / (2 * above * below), 0.0)
         return pieces.sum(axis=0), slopes.sum(axis=0)
+
+    def turned_slope(self, layer: int) -> NDArray[np.float64]:
+        """Return dD/dp of the way below the depth in a layer at which a ray turns, [rays].
+
+        The piece of that layer is w_b/(p |g|), which becomes shorter as p grows.
+        """
+        above, below = (np.maximum(np.sqrt(excess), _LEVEL) for excess in self._excess)
+        pieces = self.thickness * (self.above + self.below) / (above + below)
+        above[layer] = -below[layer]
+        return np.sum(pieces / (above * below), axis=0)
 
     def time(self, v: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the travel time of the ray with v = 1/(p C)^2 - 1, [rays]."""
@@ -207,7 +232,7 @@ def _some_rays(
     one_z: NDArray[np.float64],
     other_z: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return time, slowness, slopes at both ends, and 1 where there is a ray, [5, rays]."""
+    """Return what `Rays` contain, with 1 where there is a ray, [6, rays]."""
     one, other = profile.surface_z_m - one_z, profile.surface_z_m - other_z
     limits = profile.depth_m[0], profile.depth_m[-1]
     upper, lower = (np.clip(pick(one, other), *limits) for pick in (np.minimum, np.maximum))
@@ -218,7 +243,9 @@ def _some_rays(
     at_ends = [np.interp(depth, profile.depth_m, profile.speed_m_s) for depth in (upper, lower)]
     with np.errstate(invalid="ignore"):
         slowness = 1 / (way.fastest * np.sqrt(1 + v))
-        time = way.time(v) + slowness * (distance - way.distance(v)[0])
+        covered, per_v = way.distance(np.maximum(v, _LEVEL**2))
+        time = way.time(v) + slowness * (distance - covered)
+        spread = -2 * (way.fastest * (1 + v)) ** 2 * per_v  # dD/dp/p
     level = height == 0
     if level.any():
         straight = level & _constant_at(profile, upper)
@@ -233,18 +260,26 @@ def _some_rays(
     at_once = max(min(_TURNING_AT_ONCE, _PIECES_AT_ONCE // len(profile.depth_m)), 1)
     for first in range(0, len(missing), at_once):
         some = missing[first : first + at_once]
-        slowness[some], time[some] = _turning(profile, distance[some], upper[some], lower[some])
+        slowness[some], time[some], spread[some] = _turning(
+            profile, distance[some], upper[some], lower[some]
+        )
         turns[some] = np.isfinite(time[some])
     exists = ~np.isnan(v) | turns
-    with np.errstate(invalid="ignore"):
-        steep = [np.sqrt(np.maximum(1 / c**2 - slowness**2, 0.0)) for c in at_ends]
+    steep = []
+    for speed in at_ends:
+        sine = np.sqrt((np.maximum(v, _LEVEL**2) + way.excess(speed)) / (1 + v))
+        cosine = np.minimum(slowness[turns] * speed[turns], 1.0)
+        sine[turns] = np.sqrt((1 - cosine) * (1 + cosine))
+        steep.append(sine / speed)
+    spreading = np.sqrt(distance * np.abs(spread) * steep[0] * steep[1])
+    spreading[level & ~turns] = distance[level & ~turns]
     at_upper, at_lower = np.where(turns, -steep[0], steep[0]), -steep[1]
     slopes = [
         np.where(one <= other, at_upper, at_lower), np.where(one <= other, at_lower, at_upper),
     ]  # fmt: skip
-    found = np.stack([time, slowness, *slopes, exists.astype(np.float64)])
+    found = np.stack([time, slowness, *slopes, spreading, exists.astype(np.float64)])
     found[0, ~exists] = np.inf
-    found[1:4, ~exists] = 0.0
+    found[1:5, ~exists] = 0.0
     return found
 
 
@@ -290,12 +325,15 @@ def _turning(
     distance: NDArray[np.float64],
     upper: NDArray[np.float64],
     lower: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return slowness and time of rays that rise above both ends; infinite times without one.
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return slowness p, time and dD/dp/p of rays that rise above both ends.
+
+    Times are infinite where there is none.
 
     A ray turns at the depth where the speed is 1/p, if it is slower everywhere below.
     """
-    best_time, best_slowness = np.full(len(distance), np.inf), np.zeros(len(distance))
+    best_time = np.full(len(distance), np.inf)
+    best_slowness, best_spread = np.zeros((2, len(distance)))
     edges, speeds = profile.depth_m, profile.speed_m_s
     fraction = np.linspace(0, 1, _TURNS + 1)[:, None]
     for layer in np.flatnonzero(np.diff(speeds) < 0):
@@ -304,8 +342,8 @@ def _turning(
 
         def turned(
             share: NDArray[np.float64], some: NDArray[np.int64], reach=reach, bottom=bottom
-        ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-            """Return distance, time and slowness for turns at some share of the layer."""
+        ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], list[_Way]]:
+            """Return distance, time, slowness and ways for turns at some share of the layer."""
             # The distance has a square root at the start of the layer, hence the square.
             depth = bottom[some] - reach[some] * share**2
             speed = np.interp(depth, edges, speeds)
@@ -318,7 +356,7 @@ def _turning(
             time = sum(part.time(nothing) for part in parts)
             slowness = 1 / speed
             time = time + slowness * (distance[some] - covered)
-            return np.where(allowed, covered, np.nan), time, slowness
+            return np.where(allowed, covered, np.nan), time, slowness, parts
 
         everything = np.flatnonzero(reach > 0)
         if not everything.size:
@@ -341,8 +379,10 @@ def _turning(
             middle = (low + high) / 2
             is_beyond = sign * (turned(middle, some)[0] - distance[some]) > 0
             low, high = np.where(is_beyond, low, middle), np.where(is_beyond, middle, high)
-        _, time, slowness = turned(high, some)
+        _, time, slowness, parts = turned(high, some)
+        spread = np.sum([part.turned_slope(int(layer)) for part in parts], axis=0) / slowness
         order = np.argsort(-time)  # so that the first to arrive is kept
         earlier = order[time[order] < best_time[some[order]]]
         best_time[some[earlier]], best_slowness[some[earlier]] = time[earlier], slowness[earlier]
-    return best_slowness, best_time
+        best_spread[some[earlier]] = spread[earlier]
+    return best_slowness, best_time, best_spread

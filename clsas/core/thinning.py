@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ VERTICAL_ERROR_S = 2e-10
 most twice as much over sin(a), 2e-9 s at 11 degrees: 1/800 of a wavelength at 600 kHz."""
 
 _WORTH = 0.5  # share of the depths beyond which fewer are not worth the search
-_MOST = 400  # depths of a thinned profile; the time of a fit has their square
+_MOST = 400  # depths of a thinned profile; the time of a fit has their cube
 
 
 @lru_cache(maxsize=8)
@@ -80,23 +81,49 @@ def _fitted(
 
     Of a depth and the middle of the layer below it, the larger error counts.
     """
-    piece = np.searchsorted(kept, np.arange(len(depth)), side="right").clip(1, len(kept) - 1) - 1
-    share = (depth - depth[kept[piece]]) / (depth[kept[piece + 1]] - depth[kept[piece]])
-    hats = np.zeros((len(depth), len(kept)))
-    rows = np.arange(len(depth))
-    hats[rows, piece], hats[rows, piece + 1] = 1 - share, share
     start = speed[kept]
-    wanted = _integral(depth, (speed - hats @ start)[:, None])[:, 0]
-    basis = _integral(depth, hats)
-    change = np.linalg.lstsq(basis, wanted, rcond=None)[0]
-    fitted, error = start + change, wanted - basis @ change
-    away = speed - hats @ fitted
+    away = speed - np.interp(depth, depth[kept], start)
+    change = _least_squares(depth, _integral(depth, away), kept)
+    fitted = start + change
+    error = _integral(depth, away - np.interp(depth, depth[kept], change))
+    away = speed - np.interp(depth, depth[kept], fitted)
     below = error[:-1] + np.diff(depth) * (3 * away[:-1] + away[1:]) / 8
     error[:-1] = np.maximum(np.abs(error[:-1]), np.abs(below))
     return fitted, error
 
 
+def _least_squares(
+    depth: NDArray[np.float64], wanted: NDArray[np.float64], kept: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return changes at kept depths whose integral fits some values best, [kept].
+
+    At a depth d below the start of a piece of thickness h, the integral of changes from c to e is
+
+        S + c (d - d^2/(2 h)) + e d^2/(2 h)
+
+    with the integral S down to that start. However many depths a piece has, these are three
+    unknowns: orthogonal transformations reduce its equations to as many.
+    """
+    edges = depth[kept]
+    thickness = np.diff(edges)
+    halves = np.zeros((len(kept), len(kept)))  # of the integral of every piece
+    below = np.arange(1, len(kept))
+    halves[below, below - 1] = halves[below, below] = thickness / 2
+    of_starts = halves.cumsum(axis=0)
+    equations, values = [], []
+    for piece, (first, last) in enumerate(pairwise([0, *(kept[1:-1]), len(depth)])):
+        d = depth[first:last] - edges[piece]
+        later = d**2 / (2 * thickness[piece])
+        rows = np.column_stack([np.ones_like(d), d - later, later, wanted[first:last]])
+        reduced = np.asarray(np.linalg.qr(rows, mode="r"))[:3]
+        equation = reduced[:, :1] * of_starts[piece]
+        equation[:, piece : piece + 2] += reduced[:, 1:3]
+        equations.append(equation)
+        values.append(reduced[:, 3])
+    return np.linalg.lstsq(np.concatenate(equations), np.concatenate(values), rcond=None)[0]
+
+
 def _integral(depth: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the integrals of columns of values from the first depth down to every other."""
-    pieces = np.diff(depth)[:, None] * (values[:-1] + values[1:]) / 2
-    return np.concatenate([np.zeros((1, values.shape[1])), pieces.cumsum(axis=0)])
+    """Return the integrals of values from the first depth down to every other."""
+    pieces = np.diff(depth) * (values[:-1] + values[1:]) / 2
+    return np.append(0.0, pieces.cumsum())

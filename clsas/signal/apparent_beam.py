@@ -19,6 +19,7 @@ from clsas.core.wavelengths import wavelength_m
 from clsas.signal.ray_delays import RaySample
 from clsas.sonar.beam import BeamWindow
 
+_NEAR = 0.1  # part of the width whose channels stand for those at its end; a plain choice
 _SINES = 129  # at which the weights of a beam are sampled; a plain choice
 
 
@@ -70,8 +71,8 @@ def apparent_beam(
     -----
     The ratio of sines depends a little on the distance and on heave. One ratio is fitted to the
     horizontal components of exact rays, and another to the vertical ones, which matter where tracks
-    slope. The error is what they leave, as far as weights are smooth: steps of a window may lie
-    elsewhere by the same part of its width.
+    slope. The error is what they leave: in the weights, as far as these are smooth, and by the
+    channels that a window which begins with a step includes or leaves out wrongly.
     """
     profile = lines.sound_speed
     assert profile is not None
@@ -101,7 +102,32 @@ def apparent_beam(
     low, high = np.clip(beam.limits, -1, 1)
     sine = np.linspace(low, high, _SINES + 2)[1:-1]
     usual2 = np.mean(beam.weights(sine, at_antennas_m) ** 2)
-    return found, float(np.mean((others - weights)[inside] ** 2) / usual2)
+    smooth = float(np.mean((others - weights)[inside] ** 2) / usual2)
+    errors = ratio * given[inside] - wanted[inside]
+    steps = _step_error(beam, wanted[inside], errors, at_antennas_m) / float(usual2)
+    return found, smooth + steps
+
+
+def _step_error(
+    beam: BeamWindow,
+    sines: NDArray[np.float64],
+    errors: NDArray[np.float64],
+    wavelength_m: float,
+) -> float:
+    """Return the mean squared error of weights at the steps with which a window begins and ends.
+
+    A step is displaced by the errors of sines near it. Channels between its two places have the
+    error of its height.
+    """
+    low, high = beam.limits
+    near = _NEAR * (high - low)
+    total = 0.0
+    for edge, inwards in ((low, 1.0), (high, -1.0)):
+        beside = np.abs(sines - edge) < near
+        if abs(edge) < 1 and beside.any():
+            height = float(beam.weights(edge + 1e-6 * inwards * near, wavelength_m))
+            total += height**2 * float(np.abs(errors[beside]).sum()) / near
+    return total / len(sines)
 
 
 def _ratio(wanted: NDArray[np.float64], given: NDArray[np.float64], otherwise: float) -> float:

@@ -2,14 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
 from clsas.core import validate
+
+Elevations = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+
+
+class BentRays(NamedTuple):
+    """Elevations at which bent rays leave a position.
+
+    An elevation is any measure that is the same along a ray, and grows with the height. It is NaN
+    without a ray: such points count as lit, and cast no shadows.
+
+    Attributes
+    ----------
+    of_points : float64 [points]
+        Elevations to the points in question.
+    towards : callable
+        towards(ground_m [n], rise_m [n]) returns the elevations to other points, at horizontal
+        distances and relative heights.
+    """
+
+    of_points: NDArray[np.float64]
+    towards: Elevations
+
 
 _CLEAR = -1e30  # height beyond the lattice, where nothing casts shadows
 
@@ -52,7 +76,12 @@ class HeightField:
         heights = map_coordinates(self.heights_m, where, order=1, mode="constant", cval=np.nan)
         return heights.reshape(x.shape)
 
-    def lit(self, offsets_m: NDArray[np.float64], eye_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def lit(
+        self,
+        offsets_m: NDArray[np.float64],
+        eye_m: NDArray[np.float64],
+        bent: BentRays | None = None,
+    ) -> NDArray[np.bool_]:
         """Return a mask of the points with a clear line of sight to a position, bool [points].
 
         A polar fan of rays surrounds the position. A point is lit if its elevation is not below the
@@ -64,6 +93,8 @@ class HeightField:
             Points relative to the position.
         eye_m : float64 [3]
             The position.
+        bent : BentRays, optional
+            Elevations of the rays; by default they are straight.
         """
         x, y, z = offsets_m
         lowest = eye_m[2] + min(z.min(initial=0.0), 0.0)
@@ -101,12 +132,25 @@ class HeightField:
             mode="constant",
             cval=_CLEAR,
         )
-        highest = np.maximum.accumulate(
-            (fan - np.float32(eye_m[2] - self._level_m)) / ranges.astype(np.float32), axis=1
-        )
-
-        elevation = z / np.maximum(ground, np.finfo(float).tiny)
+        fan -= np.float32(eye_m[2] - self._level_m)
+        if bent is None:
+            fan /= ranges.astype(np.float32)
+            elevation = z / np.maximum(ground, np.finfo(float).tiny)
+        else:
+            fan = self._elevations(fan, ranges, bent.towards)
+            elevation = np.nan_to_num(bent.of_points, nan=np.inf)
+        highest = np.maximum.accumulate(fan, axis=1)
         return (before < 0) | (elevation >= highest[ray, np.maximum(before, 0)])
+
+    def _elevations(
+        self, fan: NDArray[np.float32], ranges: NDArray[np.float64], towards: Elevations
+    ) -> NDArray[np.float32]:
+        """Return the elevations of bent rays to relative heights, [rays, ranges]."""
+        covered = fan > _CLEAR / 2
+        found = np.full(fan.shape, np.float32(_CLEAR))
+        along = np.broadcast_to(ranges, fan.shape)[covered]
+        found[covered] = np.nan_to_num(towards(along, fan[covered].astype(float)), nan=_CLEAR)
+        return found
 
     @property
     def _level_m(self) -> float:

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from clsas.core import validate
 from clsas.core.geometry import legs_m
-from clsas.core.sound_speed import SoundSpeed, check_reaches
+from clsas.core.ray_tables import TIMES, Q, Quantity
+from clsas.core.sound_speed import SoundSpeed
 from clsas.core.threads import in_threads
+from clsas.simulation.legs import Legs
 from clsas.simulation.patterns import ElementPatterns
-from clsas.simulation.refraction import BlockDelays
+from clsas.simulation.refraction import BlockRays, Sightlines
 from clsas.simulation.scenes import Observer, PointTargets, Scene, Seabed
 from clsas.sonar.track import Channels
 
@@ -42,14 +44,17 @@ class PointBlock(NamedTuple):
     amplitudes : float or complex [points]
     error : float
         Relative error that the sum over these points may have.
-    refraction : BlockDelays or None
-        Delays along rays in a profile of the sound speed; None without one.
+    up : float64 [3]
+        Direction of the vertical.
+    rays : BlockRays or None
+        Rays in a profile of the sound speed; None without one.
     """
 
     points_m: NDArray[np.float64]
     amplitudes: NDArray
     error: float
-    refraction: BlockDelays | None = None
+    up: NDArray[np.float64]
+    rays: BlockRays | None = None
 
 
 @dataclass(frozen=True)
@@ -105,8 +110,10 @@ class Paths:
         tx, rx = tx[group], rx[group]
         middle = (tx.mean(axis=0) + rx.mean(axis=0)) / 2
         patterns = self.patterns
+        profile = self.sound_speed
+        bent = None if profile is None else Sightlines(profile, float(middle[2]))
         if patterns is None:
-            return Observer(middle)
+            return Observer(middle, sightlines=bent)
         radius = max(np.linalg.norm(end - middle, axis=1).max() for end in (tx, rx))
         ping = group[0] // self.receivers
         # Receivers move while the sound travels, which turns the direction of the return path.
@@ -114,10 +121,12 @@ class Paths:
         if velocity is not None:
             turn = 2 * float(np.linalg.norm(velocity[group[0]])) / self.sound_speed_m_s
 
-        def gain(directions: NDArray, slack: NDArray | float) -> NDArray:
-            return patterns.bound(ping, directions, slack + turn)
+        shorter = 1.0 if bent is None else self.sound_speed_m_s / bent.speed_m_s
 
-        return Observer(middle, radius, gain)
+        def gain(directions: NDArray, slack: NDArray | float) -> NDArray:
+            return patterns.bound(ping, shorter * directions, shorter * (slack + turn))
+
+        return Observer(middle, radius, gain, bent)
 
     def visible(self, group: range) -> tuple[list[Channels], Iterator[PointBlock]]:
         """Return the positions of the channels of a group, and the visible points block by block.
@@ -125,6 +134,11 @@ class Paths:
         Both are relative to the observer and along the axes of the elements.
         """
         observer, patterns = self.observer(group), self.patterns
+        quantities: tuple[Quantity, ...] = TIMES
+        if patterns is not None:
+            quantities += (Q.LEVEL, Q.LIFT)
+        if self.spreading:
+            quantities += (Q.SPREADING,)
         axes = np.eye(3) if patterns is None else patterns.axes[group[0] // self.receivers]
         size = _BLOCK if patterns is None else _PATTERN_BLOCK
         origin_m = observer.position_m
@@ -141,29 +155,22 @@ class Paths:
                     block = slice(first, first + size)
                     offsets = np.ascontiguousarray((positions[block] - origin_m).T)
                     points_m = (axes @ offsets).T
-                    refraction = None
+                    rays = None
                     if self.sound_speed is not None:
                         z_m = positions[block, 2]
-                        check_reaches(self.sound_speed, z_m, "the scene's points")
-                        refraction = BlockDelays(self.sound_speed, points_m, z_m)
-                    yield PointBlock(points_m, amplitudes[block], part.error, refraction)
+                        rays = BlockRays(self.sound_speed, points_m, z_m, quantities, part.error)
+                    yield PointBlock(points_m, amplitudes[block], part.error, axes[:, 2], rays)
 
         return [local(channel) for channel in group], blocks()
 
-    def delays_s(
-        self, channel: int, elements: Channels, block: PointBlock
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the delays of a block of points for a channel, and the lengths of straight paths.
-
-        The lengths from transmitter to points and from points to receiver are in metres.
-        """
-        out, back = legs_m(block.points_m, *elements, self.sound_speed_m_s)
-        if block.refraction is None:
-            return (out + back) / self.sound_speed_m_s, out, back
+    def legs(self, channel: int, elements: Channels, block: PointBlock) -> Legs:
+        """Return the paths between a block of points and the elements of a channel."""
+        if block.rays is None:
+            out, back = legs_m(block.points_m, *elements, self.sound_speed_m_s)
+            return Legs((out + back) / self.sound_speed_m_s, out, back)
         tx, rx, velocity = self.elements(channel)
         climb_m_s = 0.0 if velocity is None else float(velocity[2])
-        delay = block.refraction.delays_s(elements, float(tx[2]), float(rx[2]), climb_m_s)
-        return delay, out, back
+        return block.rays.legs(elements, float(tx[2]), float(rx[2]), climb_m_s)
 
     def delay_limits_s(self, workers: int | None) -> NDArray:
         """Return the shortest and the longest delay of every channel, float64 [2, channels]."""

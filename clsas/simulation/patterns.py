@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from clsas.core import validate
+from clsas.simulation.legs import Legs
 from clsas.sonar.system import Sonar, element_pattern
 from clsas.sonar.track import Channels
 
@@ -59,7 +60,7 @@ class ElementPatterns:
         return gain
 
     def sines(
-        self, points: NDArray, elements: Channels, out: NDArray, back: NDArray
+        self, points: NDArray, elements: Channels, legs: Legs, up: NDArray[np.float64]
     ) -> tuple[NDArray[np.bool_], list[NDArray]]:
         """Return a mask of the points in front of the elements, and the sines of their directions.
 
@@ -68,25 +69,40 @@ class ElementPatterns:
         points : float64 [points, 3]
         elements : Channels
             Positions of one channel. All coordinates are along the axes of the elements.
-        out, back : float64 [points]
-            Path lengths, metres; `back` ends at the receiver's position when the echo arrives.
+        legs : Legs
+        up : float64 [3]
+            Direction of the vertical.
 
         Returns
         -------
         in_front : bool [points]
         sines : list of float64 [points]
-            sin theta for each one-way pattern of `self.elements`.
+            sin theta for each one-way pattern of `self.elements`, times the sonar's sound speed
+            over that at the element.
         """
         tx, rx, velocity = elements
         at_reception = rx[:, None]
         if velocity is not None:
-            flight_s = (out + back) / self.sonar.sound_speed_m_s
-            at_reception = at_reception + velocity[:, None] * flight_s
-        ends = ((tx[:, None], out), (at_reception, back))
-        in_front = (points[:, 1] > tx[1]) & (points[:, 1] > at_reception[1])
-        return in_front, [
-            (points[:, axis] - ends[end][0][axis]) / ends[end][1] for _, end, axis in self.elements
-        ]
+            at_reception = at_reception + velocity[:, None] * legs.delay_s
+        ends_m = tx[:, None], at_reception
+        if legs.bends is None:
+            lengths_m = legs.out_m, legs.back_m
+            in_front = (points[:, 1] > tx[1]) & (points[:, 1] > at_reception[1])
+            return in_front, [
+                (points[:, axis] - ends_m[end][axis]) / lengths_m[end]
+                for _, end, axis in self.elements
+            ]
+
+        bends = legs.bends
+        # Patterns depend on the wavelength at the elements.
+        shorter = [self.sonar.sound_speed_m_s / bend.speed_m_s for bend in bends]
+
+        def component(end: int, axis: int) -> NDArray:
+            found = shorter[end] * bends[end].level_1_m * (points[:, axis] - ends_m[end][axis])
+            return found + bends[end].lift * (shorter[end] * up[axis]) if up[axis] else found
+
+        in_front = (component(0, 1) > 0) & (component(1, 1) > 0)
+        return in_front, [component(end, axis) for _, end, axis in self.elements]
 
     def gains(
         self, sines: list[NDArray], error: float, dtype: type[np.floating], modes: int

@@ -30,6 +30,7 @@ from clsas.core.fourier import EDGE_PRODUCT, smooth_edge
 from clsas.core.threads import in_threads
 from clsas.simulation.paths import Paths, PointBlock
 from clsas.simulation.patterns import interpolation_matrix
+from clsas.simulation.refraction import MOST_FOCUS
 from clsas.sonar.system import PASSBAND
 from clsas.sonar.track import Channels
 
@@ -41,6 +42,11 @@ RINGING = math.ceil(EDGE_PRODUCT / ((1 - PASSBAND) / 2))
 NO_ECHO = (
     "no echo arrives within the receive window and in front of the elements, so every sample is "
     "zero"
+)
+
+FOCUSED = (
+    "the sound speed focuses sound on points near a caustic, where ray theory has no limit: their "
+    f"amplitudes are limited to {20 * math.log10(MOST_FOCUS):.0f} dB above those of straight paths"
 )
 
 _SUM_ERROR = 1e-9  # relative, of the non-uniform FFT
@@ -103,7 +109,7 @@ def record(
     Warns
     -----
     ClsasWarning
-        If every sample is zero.
+        If every sample is zero, or amplitudes were limited near a caustic.
     """
     modes = fft.next_fast_len(windows.length + windows.tail)
     frequency = fft.fftfreq(modes, 1 / windows.rate_hz)
@@ -111,25 +117,29 @@ def record(
     # The sum of the FFT replaces an integral over frequency, hence the factor of the sample rate.
     transfer = windows.rate_hz * spectrum(frequency) * smooth_edge(beyond)
 
-    def echoes(group: range) -> list[NDArray[np.complex64]]:
+    def echoes(group: range) -> tuple[list[NDArray[np.complex64]], bool]:
+        focused = False
         totals = np.zeros((len(group), modes), np.complex128)
         elements, blocks = paths.visible(group)
         for block in blocks:
             for total, channel, ends in zip(totals, group, elements, strict=True):
-                _add(total, paths, carrier_hz, windows, channel, ends, block)
+                focused |= _add(total, paths, carrier_hz, windows, channel, ends, block)
         return [
             fft.ifft(total * transfer)[: windows.length].astype(np.complex64) for total in totals
-        ]
+        ], focused
 
     samples = np.empty((paths.channels, windows.length), np.complex64)
-    groups = paths.groups
-    for group, lines in zip(groups, in_threads(echoes, groups, workers), strict=True):
+    groups, focused = paths.groups, False
+    for group, (lines, some) in zip(groups, in_threads(echoes, groups, workers), strict=True):
+        focused |= some
         for channel, line in zip(group, lines, strict=True):
             samples[channel] = line
             if progress is not None:
                 progress(channel + 1, paths.channels)
     if not samples.any():
         validate.warn(NO_ECHO)
+    if focused:
+        validate.warn(FOCUSED)
     return samples
 
 
@@ -141,53 +151,56 @@ def _add(
     channel: int,
     elements: Channels,
     block: PointBlock,
-) -> None:
-    """Add the transfer functions of a block of points to those of one channel, [modes]."""
+) -> bool:
+    """Add the transfer functions of a block of points to those of one channel, [modes].
+
+    The result is True if amplitudes were limited near a caustic.
+    """
     modes, patterns = len(total), paths.patterns
     points, amplitudes = block.points_m, block.amplitudes
-    delay, out, back = paths.delays_s(channel, elements, block)
-    kept = (delay >= windows.kept_s[0][channel]) & (delay <= windows.kept_s[1][channel])
+    legs = paths.legs(channel, elements, block)
+    kept = legs.delay_s >= windows.kept_s[0][channel]
+    kept &= legs.delay_s <= windows.kept_s[1][channel]
     if not kept.any():
-        return
+        return False
     if not kept.all():
-        points, amplitudes, out, back, delay = (
-            part[kept] for part in (points, amplitudes, out, back, delay)
-        )
-    if (paths.spreading or patterns) and min(out.min(), back.min()) < _TOUCHING_M:
+        points, amplitudes, legs = points[kept], amplitudes[kept], legs.at(kept)
+    touching = min(legs.out_m.min(), legs.back_m.min()) < _TOUCHING_M
+    if (paths.spreading or patterns) and touching:
         raise ValueError(
             f"scene must have no point on an element with spreading or element patterns, "
             f"got one on an element of channel {channel}"
         )
     sines: list[NDArray] = []
     if patterns is not None:
-        in_front, sines = patterns.sines(points, elements, out, back)
+        in_front, sines = patterns.sines(points, elements, legs, block.up)
         if not in_front.any():
-            return
+            return False
         if not in_front.all():
-            amplitudes, out, back, delay, *sines = (
-                part[in_front] for part in (amplitudes, out, back, delay, *sines)
-            )
+            amplitudes, legs = amplitudes[in_front], legs.at(in_front)
+            sines = [sine[in_front] for sine in sines]
     # float32 rounds an angle by up to 2^-25 of its value, which becomes a phase error that is
     # largest at the frequency modes/2.
     single = block.error >= 1e-7 * modes
     real = np.float32 if single else np.float64
-    cycles = carrier_hz * delay
+    cycles = carrier_hz * legs.delay_s
     phase = (-2 * np.pi * (cycles - np.rint(cycles))).astype(real)
     strengths: NDArray = np.empty(len(phase), np.complex64 if single else np.complex128)
     strengths.real, strengths.imag = np.cos(phase), np.sin(phase)
     strengths *= amplitudes
     if paths.spreading:
-        strengths /= out * back
-    turns = windows.rate_hz / modes * (delay - windows.start_s[channel])
+        strengths /= legs.spreading_m2
+    turns = windows.rate_hz / modes * (legs.delay_s - windows.start_s[channel])
     angles = (2 * np.pi * (turns - np.rint(turns))).astype(real)
     accuracy = max(_SUM_ERROR, block.error / 10)
     if patterns is None:
         total += _point_sum(angles, strengths, modes, accuracy)
-        return
+        return legs.focused
     sines = [sine.astype(real) for sine in sines]
     gains = patterns.gains(sines, max(_PATTERN_ERROR, block.error), real, modes)
     sums = _point_sum(angles, strengths * gains, modes, accuracy).reshape(len(gains), modes)
     total += np.sum(interpolation_matrix(len(gains), modes) * sums, axis=0)
+    return legs.focused
 
 
 def _point_sum(angles: NDArray, strengths: NDArray, modes: int, error: float) -> NDArray:

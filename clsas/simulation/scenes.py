@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
-from clsas.simulation.height_field import HeightField
+from clsas.simulation.height_field import BentRays, HeightField
+from clsas.simulation.refraction import Sightlines
 from clsas.simulation.scatterers import Scatterers, draw_scatterers
 
 
@@ -33,11 +34,14 @@ class Observer(NamedTuple):
         gain(directions [points, 3], slack [points]) is an upper bound on the two-way amplitude
         pattern in all directions whose components differ from the given ones by up to `slack`.
         None if every element is omnidirectional.
+    sightlines : Sightlines or None
+        Rays in water whose sound speed varies with depth; None if they are straight.
     """
 
     position_m: NDArray[np.float64]
     radius_m: float = 0.0
     gain: Callable[[NDArray, NDArray | float], NDArray] | None = None
+    sightlines: Sightlines | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +187,9 @@ class Seabed:
     the maximum on the nearest ray, up to one or two lattice steps before the scatterer. Rays lie at
     most one step apart, so the sides of a shadow are accurate to half a step. The error of its far
     end is the change that the shadow would have if the object were two steps shorter. Objects
-    thinner than two steps do not cast reliable shadows.
+    thinner than two steps do not cast reliable shadows. If the sound speed varies with depth, the
+    elevations are those at which rays leave the sonar, and the angle of incidence is that at which
+    they arrive.
 
     Examples
     --------
@@ -344,11 +350,16 @@ class Seabed:
         chosen = np.arange(counts.sum()) + np.repeat(first - np.cumsum(counts) + counts, counts)
         positions = scatterers.positions_m[:, chosen]
         offsets = positions - observer.position_m[:, None]
-        rays = offsets.astype(np.float32)
+        if observer.sightlines is None:
+            rays, bent = offsets.astype(np.float32), None
+        else:
+            rays, elevations = observer.sightlines.arrivals(offsets)
+            bent = BentRays(elevations, observer.sightlines.elevations)
         # Lambert's law: the amplitude falls with the cosine of the angle of incidence.
         facing = -np.einsum("ip,ip->p", scatterers.normals[:, chosen], rays)
         facing /= np.sqrt(np.einsum("ip,ip->p", rays, rays))
-        lit = np.flatnonzero((facing > 0) & self._surface.lit(offsets, observer.position_m))
+        in_sight = self._surface.lit(offsets, observer.position_m, bent)
+        lit = np.flatnonzero((facing > 0) & in_sight)
         return positions[:, lit].T, scatterers.amplitudes[chosen[lit]] * facing[lit]
 
     def _in_beam(self, observer: Observer) -> NDArray[np.intp]:
@@ -361,8 +372,12 @@ class Seabed:
         near = scatterers.radii_m + observer.radius_m
         # Upper bound on the difference of directions from any element to any point of a tile.
         slack = np.where(distance > near, near / np.maximum(distance - near, 1e-9 * near), np.inf)
-        gains = observer.gain(offsets / distance[:, None], slack)
-        order = np.argsort(-observer.gain(offsets / distance[:, None], 0.0), kind="stable")
+        directions = offsets / distance[:, None]
+        if observer.sightlines is not None:
+            directions, magnification = observer.sightlines.departures(offsets)
+            slack *= magnification
+        gains = observer.gain(directions, slack)
+        order = np.argsort(-observer.gain(directions, 0.0), kind="stable")
         return order[gains[order] >= 10 ** (self.floor_db / 20)]
 
     @cached_property

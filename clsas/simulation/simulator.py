@@ -17,7 +17,7 @@ from clsas.signal.echoes import Echoes
 from clsas.simulation.paths import Paths, scene_parts
 from clsas.simulation.patterns import ElementPatterns
 from clsas.simulation.recording import NO_ECHO, RINGING, Progress, ReceiveWindows, record
-from clsas.simulation.scenes import Scene
+from clsas.simulation.scenes import PointTargets, Scene, Seabed
 from clsas.sonar.system import PASSBAND, Sonar
 from clsas.sonar.track import Channels, Pointing, Track, channels
 
@@ -106,7 +106,7 @@ def simulate(
     Warns
     -----
     ClsasWarning
-        If no echo arrives within the receive window.
+        If no echo arrives within the receive window, or spreading is limited near a caustic.
 
     See Also
     --------
@@ -120,8 +120,17 @@ def simulate(
     that middle, the edge of a shadow is displaced by e d/r, where r is the range of the object that
     casts the shadow and d the distance of the edge behind it.
 
-    With `sound_speed`, delays are those of exact rays. Element patterns, spreading and shadows of a
-    seabed are those of straight paths.
+    With `sound_speed`, delays are those of exact rays. Element patterns weigh the direction in
+    which a ray leaves the transmitter and arrives at the receiver, at the wavelength there. The
+    angle of incidence on a seabed and its shadows are those of rays too. Spreading follows from
+    neighbouring rays: 1/(R_tx R_rx) becomes 1/(L_tx L_rx) with
+
+        L^2 = D |dD/dp| sin(a) sin(b)/(p c_a c_b)
+
+    for the horizontal distance D, the horizontal slowness p, and the angles to the horizontal a, b
+    and sound speeds c_a, c_b at the two ends (Jensen et al., "Computational Ocean Acoustics", 2011,
+    section 3.3.5). Near caustics, amplitudes are limited to 10 dB above those of straight paths.
+    Phase jumps at caustics are left out.
 
     References
     ----------
@@ -161,7 +170,7 @@ def simulate(
     if phase_centres:
         middle_m = (geometry.tx_m + geometry.rx_m) / 2
         geometry = geometry._replace(tx_m=middle_m, rx_m=middle_m)
-    _check_heights(sound_speed, geometry)
+    _check_heights(sound_speed, geometry, parts)
     paths = Paths(parts, geometry, sound, spreading, patterns, sonar.receivers, sound_speed)
     ringing = RINGING / rate
     if range_m is None:
@@ -335,7 +344,7 @@ def simulate_lines(
     )
     validate.instance("sound_speed", sound_speed, SoundSpeed, type(None))
     antennas = _channels(tx_m, rx_m, rx_velocity_m_s)
-    _check_heights(sound_speed, antennas)
+    _check_heights(sound_speed, antennas, parts)
     paths = Paths(parts, antennas, sound, sound_speed=sound_speed)
     if (first_range_m is None) != (length is None):
         raise ValueError("first_range_m and length must be given together or not at all")
@@ -384,11 +393,17 @@ def simulate_lines(
     )
 
 
-def _check_heights(sound_speed: SoundSpeed | None, geometry: Channels) -> None:
-    """Raise ValueError if a profile does not reach all antennas."""
-    if sound_speed is not None:
-        check_reaches(sound_speed, geometry.tx_m[:, 2], "tx_m")
-        check_reaches(sound_speed, geometry.rx_m[:, 2], "rx_m")
+def _check_heights(
+    sound_speed: SoundSpeed | None, geometry: Channels, parts: tuple[PointTargets | Seabed, ...]
+) -> None:
+    """Raise ValueError if a profile does not reach all antennas and the whole scene."""
+    if sound_speed is None:
+        return
+    check_reaches(sound_speed, geometry.tx_m[:, 2], "tx_m")
+    check_reaches(sound_speed, geometry.rx_m[:, 2], "rx_m")
+    for part in parts:
+        z_m = part.positions_m[:, 2] if isinstance(part, PointTargets) else part.heights_m
+        check_reaches(sound_speed, z_m, "the scene's points")
 
 
 def _channels(tx_m: ArrayLike, rx_m: ArrayLike, rx_velocity_m_s: ArrayLike | None) -> Channels:

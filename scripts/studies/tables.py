@@ -22,6 +22,7 @@ from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
 from clsas.measures.shadows import dark_level_db
 from clsas.opencl.device import open_device
+from clsas.simulation import seabeds
 from clsas.trials import bench, cases, wreck
 
 TOLERANCES_DB = {
@@ -162,6 +163,37 @@ def simulation(devices: list[str]) -> None:
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         rows.append([name, *(f"{value:.1f}" for value in times), f"{memory:.0f}"])
     table(["element patterns", "seconds", "processor seconds", "peak memory, MiB"], rows)
+
+
+def simulation_along_rays(devices: list[str], turns: int = 3) -> None:
+    """Print processor time of simulations below a thermocline, relative to water of one speed.
+
+    Both take turns, and the shortest times count.
+    """
+    random = np.random.default_rng(1)
+    positions = random.uniform([-40, 50, 0], [40, 90, 0], (100_000, 3))
+    points = clsas.PointTargets(positions, random.standard_normal(100_000))
+    seabed = seabeds.wreck(density_m2=100)
+    track = clsas.Track.straight((-2, 0, 20), (2, 0, 0), pings=4, ping_interval_s=0.2)
+    directive = clsas.Sonar.edgetech()
+    plain = dataclasses.replace(directive, tx_length_m=None, rx_length_m=None)
+    profile = clsas.SoundSpeed([0, 12, 15, 60], [1505, 1504, 1494, 1490], surface_z_m=30)
+    rows = []
+    for name, sonar, scene, spreading in (
+        ("points", plain, points, False),
+        ("points, spreading", plain, points, True),
+        ("points, element patterns, spreading", directive, points, True),
+        ("wreck, element patterns, spreading", directive, seabed, True),
+    ):
+        times: dict[bool, list[float]] = {False: [], True: []}
+        for bent in [False, True] * turns:
+            start = time.process_time()
+            water = profile if bent else None
+            clsas.simulate(sonar, track, scene, spreading=spreading, sound_speed=water, workers=1)
+            times[bent].append(time.process_time() - start)
+        straight_s, bent_s = min(times[False]), min(times[True])
+        rows.append([name, f"{straight_s:.2f}", f"{bent_s:.2f}", f"{bent_s / straight_s:.2f}"])
+    table(["scene", "one speed, processor s", "profile, processor s", "ratio"], rows)
 
 
 def factorized(devices: list[str], names: list[str] | None = None) -> None:

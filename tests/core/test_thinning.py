@@ -1,10 +1,13 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 from bent import travel_times
+from scipy.integrate import cumulative_trapezoid
 
 from clsas import SoundSpeed
 from clsas.core.rays import rays
-from clsas.core.thinning import FEW, VERTICAL_ERROR_S, thinned
+from clsas.core.thinning import FEW, VERTICAL_ERROR_S, _fitted, thinned
 
 DEPTH = np.linspace(0, 60, 500)
 
@@ -54,3 +57,32 @@ def test_steep_profiles_are_not_refused(depths):
 def test_the_time_hardly_grows_with_the_depths():
     found = [len(thinned(cast(0.002, np.linspace(0, 60, n))).depth_m) for n in (1000, 5000)]
     assert max(found) < 200
+
+
+def test_casts_of_a_hundred_thousand_depths_need_little_memory():
+    """A least-squares matrix of all depths would have 43 MB for 54 kept depths, and 320 for 400."""
+    profile = cast(0.001, np.linspace(0, 60, 100_000))
+    tracemalloc.start()
+    found = thinned(profile)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(found.depth_m) < 100
+    assert peak < 20e6
+    at_all = np.interp(profile.depth_m, found.depth_m, found.speed_m_s)
+    errors = np.concatenate([[0], np.cumsum((profile.speed_m_s - at_all)[:-1] * 60 / 99_999)])
+    assert np.abs(errors).max() < 1.01 * VERTICAL_ERROR_S * profile.speed_m_s.min() ** 2
+
+
+@pytest.mark.parametrize("kept", [[0, 499], [0, 3, 4, 90, 300, 499], [0, 1, 2, 498, 499]])
+def test_the_fit_is_that_of_all_depths(kept):
+    """With a column per kept depth: the integral of the polygon that is 1 there, 0 elsewhere."""
+    speed, kept = cast(0.002).speed_m_s, np.array(kept)
+    hats = np.stack([np.interp(DEPTH, DEPTH[kept], unit) for unit in np.eye(len(kept))], axis=1)
+    matrix = cumulative_trapezoid(hats, DEPTH, axis=0, initial=0.0)
+    offset = speed - np.interp(DEPTH, DEPTH[kept], speed[kept])
+    wanted = cumulative_trapezoid(offset, DEPTH, initial=0.0)
+    expected = speed[kept] + np.linalg.lstsq(matrix, wanted, rcond=None)[0]
+    found, error = _fitted(DEPTH, speed, kept)
+    assert found == pytest.approx(expected, rel=1e-13)
+    left = np.abs(wanted - matrix @ (expected - speed[kept]))
+    assert np.all(np.abs(error) >= left - 1e-9)  # m^2/s; allowed are 4.5e-4

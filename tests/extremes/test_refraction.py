@@ -348,6 +348,27 @@ def test_weights_are_those_of_the_rays_at_the_sonar(name, beam):
     assert clsas.relative_error_db(stored, image) < -90
 
 
+@pytest.mark.parametrize("shape", ["rectangular", "hamming", "taylor"])
+@pytest.mark.parametrize(
+    "name",
+    [QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in ("low frequency", "far relief"))],
+)
+def test_steps_of_a_beam_that_lie_elsewhere_are_predicted(name, shape):
+    """A channel too many or too few at the edge costs -32 to -62 dB; predictions are bounds."""
+    scene, case = scene_of(name), CASES[name]
+    beam = clsas.BeamWindow(8, shape, along=[1, 0, 0])
+    speed = np.interp(case.sonar_m, case.depths_m, case.speeds_m_s)
+    weights = beam.weights(speed * scene.slowness_s_m, speed / case.carrier_hz)
+    ideal = oracle.image(scene.echoes, scene.pixels_m, weights)
+    large = {"match": "refraction leaves an error of up to"}
+    with pytest.warns(clsas.ClsasWarning, **large):
+        exact = clsas.backproject(scene.lines, scene.grid, beam=beam, accuracy_db=-62)
+    with pytest.warns(clsas.ClsasWarning, **large):
+        water = homogeneous(scene.lines, scene.grid, beam, -62)
+    error_db, predicted_db = oracle.error_db(exact.pixels, ideal), 10 * np.log10(water.error)
+    assert error_db < predicted_db < error_db + 10
+
+
 def test_a_constant_speed_would_not_do():
     lines, grid, ideal = made(QUICK)
     profile = lines.sound_speed

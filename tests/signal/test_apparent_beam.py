@@ -12,9 +12,9 @@ GRID = Grid.plane((-2, 2, 33), (58, 63, 41), -25.0)
 PROFILE = SoundSpeed([0, 60], [1500, 1440])
 
 
-def water_of(beam, tx_m):
+def water_of(beam, tx_m, allowed_db=-28):
     lines = lines_over(GRID, tx_m, None, carrier_hz=100e3, step_m=0.02)
-    return homogeneous(replace(lines, sound_speed=PROFILE), GRID, beam, -50)
+    return homogeneous(replace(lines, sound_speed=PROFILE), GRID, beam, allowed_db)
 
 
 @pytest.mark.parametrize("shape", ["rectangular", "hann", "hamming", "taylor", "tukey", "inverse"])

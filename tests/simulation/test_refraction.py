@@ -5,7 +5,7 @@ from cases import along_x
 
 import clsas
 from clsas import PointTargets, Pulse, Sonar, SoundSpeed, Track, simulate, simulate_lines
-from clsas.simulation.refraction import BlockDelays
+from clsas.simulation.refraction import BlockRays
 from clsas.sonar.track import Channels
 from clsas.trials import oracle
 
@@ -61,8 +61,8 @@ def test_tables_serve_many_points_and_moving_receivers(climb):
     tx, rx = np.array([0.5, 0, -6.0]), np.array([1.5, 0, -6.2])
 
     def delays(some):
-        block = BlockDelays(PROFILE, some, some[:, 2])
-        return block.delays_s(Channels(tx, rx, velocity), tx[2], rx[2], climb)
+        block = BlockRays(PROFILE, some, some[:, 2])
+        return block.legs(Channels(tx, rx, velocity), tx[2], rx[2], climb).delay_s
 
     many, few = delays(points), delays(points[:100])
     # Once the echo is there, the receiver is where the ray ends.
