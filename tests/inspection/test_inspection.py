@@ -710,7 +710,7 @@ def test_files_without_a_recording_are_refused(tmp_path):
         run = CliRunner().invoke(main, [*command, str(tmp_path / "image.h5"), *to])
         assert run.exit_code == 1
         assert "image.h5 must hold range lines" in run.stderr
-        assert "got Image" in run.stderr
+        assert "got an image" in run.stderr
 
 
 @pytest.mark.slow
