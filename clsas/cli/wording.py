@@ -84,6 +84,7 @@ _PHRASES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"; dataclasses\.replace\(.*?\) declares all channels to be one array", ""),
     (r"\blines\.bank\((\d+)\) has the lines of the first bank", r"{bank} \1 uses the first bank"),
     (r"\bassess lines\.bank\((\d+)\), with sonar\.bank\(\d+\)", r"use --bank \1"),
+    (r"\bgive lines\.bank\(n\) of both", "make files of one bank by clsas convert --bank"),
     (r"\blines\.bank\((\d+)\)", r"{bank} \1"),
     (r"; lines\.select\(order\) sorts them", ""),
     (r"\blines\.without_still_pings\(\)", "clsas convert --without-still-pings"),

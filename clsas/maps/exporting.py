@@ -119,7 +119,8 @@ def export(
         a GeoTIFF has no georeference, its coordinate reference system is unknown, or its grid is
         vertical or consists of points; if complex pixels are to be resampled, but they are on a
         height map, are too far apart, or there are no lines; if heights are to become SICD or a
-        folder; or if a mosaic is damaged, not finished, or changes meanwhile.
+        folder; if a mosaic is damaged, not finished, or changes meanwhile; or if the environment
+        variable SOURCE_DATE_EPOCH, which replaces the time in the history of netCDF, is no time.
     FileFormatError
         If the file at `source` does not contain an image or heights.
     ImportError

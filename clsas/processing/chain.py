@@ -201,8 +201,9 @@ def process(
         records = checked_records(scene, folder, names)
         if "heights" in names and "heights" not in records:
             uncorrected = recording.read()  # which stays in memory for the first step
-            with _naming(scene, "heights"):  # before other steps, which may take hours
-                check_banks(uncorrected)
+            if uncorrected.banks < 2:  # the step itself warns of more than two
+                with _naming(scene, "heights"):  # before other steps, which may take hours
+                    check_banks(uncorrected)
         chain = _Chain(scene, folder, recording, open_device(device), records)
         for name in STEPS:
             if name in names:
