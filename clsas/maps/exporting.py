@@ -54,7 +54,7 @@ def export(
 
     The suffix of `path` determines the format:
 
-    - ``.tif``, a cloud-optimized GeoTIFF, for programs of maps. Its overviews are the mean power of
+    - ``.tif``, a cloud-optimized GeoTIFF, for mapping programs. Its overviews are the mean power of
       the pixels that received something. A mosaic is read window by window and may be larger than
       memory.
     - ``.nc``, a netCDF 4 file after the CF conventions, with level (dB re 1, NaN where nothing was

@@ -115,9 +115,9 @@ def mosaic_heights(
     Warns
     -----
     ClsasWarning
-        If a store is damaged, whose damaged patches are then measured again; or if, in a patch, the
-        banks agree best at an end of the search, or it is too small to tell heights of ambiguity
-        apart, as for `heights`.
+        If a store is damaged, whose damaged patches are then measured again; if `a` has more than
+        two banks, of which the first two are used; or if, in a patch, the banks agree best at an
+        end of the search, or it is too small to tell heights of ambiguity apart, as for `heights`.
 
     See Also
     --------
