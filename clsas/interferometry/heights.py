@@ -174,9 +174,10 @@ def heights(
 
     Side lobes and ambiguities of brighter places carry the phase of those places. Weight the band
     in `compress` and the directions by `beam` where the brightness varies strongly. On simulated
-    dunes with an unweighted band, errors were 1.1 times the deviation, and with a Hamming window
-    1.0 times. On a rock whose far side is 25 dB darker than the seabed beside it, they were 2.9
-    times the deviation with equal weights for all directions, and 0.9 times with a Hann window of 14 degrees.
+    dunes with an unweighted band, errors were 1.1 times the deviation, since range side lobes make
+    crests too low and troughs too high; with a Hamming window they were 1.0 times. On a rock whose
+    far side is 25 dB darker than the seabed beside it, they were 2.9 times the deviation with equal
+    weights for all directions, and 0.9 times with a Hann window of 14 degrees.
 
     The track may sway, but must be close to straight over the channels that see a pixel, since a
     scatterer above an imaged surface appears in one place only then.
