@@ -134,7 +134,7 @@ class _Commands(click.Group):
                 warnings.simplefilter("ignore", pyopencl.CompilerWarning)
                 return super().invoke(ctx)
             except click.ClickException as error:
-                error.message = _printable(error.message)  # type: ignore[misc]
+                error.message = _worded(error.message)  # type: ignore[misc]
                 raise
             except BrokenPipeError:
                 raise  # the reader of our output has gone; click handles this
@@ -190,7 +190,7 @@ def _showing(others: Callable[..., None]) -> Callable[..., None]:
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
         if issubclass(category, clsas.ClsasWarning):
-            click.echo(f"Warning: {_printable(str(message))}", err=True)
+            click.echo(f"Warning: {_worded(str(message))}", err=True)
         else:
             others(_printable(str(message)), category, *where, **options)
 
@@ -204,8 +204,15 @@ def _printable(text: str) -> str:
     return validate.printable(text)
 
 
+def _worded(text: str) -> str:
+    """Return a message in the words of the command line, printable."""
+    from clsas.cli.wording import in_options
+
+    return _printable(in_options(text))
+
+
 def _message(error: BaseException) -> str:
-    return _printable(_text(error))
+    return _worded(_text(error))
 
 
 def _text(error: BaseException) -> str:

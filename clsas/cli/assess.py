@@ -12,6 +12,7 @@ from clsas.cli import options
 from clsas.cli.inputs import load_lines, read_beam, read_grid, read_request
 from clsas.cli.outputs import json_able, report
 from clsas.cli.parameters import INPUT
+from clsas.cli.wording import command
 from clsas.files.cphd import START as CPHD
 from clsas.files.matlab import is_matlab
 from clsas.planning.request import (
@@ -24,7 +25,7 @@ from clsas.planning.request import (
 _HDF5 = b"\x89HDF"
 
 
-@click.command()
+@command()
 @click.argument("file", metavar="SCENE.TOML|LINES.H5", type=INPUT)
 @options.bank
 @options.grid

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ from clsas.cli.inputs import load, read_levels, read_scene
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, ORIGIN, File, Output, keep_out
 from clsas.cli.view import Folder, size_of
+from clsas.cli.wording import command
 from clsas.core import reading, validate
 from clsas.files.hdf5 import read_geometry
 from clsas.maps import sicd
@@ -40,7 +39,7 @@ class _Target(File):
         return kind.convert(value, param, ctx)
 
 
-@click.command()
+@command()
 @click.argument("source", metavar="INPUT", type=File(exists=True))
 @click.argument("output", metavar="OUTPUT", type=_Target())
 @click.option(
@@ -136,7 +135,7 @@ def export(
     if scene_path is not None:
         known["beam"] = _beam(scene_path)
     start = time.perf_counter()
-    with progress_bar("exporting") as progress, _naming_options():
+    with progress_bar("exporting") as progress:
         clsas.export(
             source, output, kind=kind, reference=reference, georeference=place, progress=progress,
             **levels, **given, **known,
@@ -173,26 +172,6 @@ def _beam(path: Path) -> clsas.BeamWindow:
     if beam is None:
         raise click.UsageError(f"--scene {printable(path)} must have a beam, in [image]")
     return beam
-
-
-@contextmanager
-def _naming_options() -> Iterator[None]:
-    """Let errors name the options of the command, not the arguments of `clsas.export`."""
-    command = click.get_current_context().command
-    names = {each.name: each.opts[0] for each in command.params if isinstance(each, click.Option)}
-    names |= {
-        "plan": "--plan",
-        "lines": "--lines",
-        "beam": "--scene",
-        "georeference": "--crs (or --origin)",
-    }
-    try:
-        yield
-    except ValueError as error:
-        name, _, rest = str(error).partition(" ")
-        if type(error) is not ValueError or name not in names:
-            raise
-        raise ValueError(f"{names[name]} {rest}") from error
 
 
 def _georeference(

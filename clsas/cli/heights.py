@@ -15,6 +15,7 @@ from clsas.cli.inputs import load_banks, load_lines, read_beam, read_grid
 from clsas.cli.mosaics import described_flags
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, File, Output, Parsed, Store, keep_out
+from clsas.cli.wording import command
 from clsas.core import validate
 from clsas.files.hdf5 import SUFFIXES
 from clsas.files.height_files import read_heights
@@ -49,7 +50,7 @@ class _Target(File):
 _SEARCH = Parsed("LOW:HIGH", _heights, "LOW:HIGH, two ascending heights in metres, such as -1:2")
 
 
-@click.command()
+@command()
 @click.argument("first_file", metavar="LINES.H5", type=INPUT)
 @click.argument("second_file", metavar="[B.H5]", type=INPUT, required=False)
 @click.option(

@@ -25,6 +25,7 @@ from clsas.cli.inputs import (
 )
 from clsas.cli.outputs import printable, progress_bar, report, say, warn
 from clsas.cli.parameters import HDF5
+from clsas.cli.wording import command
 from clsas.core import validate
 from clsas.core.image import holds_any
 from clsas.exact.backprojection import prepare
@@ -40,7 +41,7 @@ from clsas.sonar.looking import warn_before_imaging
 _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is reported
 
 
-@click.command()
+@command()
 @click.argument("lines_file", metavar="LINES.H5", type=HDF5)
 @options.output("Image")
 @options.bank
@@ -264,7 +265,7 @@ def _table(kernels: dict[str, KernelTimes]) -> str:
     )
 
 
-@click.command()
+@command()
 @click.argument("lines_file", metavar="LINES.H5", type=HDF5)
 @options.bank
 @options.grid

@@ -13,10 +13,11 @@ from clsas.cli import options
 from clsas.cli.inputs import load, read_beam, read_grid, read_scene
 from clsas.cli.outputs import report
 from clsas.cli.parameters import INPUT
+from clsas.cli.wording import command
 from clsas.files.scene_files import SceneFile
 
 
-@click.command()
+@command()
 @click.argument("recording", metavar="FILE", type=INPUT)
 @options.grid
 @options.beam

@@ -11,12 +11,13 @@ from clsas.cli import options
 from clsas.cli.inputs import read_scene
 from clsas.cli.outputs import report
 from clsas.cli.parameters import INPUT
+from clsas.cli.wording import command
 from clsas.core.json_types import json_able
 
 _FROM_SCENE = ("range_m", "pointing", "element_pattern", "motion_in_flight")
 
 
-@click.command()
+@command()
 @click.argument("scene", metavar="SCENE.TOML", type=INPUT)
 @options.as_json
 def limits(scene: Path, as_json: bool) -> None:

@@ -15,6 +15,7 @@ from clsas.cli import options
 from clsas.cli.inputs import load, load_lines, read_levels, read_scene, warn_of_sampling
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import HDF5, INPUT, Output
+from clsas.cli.wording import command
 from clsas.core import validate
 from clsas.core.conditioning import STATISTICS, high_passed, tapered_ends
 from clsas.files.cphd_writing import SUFFIXES as CPHD
@@ -23,7 +24,7 @@ from clsas.signal.compression import check_options
 from clsas.simulation.simulator import check_size
 
 
-@click.command()
+@command()
 @click.argument("scene_file", metavar="SCENE.TOML", type=INPUT)
 @options.output("Echoes")
 @options.picture("track and grid")
@@ -58,13 +59,24 @@ def simulate(scene_file: Path, output: Path, picture: Path | None, as_json: bool
     )  # fmt: skip
 
 
-@click.command()
+def _check_window(window: str) -> None:
+    """Raise ValueError unless a window is one that a word describes."""
+    try:
+        check_options(window=window)
+    except ValueError:
+        raise ValueError(
+            "must be none or a window of SciPy without parameters, such as hamming, hann or "
+            f"taylor, got {validate.shown(window)}"
+        ) from None
+
+
+@command()
 @click.argument("echoes_file", metavar="ECHOES.H5", type=HDF5)
 @options.output("Range lines")
 @options.scene
 @click.option(
     "--window", help="Window over the band, such as hamming or taylor. [default: none]",
-    callback=options.checked(lambda window: check_options(window=window)),
+    callback=options.checked(_check_window),
 )  # fmt: skip
 @click.option(
     "--oversampling", type=float, help="Samples per bandwidth. [default: 2]",
@@ -115,7 +127,7 @@ def compress(
     )  # fmt: skip
 
 
-@click.command()
+@command()
 @click.argument("recording", metavar="FILE", type=INPUT)
 @click.argument("output", metavar="OUTPUT", type=Output(*SUFFIXES))
 @options.bank

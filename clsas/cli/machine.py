@@ -12,6 +12,7 @@ import clsas
 from clsas.cli import options
 from clsas.cli.outputs import print_json, printable, progress_bar, say
 from clsas.cli.parameters import File, need_matplotlib
+from clsas.cli.wording import command
 from clsas.opencl.device import choose, open_device
 from clsas.trials import demo as demonstration
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from clsas.planning.costs import KnownCosts
 
 
-@click.command()
+@command()
 @click.option(
     "--measure", is_flag=True,
     help="First measure the costs of the device that is used again, which takes 0.3 to 0.6 s.",
@@ -71,7 +72,7 @@ def _origin(known: KnownCosts) -> str:
     return f"defaults, scaled by a short measurement on {known.measured[:10]} ({age})"
 
 
-@click.command()
+@command()
 @click.option(
     "-o", "--out", type=File(file_okay=False), default="clsas-demo",
     show_default=True, help="Folder for the files: a new one, or that of an earlier demo.",

@@ -14,6 +14,7 @@ from clsas.cli import options
 from clsas.cli.inputs import load, load_lines, read_beam, read_grid
 from clsas.cli.outputs import json_able, print_json, printable, progress_bar, report, say
 from clsas.cli.parameters import HDF5, INPUT, POSITION, STAGES, Output
+from clsas.cli.wording import command
 from clsas.core import validate
 from clsas.files.scene_files import SceneFile
 from clsas.measures.cuts import Cut
@@ -22,7 +23,7 @@ from clsas.measures.shadows import DARKEST, dark_level_db
 from clsas.measures.tradeoff import TOLERANCES_DB
 
 
-@click.command()
+@command()
 @click.argument("image_file", metavar="IMAGE.H5", type=HDF5)
 @click.option(
     "--near",
@@ -87,7 +88,7 @@ def quality(
     report(as_json, "\n".join(text), **results)
 
 
-@click.command()
+@command()
 @click.argument("lines_file", metavar="[LINES.H5]", type=HDF5, required=False)
 @click.option(
     "--case", help="Use lines and grid of a case of `clsas bench`: ffbp-thesis, ffbp-2k, ..."
@@ -187,7 +188,7 @@ def tradeoff(
     )  # fmt: skip
 
 
-@click.command()
+@command()
 @click.argument("case", required=False)
 @options.device
 @click.option(

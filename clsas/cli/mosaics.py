@@ -24,6 +24,7 @@ from clsas.cli.inputs import (
 )
 from clsas.cli.outputs import printable, progress_bar, report, say
 from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart, keep_out
+from clsas.cli.wording import command
 from clsas.core.extras import needed
 from clsas.core.threads import uninterrupted
 from clsas.exact.backprojection import ACCURACY_DB
@@ -39,7 +40,7 @@ _IDLE_S = 60.0  # default of --idle-s
 _LISTED = 3  # patches that are listed for each flag; arbitrary
 
 
-@click.command()
+@command()
 @click.argument("scene", metavar="[SCENE.TOML]", type=INPUT, required=False)
 @click.option(
     "--lines", "lines_path", type=File(exists=True),

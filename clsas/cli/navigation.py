@@ -14,6 +14,7 @@ from clsas.cli import options
 from clsas.cli.inputs import load, read_beam, read_grid
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, POSITION, RANGE
+from clsas.cli.wording import command
 from clsas.core import validate
 from clsas.navigation.autofocus import UNKNOWNS as FOCUSED
 from clsas.navigation.known_points import DEFAULT_UNKNOWNS
@@ -26,7 +27,7 @@ def _positive(name: str, unit: str) -> Any:
     return options.checked(partial(validate.positive, name, unit=unit))
 
 
-@click.command("known-points")
+@command("known-points")
 @click.argument("lines_file", metavar="LINES.H5", type=INPUT)
 @options.output("Corrected range lines")
 @click.option(
@@ -89,7 +90,7 @@ def known_points(
     )
 
 
-@click.command()
+@command()
 @click.argument("lines_file", metavar="LINES.H5", type=INPUT)
 @options.output("Corrected range lines")
 @click.option("--range-m", type=RANGE, help="Nearest and farthest range to use, NEAR:FAR (m).")
@@ -128,7 +129,9 @@ def known_points(
     type=float,
     default=1.0,
     show_default=True,
-    callback=_positive("yaw_sd_deg", "degrees"),
+    callback=options.checked(
+        partial(validate.number, "yaw_sd_deg", unit="degrees", above=0.0, most=180.0)
+    ),
     help="Standard deviation of the yaw in the navigation data (degrees).",
 )
 @click.option(
@@ -188,7 +191,7 @@ def navigate(
     )
 
 
-@click.command()
+@command()
 @click.argument("lines_file", metavar="LINES.H5", type=INPUT)
 @options.output("Corrected range lines")
 @options.grid

@@ -34,7 +34,9 @@ def checked(check: Callable[[Any], object]) -> Callable:
                 if each is not None:
                     check(each)
         except (TypeError, ValueError) as error:
-            raise click.BadParameter(str(error), ctx, param) from error
+            # click names the option, so the message does without the argument's name.
+            message = str(error).removeprefix(f"{param.name} ")
+            raise click.BadParameter(message, ctx, param) from error
         return value
 
     return callback

@@ -20,6 +20,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from clsas.cli.wording import in_options
 from clsas.core import validate
 from clsas.core.json_types import json_able
 
@@ -77,7 +78,7 @@ def printable(name: object) -> str:
 
 def warn(message: str) -> None:
     """Print a warning."""
-    say(f"Warning: {printable(message)}", err=True)
+    say(f"Warning: {printable(in_options(message))}", err=True)
 
 
 def print_json(results: Any, indent: int | None = 2) -> None:

@@ -13,12 +13,13 @@ from clsas.cli import options
 from clsas.cli.inputs import load_banks, load_heights, read_beam
 from clsas.cli.outputs import printable, report
 from clsas.cli.parameters import HDF5_OR_STORE, INPUT, POSITION, keep_out
+from clsas.cli.wording import command
 from clsas.core import banks, validate
 from clsas.files.scene_files import SceneFile
 from clsas.interferometry.pair_errors_result import UNKNOWNS
 
 
-@click.command("pair-errors")
+@command("pair-errors")
 @click.argument("lines_file", metavar="LINES.H5", type=INPUT)
 @click.argument("heights_file", metavar="HEIGHTS", type=HDF5_OR_STORE)
 @options.output("Corrected range lines")

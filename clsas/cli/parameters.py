@@ -12,6 +12,7 @@ from typing import Any
 
 import click
 
+from clsas.cli.wording import option_name
 from clsas.core import validate
 from clsas.core.extras import check_installed
 from clsas.core.reading import check_ordinary
@@ -136,7 +137,7 @@ class File(click.Path):
                 taken = ctx.params.get(other.name)
                 if self.written or other.type.written:
                     for each in taken if isinstance(taken, tuple) else (taken,):
-                        keep_apart(_option_name(other), each, _option_name(param), path)
+                        keep_apart(option_name(other), each, option_name(param), path)
         return path
 
 
@@ -188,7 +189,7 @@ class Hdf5(File):
         path = super().convert(value, param, ctx)
         if path.suffix.lower() != ".toml":
             return path
-        name = _option_name(param)
+        name = option_name(param)
         usual = [ctx.command_path, name]
         for other in ctx.command.params:
             if other.name == "scene":
@@ -218,13 +219,8 @@ def keep_out(option: str, path: Path | None, what: str, folder: Path) -> None:
 def written_to(ctx: click.Context) -> dict[str, Path]:
     """Return the paths that the running command writes, by option."""
     outputs = [p for p in ctx.command.params if isinstance(p.type, File) and p.type.written]
-    paths = {_option_name(param): ctx.params.get(param.name) for param in outputs}
+    paths = {option_name(param): ctx.params.get(param.name) for param in outputs}
     return {shown: path for shown, path in paths.items() if path is not None}
-
-
-def _option_name(param: click.Parameter) -> str:
-    """Return the name of a parameter on the command line."""
-    return param.opts[0] if isinstance(param, click.Option) else (param.metavar or "").strip("[]")
 
 
 def _exists(path: Path) -> bool:

@@ -12,11 +12,12 @@ from clsas.cli import heights, options
 from clsas.cli.inputs import read_scene
 from clsas.cli.outputs import printable, report, step_bar
 from clsas.cli.parameters import INPUT, keep_apart
+from clsas.cli.wording import command
 from clsas.files.process_tables import STEPS
 from clsas.processing.record import StepRecord
 
 
-@click.command()
+@command()
 @click.argument("scene", metavar="SCENE.TOML", type=INPUT)
 @click.option("--lines", "lines_path", type=INPUT, help="Recording, instead of the scene's.")
 @click.option(

@@ -12,6 +12,7 @@ from clsas.cli import options
 from clsas.cli.inputs import read_levels
 from clsas.cli.outputs import printable, report
 from clsas.cli.parameters import POSITION, File, Output, keep_out, need_matplotlib
+from clsas.cli.wording import command
 from clsas.core import reading, validate
 from clsas.files.formats import SUFFIXES
 from clsas.plot.canvas import SUFFIXES as PICTURES
@@ -35,7 +36,7 @@ _JSON = b"{"
 _MARKS = ("--north-arrow", "--scale-bar")
 
 
-@click.command()
+@command()
 @click.argument("file", metavar="FILE", type=File(exists=True))
 @click.option(
     "-o", "--output", type=Output(*PICTURES),

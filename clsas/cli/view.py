@@ -18,6 +18,7 @@ from clsas.cli import options
 from clsas.cli.inputs import load, read_levels
 from clsas.cli.outputs import printable, progress_bar, report, warn
 from clsas.cli.parameters import File, keep_out, need_matplotlib
+from clsas.cli.wording import command
 from clsas.maps import viewer
 
 
@@ -36,7 +37,7 @@ class Folder(File):
         return path
 
 
-@click.command()
+@command()
 @click.argument("source", metavar="INPUT", type=File(exists=True))
 @click.argument("folder", metavar="[FOLDER]", required=False, type=Folder())
 @click.option(

@@ -77,11 +77,28 @@ def first_two(numbers: NDArray[np.int64] | None) -> tuple[int, int]:
     ------
     ValueError
         If there is only one bank.
+
+    Warns
+    -----
+    ClsasWarning
+        If there are more than two banks, with the two that are used.
     """
     first, *others = present(numbers)
     if not others:
         raise ValueError("must have at least 2 receiver banks (bank_numbers), got 1")
-    return int(first), int(others[0])
+    second, *unused = others
+    if unused:
+        validate.warn(
+            f"heights are measured from banks {first} and {second}; {_in_words(unused)} not used. "
+            "To choose others, give lines.bank(n) of both"
+        )
+    return first, second
+
+
+def _in_words(numbers: list[int]) -> str:
+    if len(numbers) == 1:
+        return f"bank {numbers[0]} is"
+    return f"banks {', '.join(map(str, numbers[:-1]))} and {numbers[-1]} are"
 
 
 def pair(lines: RangeLines) -> tuple[RangeLines, RangeLines]:

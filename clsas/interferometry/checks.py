@@ -46,8 +46,9 @@ def check_grid(grid: Grid) -> None:
             "grid must be a plane or height map, above which heights are measured, got arbitrary "
             "points"
         )
-    if min(grid.shape) < 2:
-        raise ValueError(f"grid must have at least 2 rows and 2 columns, got {grid.shape}")
+    rows, columns = grid.shape
+    if min(rows, columns) < 2:
+        raise ValueError(f"grid must have at least 2 rows and 2 columns, got {rows} x {columns}")
     normal = np.cross(*grid.vectors_m[1:])
     if abs(normal[2]) < 0.1 * float(np.linalg.norm(normal)):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The error of banks and grids that allow no heights."""
+"""The exception for banks and grids that do not show heights."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 The method has two steps. A sweep finds, along curves of equal range, the heights at which the
 banks agree (`clsas.interferometry.sweep`); large windows decide between the cycles of the phase.
-Both banks are then imaged on that relief, and the phase that is left corrects it
+Both banks are then imaged on that relief, and the remaining phase corrects it
 (`clsas.interferometry.refinement`), with a plane fitted in every window
 (`clsas.interferometry.planes`). Passes end when corrections are below the deviation.
 """
@@ -93,8 +93,8 @@ def heights(
     search_m : (lowest, highest)
         Heights above the pixels of the grid between which the seabed lies, metres: above the plane,
         or above the relief of a height map. The phase repeats with the height of ambiguity: a
-        seabed outside may appear inside, that much too high or too low. A warning appears if most
-        of the seabed seems to lie outside.
+        seabed outside the search may appear inside it, too high or too low by that much. A warning
+        appears if most of the seabed seems to lie outside.
     window_m : float, optional
         Side of the windows in which the coherence is estimated, metres. It is the resolution of the
         heights. By default windows contain about 50 independent samples.
@@ -113,7 +113,7 @@ def heights(
     Returns
     -------
     Heights
-        They are heights above the plane, also if the grid is a height map.
+        Heights above the plane, even if the grid is a height map.
 
     Raises
     ------
@@ -175,9 +175,10 @@ def heights(
 
     Side lobes and ambiguities of brighter places carry the phase of those places. Weight the band
     in `compress` and the directions by `beam` where the brightness varies strongly. On simulated
-    dunes with an unweighted band, errors were 1.1 times the deviation, and with a Hamming window
-    1.0 times. On a rock whose far side is 25 dB darker than the seabed beside it, they were 2.9
-    times the deviation with all directions alike, and 0.9 times with a Hann window of 14 degrees.
+    dunes with an unweighted band, errors were 1.1 times the deviation, since range side lobes make
+    crests too low and troughs too high; with a Hamming window they were 1.0 times. On a rock whose
+    far side is 25 dB darker than the seabed beside it, they were 2.9 times the deviation with equal
+    weights for all directions, and 0.9 times with a Hann window of 14 degrees.
 
     The track may sway, but must be close to straight over the channels that see a pixel, since a
     scatterer above an imaged surface appears in one place only then.

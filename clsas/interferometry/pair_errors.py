@@ -43,7 +43,7 @@ def pair_errors(
     beam: BeamWindow | None = None,
     device: Device | str | int | None = None,
 ) -> PairErrors:
-    """Return the phase, delay and roll of two banks that their heights show to be wrong.
+    """Return the errors in phase, delay and roll of two banks that their heights reveal.
 
     Give one of `known_height_m`, `points_m` and `other`. The errors are those of b relative to a;
     `PairErrors.corrected` removes them.

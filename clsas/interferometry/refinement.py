@@ -1,4 +1,4 @@
-"""Heights from the phase that is left on a relief, pass by pass until it stands still."""
+"""Heights from the remaining phase on a relief, pass by pass until they no longer change."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class Heights:
         Effective number of independent samples behind each height.
     m_per_rad : float64 [rows, columns]
         Change of the height per radian of phase between the banks, metres. A constant error of the
-        phase displaces all heights by so much.
+        phase displaces all heights by that much.
     image : Image
         Image of the first bank on the relief. Its grid has the heights of the last pass but one,
         which differ from `height_m` by less than its deviation, and the nearest valid height

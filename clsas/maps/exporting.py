@@ -54,7 +54,7 @@ def export(
 
     The suffix of `path` determines the format:
 
-    - ``.tif``, a cloud-optimized GeoTIFF, for programs of maps. Its overviews are the mean power of
+    - ``.tif``, a cloud-optimized GeoTIFF, for mapping programs. Its overviews are the mean power of
       the pixels that received something. A mosaic is read window by window and may be larger than
       memory.
     - ``.nc``, a netCDF 4 file after the CF conventions, with level (dB re 1, NaN where nothing was
@@ -119,7 +119,8 @@ def export(
         a GeoTIFF has no georeference, its coordinate reference system is unknown, or its grid is
         vertical or consists of points; if complex pixels are to be resampled, but they are on a
         height map, are too far apart, or there are no lines; if heights are to become SICD or a
-        folder; or if a mosaic is damaged, not finished, or changes meanwhile.
+        folder; if a mosaic is damaged, not finished, or changes meanwhile; or if the environment
+        variable SOURCE_DATE_EPOCH, which replaces the time in the history of netCDF, is no time.
     FileFormatError
         If the file at `source` does not contain an image or heights.
     ImportError

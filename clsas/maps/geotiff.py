@@ -27,12 +27,13 @@ from clsas.core.atomic import assembling
 from clsas.core.extras import needed
 from clsas.core.lines import RangeLines
 from clsas.core.map_grids import Affine
+from clsas.maps.agreement import LEAST_AGREEMENT, agreement
 from clsas.maps.bands import Band, bands_of
 from clsas.maps.carrier import Carrier
 from clsas.maps.collection import Collection
 from clsas.maps.encoding import Encoding, colour_table
 from clsas.maps.geotiff_checks import FULL_BYTES, check_space, check_whole
-from clsas.maps.interpolation import Interpolation
+from clsas.maps.interpolation import InexactError, Interpolation
 from clsas.maps.orientation import Orientation
 from clsas.maps.resampling import Resampling, north_up, steps_m
 from clsas.maps.sources import Source, windows_of
@@ -255,9 +256,20 @@ class _Export:
             )
         assert lines is not None  # the caller has checked it
         vectors_m = self._turned.vectors_m(self._source.grid)
-        carrier = Carrier.of(Collection.of(lines, beam), self._shape, *vectors_m)
+        collection = Collection.of(lines, beam)
+        carrier = Carrier.of(collection, self._shape, *vectors_m)
         read = partial(_get, file, 1)
-        interpolation = Interpolation.of(carrier, self._affine, onto, read)
+        try:
+            interpolation = Interpolation.of(carrier, self._affine, onto, read)
+        except InexactError:
+            agreed = agreement(collection, self._shape, *vectors_m, read)
+            if agreed < LEAST_AGREEMENT:
+                raise ValueError(
+                    "lines and beam must be those that formed the image: its spatial frequencies "
+                    f"agree with theirs by {100 * agreed:.0f} %, where {100 * LEAST_AGREEMENT:.0f} "
+                    "% or more are expected"
+                ) from None
+            raise
         self._more_tags["INTERPOLATION_ERROR_DB"] = f"{interpolation.error_db:.12g}"
         return interpolation.side, lambda rows, columns, _: interpolation.at(rows, columns, read)
 

@@ -40,6 +40,11 @@ _USED = 0.4  # half the band over the sample rate at which images are interpolat
 _WINDOW = 1024
 _ACCURACY = 1e-5  # of the non-uniform FFT
 
+
+class InexactError(ValueError):
+    """The error of interpolated pixels would exceed `MOST_ERROR_DB`."""
+
+
 Reader = Callable[[slice, slice], NDArray[np.complex64]]
 
 
@@ -78,9 +83,10 @@ class Interpolation:
 
         Raises
         ------
+        InexactError
+            If the error would exceed `MOST_ERROR_DB`.
         ValueError
-            If the error would exceed `MOST_ERROR_DB`, or new pixels are more than 16 times as large
-            as those of the image.
+            If new pixels are more than 16 times as large as those of the image.
         """
         averaged(affine, onto)  # checks the size of new pixels
         power = _mean_power(carrier, read)
@@ -89,7 +95,7 @@ class Interpolation:
         good = [n for n, error_db in enumerate(errors_db) if error_db <= _GOOD_DB]
         best = good[0] if good else int(np.argmin(errors_db))
         if errors_db[best] > MOST_ERROR_DB:
-            raise ValueError(
+            raise InexactError(
                 f"north_up would cause an error of up to {errors_db[best]:.1f} dB in complex "
                 f"pixels, more than {MOST_ERROR_DB:g} dB: {_remedy(carrier, steps_m(affine))}"
             )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +29,7 @@ SUFFIXES = (".nc",)
 
 _REFERENCE = 1.0  # amplitude of 0 dB
 _BYTES = 40  # memory of a pixel: complex number, level, coordinates, and the file in memory
+_EPOCH = "SOURCE_DATE_EPOCH"  # variable of the environment, of reproducible-builds.org
 _ALL = slice(None), slice(None)
 
 
@@ -36,7 +39,8 @@ def write(path: Path, source: Source, tags: dict[str, Any]) -> None:
     Raises
     ------
     ValueError
-        If the pixels do not fit into memory, or heights are on points.
+        If the pixels do not fit into memory, heights are on points, or SOURCE_DATE_EPOCH is no
+        time.
     ImportError
         If xarray or h5netcdf is not installed, or pyproj for an image with a georeference.
     OSError
@@ -99,6 +103,7 @@ def _described(data: xarray.Dataset, grid: Grid, tags: dict[str, Any]) -> xarray
     origin: dict[str, Any] = {
         "Conventions": "CF-1.11",
         "source": f"clsas {__version__}",
+        "history": f"{_now():%Y-%m-%dT%H:%M:%SZ}: written by clsas.export of clsas {__version__}",
         **{name.lower(): value for name, value in tags.items()},
     }
     compressed = {"zlib": True, "complevel": 1, "shuffle": True}
@@ -107,6 +112,19 @@ def _described(data: xarray.Dataset, grid: Grid, tags: dict[str, Any]) -> xarray
     for name in data.coords:
         data[name].encoding = {"_FillValue": None}
     return data.assign_attrs(origin)
+
+
+def _now() -> datetime:
+    """Return the time in UTC, or that of SOURCE_DATE_EPOCH, which makes files reproducible."""
+    given = os.environ.get(_EPOCH)
+    if given is None:
+        return datetime.now(UTC)
+    try:
+        return datetime.fromtimestamp(int(given), UTC)
+    except (ValueError, OverflowError, OSError):
+        raise ValueError(
+            f"{_EPOCH} must be a whole number of seconds since 1970, got {validate.shown(given)}"
+        ) from None
 
 
 def _with_places_on_map(data: xarray.Dataset) -> xarray.Dataset:

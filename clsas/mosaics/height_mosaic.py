@@ -119,9 +119,10 @@ def mosaic_heights(
     Warns
     -----
     ClsasWarning
-        If a store is damaged, whose damaged patches are then measured again; or once, at the end,
-        if there are patches in which the banks agree best at an end of the search, or which are too
-        small to tell heights of ambiguity apart, as for `heights`.
+        If a store is damaged, whose damaged patches are then measured again; if `a` has more than
+        two banks, of which the first two are used; or once, at the end, if there are patches in
+        which the banks agree best at an end of the search, or which are too small to tell heights
+        of ambiguity apart, as for `heights`.
 
     See Also
     --------

@@ -212,8 +212,9 @@ def process(
         records = checked_records(scene, folder, names)
         if not set(of_banks) <= records.keys():
             uncorrected = recording.read()  # which stays in memory for the first step
-            with _naming(scene, of_banks[0]):  # before other steps, which may take hours
-                check_banks(uncorrected)
+            if uncorrected.banks < 2:  # the step itself warns of more than two
+                with _naming(scene, of_banks[0]):  # before other steps, which may take hours
+                    check_banks(uncorrected)
         chain = _Chain(scene, folder, recording, open_device(device), records)
         for name in STEPS:
             if name in names:

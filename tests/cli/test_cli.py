@@ -509,11 +509,11 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
 @pytest.mark.parametrize(
     ("args", "code", "message"),
     [
-        (["image", "echoes.h5", *GRID, "-o", "new.h5"], 1, "must hold RangeLines (clsas compress"),
+        (["image", "echoes.h5", *GRID, "-o", "new.h5"], 1, "must hold range lines (clsas compress"),
         (
             ["compress", "image.h5", "-o", "new.h5"],
             1,
-            "image.h5 must hold Echoes (clsas simulate makes them), got Image",
+            "image.h5 must hold echoes (clsas simulate makes them), got an image",
         ),
         (
             ["quality", "image.h5", "--reference", "scene.toml"],
@@ -536,15 +536,27 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (["simulate", "grid.toml", "-o", "new.h5"], 1, "grid.toml: missing table [sonar]"),
         (["compress", "echoes.h5", "-o", "new.h5", "--window", "bay"], 2, "bay"),
         (["compress", "echoes.h5", "-o", "new.h5", "--oversampling", "0.5"], 2, "oversampling"),
-        (["image", "lines.h5", *GRID, "-o", "new.h5", "--taps", "3"], 2, "taps must be one of"),
-        (["image", "lines.h5", *GRID, "-o", "new.h5", "--accuracy-db", "3"], 2, "accuracy_db must"),
-        (["image", "lines.h5", *GRID, "-o", "new.h5", "--upsampling", "0"], 2, "upsampling must"),
+        (
+            ["image", "lines.h5", *GRID, "-o", "new.h5", "--taps", "3"],
+            2,
+            "'--taps': must be one of",
+        ),
+        (
+            ["image", "lines.h5", *GRID, "-o", "new.h5", "--accuracy-db", "3"],
+            2,
+            "'--accuracy-db': must",
+        ),
+        (
+            ["image", "lines.h5", *GRID, "-o", "new.h5", "--upsampling", "0"],
+            2,
+            "'--upsampling': must",
+        ),
         (["image", "lines.h5", *GRID, "-o", "new.h5", "--device", "abacus"], 1, "'abacus'"),
         (["image", "lines.h5", "--x", "0:1:0", *GRID[2:], "-o", "new.h5"], 2, "START:STOP:N"),
         (["image", "lines.h5", "--x", "0:nan:9", *GRID[2:], "-o", "new.h5"], 2, "START:STOP:N"),
-        (["plan", "lines.h5", *GRID, "--z", "inf"], 2, "z must be finite m, got inf"),
+        (["plan", "lines.h5", *GRID, "--z", "inf"], 2, "'--z': must be finite m, got inf"),
         (["quality", "image.h5", "--near", "9,9"], 1, "near must be inside the image"),
-        (["quality", "image.h5", "--near", "0,20", "--search-m", "-1"], 2, "search_m must be"),
+        (["quality", "image.h5", "--near", "0,20", "--search-m", "-1"], 2, "'--search-m': must be"),
         (["simulate", "none.toml", "-o", "new.h5"], 2, "'none.toml' does not exist"),
         (["simulate", "scene.toml"], 2, "Missing option '-o'"),
         (["simulate", "scene.toml", "-o", "no/new.h5"], 2, "there is no folder 'no'"),
@@ -552,14 +564,14 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (["simulate", "scene.toml", "-o", "n" * 300], 2, "cannot be written: File name too long"),
         (["simulate", "scene.toml", "-o", "-"], 2, "must be a path; '-' for standard input or"),
         (["image", "-", *GRID, "-o", "new.h5"], 2, "must be a path; '-'"),
-        (["show", "image.h5", "-o", "new.png", "--db", "1e300"], 2, "dynamic_range_db must be"),
+        (["show", "image.h5", "-o", "new.png", "--db", "1e300"], 2, "'--db': must be"),
         (["simulate", "scene.toml", "-o", "/dev/null"], 2, "'/dev/null' is not an ordinary file"),
         (["simulate", "scene.toml", "-o", "new", "--png", "./new"], 2, "must be two files"),
         (["compress", "echoes.h5", "--png", "new", "-o", "new"], 2, "must be two files"),
         (
             ["image", "lines.h5", *GRID, "-o", "new.h5", "--png", "a", "--dynamic-range-db", "-5"],
             2,
-            "dynamic_range_db must be finite and > 0 and <= 2000 dB, got -5",
+            "'--db': must be finite and > 0 and <= 2000 dB, got -5",
         ),
         (
             ["image", "lines.h5", "--x", "0:1:1000000", "--y", "0:1:1000000", "-o", "new.h5"],
@@ -594,7 +606,11 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (["plan", "lines.h5", *GRID, "--stages", "2x2,2"], 2, "'2x2,2' must be QRxQI for every"),
         (["plan", "lines.h5", *GRID, "--stages", "1x9"], 1, "stages must leave a line and a pixel"),
         (["plan", "lines.h5", *GRID, "--tolerance-wavelengths", "1/0"], 2, "a fraction such as"),
-        (["plan", "lines.h5", *GRID, "--tolerance-db", "-100"], 2, "tolerance_db must be finite"),
+        (
+            ["plan", "lines.h5", *GRID, "--tolerance-db", "-100"],
+            2,
+            "'--tolerance-db': must be finite",
+        ),
         (["plan", "lines.h5", *GRID, "--tolerance-db", "nan"], 2, "and <= -10 dB, got nan"),
         (["tradeoff", "lines.h5", *GRID, "--tolerance-db", "-9"], 2, "dB, got -9"),
         (["plan", "lines.h5", *GRID, "--tolerance-wavelengths", "9"], 2, "wavelengths, got 9"),
@@ -611,9 +627,9 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (
             ["plan", "lines.h5", *GRID, "--beam-deg", "9", "--beam-shape", "inverse"],
             2,
-            "element_length_m must be given for shape 'inverse'",
+            "--element-length-m must be given for --beam-shape inverse",
         ),
-        (["plan", "lines.h5", *GRID, "--beam-deg", "-3"], 2, "width_deg must be finite"),
+        (["plan", "lines.h5", *GRID, "--beam-deg", "-3"], 2, "--beam-deg must be finite"),
         (["plan", "lines.h5"], 2, "no grid given: use --scene, or --x and --y"),
         (["tradeoff", *GRID], 2, "give either LINES.H5 or --case"),
         (

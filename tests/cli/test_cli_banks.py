@@ -101,7 +101,7 @@ def test_assessments_take_a_bank(made):
     ]
     assert {each["channels"] for each in results} == {80}
     _, stderr = run("assess", lines, "--scene", scene, code=1)
-    assert "assess lines.bank(0), with sonar.bank(0)" in stderr
+    assert "got 2: use --bank 0" in stderr
 
 
 def test_a_case_has_no_banks():

@@ -80,7 +80,7 @@ def test_options_place_an_image(folder):
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (("nowhere.h5", "a.tif"), 1, "source must have a georeference for a GeoTIFF"),
+        (("nowhere.h5", "a.tif"), 1, "INPUT must have a georeference for a GeoTIFF"),
         (("nowhere.h5", "a.tif", "--origin", "60,5"), 2, "must be given together"),
         (("nowhere.h5", "a.tif", "--origin", "x"), 2, "LATITUDE,LONGITUDE in degrees"),
         (("nowhere.h5", "a.tif", "--crs", "EPSG:1", "--origin", "60,5"), 2, "--crs excludes"),

@@ -155,7 +155,7 @@ def test_one_file_may_hold_both_banks(tmp_path):
     run("heights", tmp_path / "upper.h5", *given)
     assert np.array_equal(clsas.load(output).height_m, found.height_m, equal_nan=True)
     alone = run("heights", tmp_path / "low.h5", *given, code=1)
-    assert "low.h5 must have at least 2 receiver banks (bank_numbers), got 1: give" in alone.stderr
+    assert "low.h5 must have at least 2 receiver banks, got 1: give" in alone.stderr
     # Of three banks, the first two are taken, as by clsas process.
     three = replace(
         both,
@@ -167,7 +167,11 @@ def test_one_file_may_hold_both_banks(tmp_path):
         bank_numbers=np.repeat([0, 1, 2], low.channels),
     )
     clsas.save(tmp_path / "three.h5", three)
-    run("heights", tmp_path / "three.h5", *given)
+    warned = run("heights", tmp_path / "three.h5", *given)
+    assert warned.stderr == (
+        "Warning: heights are measured from banks 0 and 1; bank 2 is not used. To choose others, "
+        "make files of one bank by clsas convert --bank\n"
+    )
     assert np.array_equal(clsas.load(output).height_m, found.height_m, equal_nan=True)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clsas
-from clsas.core.banks import together
+from clsas.core.banks import first_two, together
 from clsas.core.digests import lines_digest
 from clsas.mosaics.survey import open_survey
 from clsas.sonar.system import line_array, stacked
@@ -33,6 +33,16 @@ def test_a_bank_is_the_sonar_with_its_receivers():
     assert upper.bank_numbers is None
     assert upper.bank(0) is upper
     assert "2 banks of 3 receivers" in repr(SONAR)
+
+
+def test_the_two_banks_of_heights_are_the_first_and_others_are_named():
+    assert first_two(np.array([3, 1, 1])) == (1, 3)  # warnings are errors
+    with pytest.warns(
+        clsas.ClsasWarning, match="from banks 0 and 1; bank 2 is not used. To choose"
+    ):
+        assert first_two(np.array([0, 1, 2])) == (0, 1)
+    with pytest.warns(clsas.ClsasWarning, match="banks 1 and 4; banks 5, 6 and 9 are not used"):
+        assert first_two(np.array([9, 6, 5, 4, 1])) == (1, 4)
 
 
 @pytest.mark.parametrize(

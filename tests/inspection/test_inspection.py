@@ -709,8 +709,8 @@ def test_files_without_a_recording_are_refused(tmp_path):
         to = [] if command == ["inspect"] else [str(tmp_path / "o.cphd")]
         run = CliRunner().invoke(main, [*command, str(tmp_path / "image.h5"), *to])
         assert run.exit_code == 1
-        assert "image.h5 must hold RangeLines" in run.stderr
-        assert "got Image" in run.stderr
+        assert "image.h5 must hold range lines" in run.stderr
+        assert "got an image" in run.stderr
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from placed import UTM_NORTH, local
 
 import clsas
 from clsas.core.image_error import relative_error_db
+from clsas.maps.agreement import agreement
 from clsas.maps.carrier import Carrier
 from clsas.maps.collection import Collection
 from clsas.maps.interpolation import MOST_ERROR_DB, margin_of
@@ -245,6 +246,34 @@ def noise(grid, seed=5):
     return clsas.Image(random.normal(size=(*grid.shape, 2)) @ [1, 1j], grid)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("carrier_hz", [140e3, 180e3, 300e3])
+@pytest.mark.parametrize(("kind", "step_m"), [("speckle", 0.0125), ("points", 0.016)])
+def test_lines_of_another_recording_are_recognized(kind, step_m, carrier_hz, tmp_path):
+    place = local(217.0)
+    lines, grid = lines_of(place, kind), grid_of(place, step_m, "oblique")
+    image = clsas.backproject(lines, grid, beam=BEAM, accuracy_db=-60)
+    other = replace(lines, carrier_hz=carrier_hz)
+    with pytest.raises(ValueError, match="lines and beam must be those that formed the image: its"):
+        resampled(image, tmp_path / "a.tif", lines=other, beam=BEAM)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["speckle", "points"])
+@pytest.mark.parametrize("step_m", [0.008, 0.0125, 0.016, 0.03])
+def test_lines_agree_with_their_image(kind, step_m):
+    place = local(217.0)
+    lines, grid = lines_of(place, kind), grid_of(place, step_m, "oblique")
+    for beam in (BEAM, clsas.BeamWindow(20.0), clsas.BeamWindow(10.0, "hann", squint_deg=8.0)):
+        image = clsas.backproject(lines, grid, beam=beam, accuracy_db=-60)
+        found = agreement(
+            Collection.of(lines, beam), grid.shape, grid.origin_m,
+            np.stack([grid.row_step_m, grid.column_step_m]),
+            lambda rows, columns, pixels=image.pixels: pixels[rows, columns],
+        )  # fmt: skip
+        assert 0.97 < found <= 1
+
+
 def test_what_cannot_be_resampled_is_refused(tmp_path):
     place = local(217.0)
     lines, grid = lines_of(place, "points"), grid_of(place, 0.05)
@@ -269,7 +298,7 @@ def test_what_cannot_be_resampled_is_refused(tmp_path):
         ),
         (
             noise(grid_of(place, 0.01)), {"lines": lines, "beam": BEAM},
-            "or lines and beam are not those that formed the image",
+            "lines and beam must be those that formed the image: its spatial",
         ),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):

@@ -1,6 +1,7 @@
 """netCDF files, and pictures with world files."""
 
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -11,6 +12,30 @@ import clsas
 rasterio = pytest.importorskip("rasterio")
 xarray = pytest.importorskip("xarray")
 pytest.importorskip("h5netcdf")
+
+
+def test_netcdf_has_a_history_and_is_reproducible(tmp_path, monkeypatch):
+    image = clsas.Image(np.ones((2, 3), np.complex64), clsas.Grid.plane((0, 1, 3), (9, 10, 2)))
+    path = tmp_path / "a.nc"
+
+    def history():
+        clsas.export(image, path)
+        with xarray.open_dataset(path, engine="h5netcdf") as data:
+            return data.attrs["history"]
+
+    before = datetime.now(UTC).replace(microsecond=0)
+    stamp, _, rest = history().partition(": ")
+    assert before <= datetime.fromisoformat(stamp) <= datetime.now(UTC)
+    assert rest == f"written by clsas.export of clsas {clsas.__version__}"
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1000000000")
+    assert history().startswith("2001-09-09T01:46:40Z: written by clsas")
+    first = path.read_bytes()
+    history()
+    assert path.read_bytes() == first
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
+    with pytest.raises(ValueError, match="SOURCE_DATE_EPOCH must be a whole number of seconds"):
+        history()
+    assert path.read_bytes() == first
 
 
 @pytest.mark.parametrize("place", [UTM_NORTH, local(90.0), local(217.0), None], ids=str)

@@ -440,6 +440,6 @@ class TestCommand:
         assert "must not lie in the store" in self.run(store, store / "web", code=2)
         assert "--no-open requires FOLDER" in self.run(store, "--no-open", code=2)
         clsas.save(tmp_path / "lines.h5", LINES)
-        assert "must hold Image" in self.run(tmp_path / "lines.h5", tmp_path / "web", code=1)
+        assert "must hold an image" in self.run(tmp_path / "lines.h5", tmp_path / "web", code=1)
         assert not opened
         assert not (tmp_path / "web").exists()

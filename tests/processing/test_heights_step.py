@@ -171,7 +171,10 @@ def test_the_first_two_of_several_banks_are_used(scene):
     three = together([low, high, silent])
     renumbered = replace(three, bank_numbers=np.array([1, 4, 6])[three.bank_numbers])
     change(scene, '"image", "heights"', '"heights"')
-    found = clsas.process(scene, lines=renumbered).heights
+    with pytest.warns(ClsasWarning) as warned:
+        found = clsas.process(scene, lines=renumbered).heights
+    (message,) = [str(each.message) for each in warned]
+    assert "heights are measured from banks 1 and 4; bank 6 is not used" in message
     expected = clsas.heights(low, high, read_scene(scene).grid, search_m=(-0.5, 0.5), window_m=0.2)
     np.testing.assert_array_equal(found.height_m, expected.height_m)
 

@@ -1,0 +1,156 @@
+"""Messages of commands name options and files, not arguments and functions of Python."""
+
+import re
+import warnings
+from dataclasses import replace
+
+import click
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from reliefs import flat_banks
+
+import clsas
+from clsas import cli
+from clsas.cli.wording import command, in_options
+
+GRID = ("--x", "-0.5:0.5:21", "--y", "31.5:32.5:21")
+HEIGHTS = ("heights", "banks.h5", *GRID, "-o", "new.h5", "--search-m")
+NAVIGATE = ("navigate", "pings.h5", "-o", "new.h5")
+PLAN = ("plan", "low.h5", *GRID)
+EXPORT = ("export", "image.h5", "new.tif")
+# Names of arguments, attributes and functions, and tuples.
+PYTHON = re.compile(r"(?<![\w./-])[a-z]+_[a-z_]+|\bclsas\.\w|\w\.\w+\(|\bNone\b|\('|\(-?[\d.]+, ")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    low, high = flat_banks()
+    names = "samples", "first_range_m", "tx_m", "rx_m"
+    arrays = {name: np.concatenate([getattr(low, name), getattr(high, name)]) for name in names}
+    both = replace(low, **arrays, bank_numbers=np.repeat([0, 1], low.channels))
+    clsas.save(folder / "low.h5", low)
+    clsas.save(folder / "banks.h5", both)
+    grid = clsas.Grid.plane((-0.5, 0.5, 21), (31.5, 32.5, 21))
+    clsas.save(folder / "image.h5", clsas.Image(np.ones((21, 21), np.complex64), grid))
+    pings = np.repeat(np.arange(4.0), 4)
+    rx_m = np.stack([0.1 * pings + np.tile(0.05 * np.arange(4), 4), 0 * pings, 0 * pings], axis=1)
+    tx_m = np.stack([0.1 * pings, 0 * pings, 0 * pings], axis=1)
+    samples = np.ones((16, 200), np.complex64)
+    clsas.save(
+        folder / "pings.h5",
+        clsas.RangeLines(
+            samples=samples,
+            first_range_m=np.full(16, 20.0),
+            range_step_m=0.01,
+            carrier_hz=100e3,
+            tx_m=tx_m,
+            rx_m=rx_m,
+            sound_speed_m_s=1500.0,
+        ),
+    )
+    (folder / "scene.toml").write_text('[image]\nbeam = { shape = "inverse", width_deg = 30 }\n')
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((*HEIGHTS, "0:1e9"), "--search-m must lie within 1e+08 m of the grid, got 0:1e+09"),
+        ((*HEIGHTS, "-9:40"), "--search-m must end below the sonar"),
+        ((*HEIGHTS, "0:0.001"), "the two banks must be apart across the line of sight"),
+        ((*HEIGHTS, "0:0.001"), "over --search-m, less than"),
+        ((*HEIGHTS, "-1:1", "--window-m", 9), "--window-m must be finite and > 0 and <= 1.05 m"),
+        ((*HEIGHTS, "-1:1", "--x", "0:0:1"), "the grid of --x and --y must have at least 2 rows"),
+        (("heights", "low.h5", *HEIGHTS[2:], "-1:1"), "low.h5 must have at least 2 receiver"),
+        (("heights", "banks.h5", "pings.h5", *HEIGHTS[2:], "-1:1"), "the two banks must contain"),
+        ((*NAVIGATE, "--range-m", "1:99"), "20 to 21.99 m, with the nearest first, got 1:99"),
+        ((*NAVIGATE, "--unknown", "yaw"), "--unknown must include 'sway', got yaw"),
+        ((*NAVIGATE, "--window-m", -1), "'--window-m': must be finite and > 0 m, got -1"),
+        ((*NAVIGATE, "--yaw-sd-deg", 200), "must be finite and > 0 and <= 180 degrees, got 200"),
+        ((*PLAN, "--beam-deg", 700), "--beam-deg must be finite and >= 0.001 and <= 180 degrees"),
+        ((*PLAN, "--stages", "999x999"), "--stages must leave a line and a pixel"),
+        ((*PLAN, "--z", "nan"), "'--z': must be finite m, got nan"),
+        ((*PLAN, "--x", "1e9:2e9:3"), "--x stop must be finite"),
+        ((*PLAN, "--device", "abacus"), "No device matches 'abacus' (--device)"),
+        (("image", "image.h5", *GRID, "-o", "new.h5"), "must hold range lines (clsas compress"),
+        (("convert", "banks.h5", "new.cphd"), "FILE must be of one bank, got 2: write --bank 0"),
+        (("compress", "low.h5", "-o", "new.h5", "--window", "oak"), "SciPy without parameters"),
+        (("mosaic", "--lines", "low.h5", *GRID, "-o", "m.zarr", "--memory-mib", 1),
+         "--memory-mib must be"),
+        (("quality", "image.h5", "--near", "9,9"), "--near must be inside the image"),
+        (("show", "image.h5", "--north-arrow"), "--north-arrow needs an image with a georeference"),
+        ((*EXPORT, "--origin", "91,0", "--heading-deg", 0), "latitude of --origin must be from"),
+        ((*EXPORT, "--pixel-m", 1, "--origin", "60,5", "--heading-deg", 0),
+         "no effect on .tif with --as db without --north-up"),
+        (EXPORT, "INPUT must have a georeference for a GeoTIFF"),
+        (EXPORT, "give --origin and --heading-deg, or --crs, or form"),
+        (("known-points", "low.h5", "--point", "0,900", "-o", "new.h5"), "--point must lie where"),
+        # A file keeps its own words.
+        (("plan", "low.h5", "--scene", "scene.toml", *GRID), "scene.toml: [image.beam] element"),
+    ],
+)  # fmt: skip
+def test_messages_name_what_the_user_typed(arguments, expected, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    result = CliRunner().invoke(cli.main, [str(each) for each in arguments], prog_name="clsas")
+    assert result.exit_code in (1, 2)
+    assert expected in result.stderr
+    if "scene.toml" not in arguments:
+        assert not PYTHON.search(result.stderr), result.stderr
+
+
+def said(text, given=(), options=("search_m", "unknowns", "beam", "scene", "bank")):
+    """Return what a command with some options says instead of a text."""
+    found = []
+
+    @command(context_settings={"ignore_unknown_options": True})
+    def run(**_):
+        found.append(in_options(text))
+
+    for name in options:
+        option = "--unknown" if name == "unknowns" else f"--{name.replace('_', '-')}"
+        run.params.append(click.Option([option, name]))
+    run.main(list(given), standalone_mode=False)
+    return found[0]
+
+
+def test_every_kind_of_name_is_translated():
+    for text, expected in [
+        ("search_m=(-1.0, 2.5) is wide", "--search-m -1.0:2.5 is wide"),
+        ("make the grid larger or search_m smaller", "make the grid larger or --search-m smaller"),
+        ('Leave out yaw with unknowns=("sway",)', "Leave out yaw with --unknown sway"),
+        ("use clsas.autofocus", "use clsas focus"),
+        ("x must hold RangeLines, got Image", "x must hold range lines, got an image"),
+        ("a and b must have the same sound_speed", "the two banks must have the same sound-speed"),
+        ("beam is one word of English", "--beam is one word of English"),
+        ("the beam must be wide", "the beam must be wide"),
+        ("[process.heights] search_m must", "[process.heights] search_m must"),
+        ("key 'search_m' is unknown", "key 'search_m' is unknown"),
+        ("Heights may be wrong", "Heights may be wrong"),
+        ("number must be 0", "--bank must be 0"),
+    ]:
+        assert expected in said(text), text
+    assert said("use lines.bank(2)", options=()) == "use clsas convert --bank 2"
+    assert in_options("search_m must be") == "search_m must be"  # no command is running
+
+
+def test_warnings_are_translated_too(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    arguments = ("image", "banks.h5", *GRID, "-o", "new.h5", "--exact")
+    with warnings.catch_warnings():
+        result = CliRunner().invoke(cli.main, arguments, prog_name="clsas")
+    assert result.exit_code == 0, result.output
+    assert "--bank 0 uses the first bank\n" in result.stderr
+    assert not PYTHON.search(result.stderr)
+    monkeypatch.setattr(cli, "_worded", str)
+    before = CliRunner().invoke(cli.main, arguments, prog_name="clsas")
+    assert "lines.bank(0)" in before.stderr  # so that there was something to translate
+
+
+def test_every_command_has_its_options_translated():
+    context = click.Context(cli.main)
+    for name in cli.main.list_commands(context):
+        found = cli.main.get_command(context, name)
+        assert type(found).__name__ == "Command", name
+        assert type(found).__module__ == "clsas.cli.wording"
