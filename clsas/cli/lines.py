@@ -21,6 +21,7 @@ from clsas.files.cphd_writing import SUFFIXES as CPHD
 from clsas.files.formats import SUFFIXES
 from clsas.signal.compression import check_options
 from clsas.simulation.simulator import check_size
+from clsas.sonar.density import noise_penalty_db
 
 
 @click.command()
@@ -142,6 +143,12 @@ def compress(
     help="Fade the lines over this range at either end (m).",
     callback=options.checked(partial(validate.positive, "taper_m", unit="m")),
 )
+@click.option(
+    "--compensate-density",
+    is_flag=True,
+    help="Weight every channel by the length of track that its phase centre stands for, which "
+    "removes the ghosts of repeated phase centres.",
+)
 @options.as_json
 def convert(
     recording: Path,
@@ -151,6 +158,7 @@ def convert(
     without_background: str | None,
     high_pass_hz: float | None,
     taper_m: float | None,
+    compensate_density: bool,
     as_json: bool,
 ) -> None:
     """Convert a recording to HDF5 or CPHD.
@@ -174,18 +182,23 @@ def convert(
     if taper_m is not None:
         steps.append(partial(tapered_ends, length_m=taper_m, name="--taper-m"))
     obj: Any
-    if steps or bank is not None or output.suffix.lower() in CPHD:
+    if steps or compensate_density or bank is not None or output.suffix.lower() in CPHD:
         obj = load_lines(recording, bank)
     else:
         obj = clsas.load(recording)
     for step in steps:
         obj = step(obj)
+    noise: dict[str, float] = {}
+    if compensate_density:
+        weights = clsas.density_weights(obj)
+        obj, noise = obj.weighted(weights), {"noise_penalty_db": noise_penalty_db(weights)}
     clsas.save(output, obj)
     seconds = time.perf_counter() - start
     report(
         as_json,
-        f"{printable(output)}: {obj!r} in {seconds:.2f} s",
-        file=output, kind=type(obj).__name__, seconds=seconds,
+        f"{printable(output)}: {obj!r} in {seconds:.2f} s"
+        + "".join(f"\n  the weights raise the noise by {each:.2f} dB" for each in noise.values()),
+        file=output, kind=type(obj).__name__, seconds=seconds, **noise,
     )  # fmt: skip
 
 
