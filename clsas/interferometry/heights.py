@@ -41,6 +41,7 @@ from clsas.interferometry.refinement import PASSES, Refined, filled, refine
 from clsas.interferometry.request import Request
 from clsas.interferometry.result import Heights
 from clsas.interferometry.shadows import in_shadow
+from clsas.interferometry.side_lobes import from_elsewhere, point_response
 from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, Sweep, sweep
 from clsas.interferometry.task import Task
 from clsas.opencl.device import Device, open_device
@@ -253,12 +254,15 @@ def measured(
         lambda done: report(len(heights_m) + done, total),
     )
     report(total, total)
-    hidden = in_shadow(task.plane, refined.offset_m, refined.sd_m, refined.valid, sights, window)
+    response = point_response(task.pair, task.level)
+    power = np.abs(refined.image.pixels.astype(np.complex128)) ** 2
+    valid = refined.valid & ~from_elsewhere(power, response, window)
+    hidden = in_shadow(task.plane, refined.offset_m, refined.sd_m, valid, sights, window)
     found = Heights(
         refined.offset_m,
         refined.sd_m,
         refined.coherence,
-        refined.valid & ~hidden,
+        valid & ~hidden,
         refined.looks,
         refined.m_per_rad,
         refined.image,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from clsas.core import banks, decibels, reprs, validate
 from clsas.core.lines import RangeLines
 from clsas.core.pings import STILL, Transmissions, means
+from clsas.sonar.sampling import course
 
 _LOCAL = 11  # steps that are averaged to find the local course, as for turns of a track
 # Advance over `_LOCAL` steps, relative to the length of these steps, below which a track has no
@@ -231,6 +232,16 @@ def lengths(along_m: NDArray[np.float64]) -> NDArray[np.float64]:
     found = np.empty(len(along_m))
     found[order] = (parts_m / members)[group]
     return found
+
+
+def usual_spacing_m(lines: RangeLines) -> float:
+    """Return the usual spacing of the phase centres along the direction of the track, metres.
+
+    It is 0 if all of them coincide.
+    """
+    centres_m = lines.phase_centres_m
+    gaps_m = np.diff(np.sort(centres_m @ course(centres_m)))
+    return _usual(gaps_m) if gaps_m.any() else 0.0
 
 
 def _usual(gaps_m: NDArray[np.float64]) -> float:
