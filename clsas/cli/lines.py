@@ -71,6 +71,10 @@ def simulate(scene_file: Path, output: Path, picture: Path | None, as_json: bool
     "--oversampling", type=float, help="Samples per bandwidth. [default: 2]",
     callback=options.checked(lambda rate: check_options(oversampling=rate)),
 )  # fmt: skip
+@click.option(
+    "--equalize", is_flag=True, default=None,
+    help="Remove the ripples of the pulse's spectrum, and the range side lobes that they cause.",
+)  # fmt: skip
 @options.picture("the lines")
 @options.levels
 @options.as_json
@@ -80,6 +84,7 @@ def compress(
     scene: Path | None,
     window: str | None,
     oversampling: float | None,
+    equalize: bool | None,
     picture: Path | None,
     dynamic_range_db: float | None,
     percentiles: tuple[float, float] | None,
@@ -88,14 +93,18 @@ def compress(
 ) -> None:
     """Compress echoes into range lines.
 
-    Window and oversampling are taken from the options or, without these, from --scene.
+    Window, oversampling and equalization are taken from the options or, without these, from
+    --scene.
 
     \b
     Example:  clsas compress echoes.h5 -o lines.h5 --window hamming
     """
     levels = read_levels(dynamic_range_db, percentiles, colour_map)
     settings = _overridden(
-        read_scene(scene).compress if scene else {}, window=window, oversampling=oversampling
+        read_scene(scene).compress if scene else {},
+        window=window,
+        oversampling=oversampling,
+        equalize=equalize,
     )
     echoes = load(echoes_file, clsas.Echoes)
     with progress_bar("compressing") as progress:

@@ -60,8 +60,9 @@ def from_elsewhere(
         own.
     """
     row, column = middle(power.shape)
-    inside = slice(max(row - window.rows // 2, 0), row + window.rows // 2 + 1), slice(
-        max(column - window.columns // 2, 0), column + window.columns // 2 + 1
+    inside = (
+        slice(max(row - window.rows // 2, 0), row + window.rows // 2 + 1),
+        slice(max(column - window.columns // 2, 0), column + window.columns // 2 + 1),
     )
     own = float(response[inside].sum())
     if own == 0:  # no line reaches the point

@@ -236,9 +236,7 @@ def test_two_receivers_at_one_place():
 @pytest.mark.slow
 def test_factorized_images_keep_their_tolerance():
     """The tolerance refers to the exact image of the same weighted lines."""
-    sonar = clsas.Sonar(
-        clsas.Pulse(CARRIER_HZ, 30e3, 1e-3), 2 * line_array(RECEIVERS, SPACING_M)
-    )
+    sonar = clsas.Sonar(clsas.Pulse(CARRIER_HZ, 30e3, 1e-3), 2 * line_array(RECEIVERS, SPACING_M))
     velocity_m_s = [(RECEIVERS - 1) * SPACING_M / 0.2, 0, 0]
     track = clsas.Track.straight([-15, 0, 0], velocity_m_s, pings=60, ping_interval_s=0.2)
     random = np.random.default_rng(3)
