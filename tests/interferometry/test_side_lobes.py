@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.ndimage import center_of_mass, maximum_filter, minimum_filter
 
 import clsas
 from clsas.core.decibels import in_db
@@ -27,7 +27,7 @@ def response(shape=SHAPE):
     return found
 
 
-@pytest.mark.parametrize(("level_db", "masked"), [(0, True), (9, True), (14, False)])
+@pytest.mark.parametrize(("level_db", "masked"), [(0, True), (5, True), (14, False)])
 def test_lobes_in_the_dark_are_found_where_they_lie(level_db, masked):
     """A block of 30 dB has lobes of 10 dB, which count where they are most of the power."""
     own = 10 ** (level_db / 10) * np.random.default_rng(1).exponential(size=SHAPE)
@@ -98,10 +98,8 @@ def test_responses_are_those_of_simulated_points(width_deg, repeated):
     for part in (left, right):
         levels_db = [in_db(each[part].sum() / each[own].sum()) for each in (found, expected)]
         assert levels_db[0] == pytest.approx(levels_db[1], abs=1.0)
-    ambiguous = [
-        np.unravel_index(each[right].argmax(), each[right].shape) for each in (found, expected)
-    ]
-    np.testing.assert_allclose(ambiguous[0], ambiguous[1], atol=3)
+        places = [center_of_mass(each[part]) for each in (found, expected)]
+        np.testing.assert_allclose(places[0], places[1], atol=4)  # 0.1 m and 0.3 m
 
 
 def test_silent_lines_have_no_response():

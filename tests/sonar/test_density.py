@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from factorizing import EXACT_IS_SLOW
 
 import clsas
 from clsas.sonar.density import density_compensated, density_weights, noise_penalty_db
-from factorizing import EXACT_IS_SLOW
-
 from clsas.sonar.system import line_array
 
 CARRIER_HZ, SPEED_M_S = 100e3, 1500.0
@@ -221,7 +220,7 @@ def test_what_has_no_track_is_refused():
         with pytest.raises(ValueError, match="must come from receivers that move along a track"):
             density_weights(stationary)
     there_m = straight([RECEIVERS] * 20)
-    with pytest.raises(ValueError, match="around ping 2[0-9], 11 steps .*Sort pings by time"):
+    with pytest.raises(ValueError, match=r"around ping 2[0-9], 11 steps .*Sort pings by time"):
         density_weights(array_lines(np.concatenate([there_m, there_m[::-1] + [0, 0.5, 0]])))
     with pytest.raises(TypeError, match="lines must be of type RangeLines"):
         density_weights(np.ones(3))
