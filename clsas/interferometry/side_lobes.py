@@ -152,5 +152,5 @@ def _two_way_pattern(lines: RangeLines, point_m: NDArray[np.float64]) -> NDArray
     distance_m = np.maximum(np.linalg.norm(sight_m, axis=1), _NEAREST_M)
     sine = np.einsum("ci,ci->c", sight_m, along) / distance_m
     length_m = 2 * usual_spacing_m(lines)
-    one_way: NDArray[np.float64] = element_pattern(length_m, sine, 1.0, wavelength_m(lines))
-    return one_way**2
+    one_way = element_pattern(length_m, sine, 1.0, wavelength_m(lines))
+    return one_way.astype(np.float64) ** 2

@@ -20,9 +20,10 @@ _LOCAL = 11  # steps that are averaged to find the local course, as for turns of
 # Advance over `_LOCAL` steps, relative to the length of these steps, below which a track has no
 # course. Pings along a line whose positions err by a whole step have 0.7, turns by 180 degrees 0.
 _LEAST_STRAIGHT = 0.5
-# Phase centres closer than this share of the usual spacing have equal weights. Smaller values
-# leave some of them nearly without a weight, which raises the noise. Larger ones leave ghosts: with
-# a distance of 0.1, 35 dB below those of equal weights.
+# Phase centres closer than this share of the usual spacing have equal weights. Without that, those
+# in the middle of a group have hardly any: groups of three, scattered by 0.03 spacings, raise the
+# noise by 1.6 dB (0.3 dB with half the value, 0.03 dB with this one, 0 with twice the value). Ghosts
+# do not depend on it up to 0.2.
 _COINCIDENT = 0.1
 # Spacing, relative to the usual one, up to which the phase centres beside a gap stand for the whole
 # gap. Nothing else samples it, so that larger weights only raise the side lobes.
@@ -32,8 +33,8 @@ _MOST_SPACING = 2.0
 def density_compensated(lines: RangeLines) -> RangeLines:
     """Return lines with weights that even out the density of their phase centres along the track.
 
-    Arrays that repeat phase centres from ping to ping, as [micronavigation](micronavigate) needs,
-    image without ghosts after this. Correct the track first: the weights follow from positions.
+    Arrays that repeat phase centres from ping to ping, as `micronavigate` needs, image without
+    ghosts after this. Correct the track first, since the weights follow from positions.
 
     Parameters
     ----------
@@ -102,9 +103,9 @@ def density_weights(lines: RangeLines) -> NDArray[np.float64]:
     Distances are measured along the local course, the mean direction of about 11 pings. A phase
     centre stands for the track up to halfway to its neighbours on either side. Those that
     coincide, within a tenth of the usual spacing, share their part equally. A gap counts as at most
-    twice the usual spacing, so that pings beside a lost one weigh 1.5 times as much as others, and
-    not more. At the ends of the track the first and the last spacing continue. The usual spacing is
-    the one in which half the track lies in smaller ones.
+    twice the usual spacing, so that phase centres beside a lost ping weigh 1.5 times as much as
+    others, and not more. At the ends of the track the first and the last spacing continue. Half of
+    the track lies in spacings that are smaller than the usual one.
 
     With weights w of mean 1, equal weights would instead cause ghosts with the total power ::
 
@@ -116,7 +117,9 @@ def density_weights(lines: RangeLines) -> NDArray[np.float64]:
 
         mean(w^2)
 
-    This is less than the noise without the repeated channels.
+    This is less than the noise of an image without the repeated channels. Phase centres that nearly
+    coincide leave ghosts: with one of six repeated, -36, -28 and -22 dB at distances of 0.02, 0.05
+    and 0.1 spacings, where equal weights have -9.5 dB.
 
     Examples
     --------
@@ -144,7 +147,7 @@ def density_weights(lines: RangeLines) -> NDArray[np.float64]:
 
 def noise_penalty_db(weights: NDArray[np.float64]) -> float:
     """Return the power of noise relative to targets with weights, over that without, dB."""
-    return float(decibels.in_db(np.mean(weights**2) / np.mean(weights) ** 2))
+    return decibels.in_db(float(np.mean(weights**2) / np.mean(weights) ** 2))
 
 
 def _of_bank(lines: RangeLines) -> NDArray[np.float64]:
