@@ -166,7 +166,9 @@ def heights(
     Images are coregistered because they are formed in the time domain, and a sway or yaw of the
     track is accounted for like any other motion. The mask leaves out what is not coherent, pixels
     on none of the curves or hidden by other pixels (shadow), and pixels on several curves or on
-    slopes that face the sonar too steeply (layover).
+    slopes that face the sonar too steeply (layover). It also leaves out windows that receive most
+    of their power from elsewhere, by side lobes and ambiguities of brighter places, as far as the
+    response to a point in the middle of the grid shows.
 
     Errors that all pixels have in common are not part of the deviation. A constant phase between
     the banks, as from a delay of one receiver, adds `Heights.m_per_rad` per radian. An error of the

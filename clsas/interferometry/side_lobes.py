@@ -47,7 +47,7 @@ _BLOCK = 1 << 22  # complex128 samples of the channels that are computed togethe
 def from_elsewhere(
     power: NDArray[np.float64], response: NDArray[np.float64], window: Window
 ) -> NDArray[np.bool_]:
-    """Return which pixels receive at least as much from elsewhere as from their own window.
+    """Return which pixels receive most of their power from beyond their own window.
 
     Parameters
     ----------
@@ -90,19 +90,30 @@ def point_response(pair: Pair, grid: Grid) -> NDArray[np.float64]:
         A plane.
     """
     point_m = grid.positions_m()[middle(grid.shape)]
-    pixels = replace(pair, a=lines_of_point(pair.a, point_m)).first_image(grid)
+    lines, beam = pair.a, pair.beam
+    along = track_directions(lines) if beam is None else beam.directions(lines)
+    pixels = replace(pair, a=lines_of_point(lines, point_m, along)).first_image(grid)
     return pixels.real.astype(np.float64) ** 2 + pixels.imag.astype(np.float64) ** 2
 
 
-def lines_of_point(lines: RangeLines, point_m: NDArray[np.float64]) -> RangeLines:
+def lines_of_point(
+    lines: RangeLines, point_m: NDArray[np.float64], along: NDArray[np.float64]
+) -> RangeLines:
     """Return the lines that a point would cause, with the band of the lines.
 
-    Elements are taken to be twice as long as the usual spacing of phase centres, the longest that
-    this spacing samples. Lines do not tell their length.
+    Lines do not contain the length of the elements. It is taken to be twice the usual spacing of
+    the phase centres, the spacing up to which elements of that length are sampled.
+
+    Parameters
+    ----------
+    lines : RangeLines
+    point_m : float64 [3]
+    along : float64 [channels, 3]
+        Unit vectors along the track.
     """
     every = np.arange(lines.channels)
     range_m = bistatic_range_m(point_m, *antennas_of(lines, every))
-    amplitude = _two_way_pattern(lines, point_m) * _gains(lines)
+    amplitude = _two_way_pattern(lines, point_m, along) * _gains(lines)
     spectrum = measure_spectrum(lines)
     # Without wrap-around of the response, which is shorter than a line.
     padded = fft.next_fast_len(2 * lines.length)
@@ -138,12 +149,13 @@ def _gains(lines: RangeLines) -> NDArray[np.float64]:
     return relative
 
 
-def _two_way_pattern(lines: RangeLines, point_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def _two_way_pattern(
+    lines: RangeLines, point_m: NDArray[np.float64], along: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the amplitude with which every channel receives a point, [channels].
 
     Elements lie along the track, or across the direction in which they look if that is known.
     """
-    along = track_directions(lines)
     look = lines.look_direction
     if look is not None:
         along = along - np.einsum("ci,ci->c", along, look)[:, None] * look

@@ -18,12 +18,13 @@ from clsas.sonar.sampling import course
 
 _LOCAL = 11  # steps that are averaged to find the local course, as for turns of a track
 # Advance over `_LOCAL` steps, relative to the length of these steps, below which a track has no
-# course. Pings along a line whose positions err by a whole step have 0.7, turns by 180 degrees 0.
+# course. If positions err by half a step rms, along and across, it is 0.6 or more among 400 pings;
+# by a whole step, down to 0.3. At turns by 180 degrees it is 0.
 _LEAST_STRAIGHT = 0.5
 # Phase centres closer than this share of the usual spacing have equal weights. Without that, those
 # in the middle of a group have hardly any: groups of three, scattered by 0.03 spacings, raise the
-# noise by 1.6 dB (0.3 dB with half the value, 0.03 dB with this one, 0 with twice the value). Ghosts
-# do not depend on it up to 0.2.
+# noise by 1.6 dB (0.3 dB with half the value, 0.03 dB with this one, 0 with twice the value).
+# Ghosts do not depend on it up to 0.2.
 _COINCIDENT = 0.1
 # Spacing, relative to the usual one, up to which the phase centres beside a gap stand for the whole
 # gap. Nothing else samples it, so that larger weights only raise the side lobes.

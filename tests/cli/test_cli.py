@@ -200,6 +200,24 @@ def test_mending_options_are_called_by_their_names(made, tmp_path):
     assert not (tmp_path / "mended.h5").exists()
 
 
+def test_bands_are_equalized_by_option_and_by_scene(made, tmp_path):
+    folder, output = made[0], tmp_path / "lines.h5"
+    expected = clsas.compress(clsas.load(folder / "echoes.h5"), equalize=True)
+    run("compress", folder / "echoes.h5", "--equalize", "-o", output)
+    np.testing.assert_allclose(clsas.load(output).samples, expected.samples, rtol=1e-6)
+    scene = tmp_path / "equal.toml"
+    scene.write_text("[compress]\nequalize = true\n")
+    run("compress", folder / "echoes.h5", "--scene", scene, "-o", output)
+    np.testing.assert_allclose(clsas.load(output).samples, expected.samples, rtol=1e-6)
+
+
+def test_a_survey_that_is_equalized_is_assessed(made, tmp_path):
+    text, scene = (made[0] / "scene.toml").read_text(), tmp_path / "equal.toml"
+    assert "[compress]" in text
+    scene.write_text(text.replace("[compress]", "[compress]\nequalize = true"))
+    assert "needed" in run_json("assess", scene)
+
+
 def test_density_is_compensated_on_the_way(made, tmp_path):
     """The last of 16 receivers repeats the phase centre of the first one, a ping before."""
     lines = clsas.load(made[0] / "lines.h5")
