@@ -69,7 +69,8 @@ def density_compensated(lines: RangeLines) -> RangeLines:
     >>> echoes = clsas.simulate(sonar, track, clsas.PointTargets([[0.5, 40, 0]]))
     >>> lines = clsas.density_compensated(clsas.compress(echoes))
     """
-    return lines.weighted(density_weights(lines))
+    weights = density_weights(lines)  # checks that these are lines
+    return lines.weighted(weights)
 
 
 def density_weights(lines: RangeLines) -> NDArray[np.float64]:

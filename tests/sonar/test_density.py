@@ -222,8 +222,9 @@ def test_what_has_no_track_is_refused():
     there_m = straight([RECEIVERS] * 20)
     with pytest.raises(ValueError, match=r"around ping 2[0-9], 11 steps .*Sort pings by time"):
         density_weights(array_lines(np.concatenate([there_m, there_m[::-1] + [0, 0.5, 0]])))
-    with pytest.raises(TypeError, match="lines must be of type RangeLines"):
-        density_weights(np.ones(3))
+    for function in (density_weights, density_compensated):
+        with pytest.raises(TypeError, match="lines must be of type RangeLines"):
+            function(np.ones(3))
 
 
 def test_two_receivers_at_one_place():
