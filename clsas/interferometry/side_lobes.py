@@ -41,7 +41,6 @@ from clsas.sonar.system import element_pattern
 _MOST_FROM_ELSEWHERE = 0.5
 # Avoid divisions by zero if elements look along the track, or a point lies at a phase centre.
 _LEAST_ACROSS, _NEAREST_M = 1e-3, 1e-9
-_BLOCK = 1 << 22  # complex128 samples of the channels that are computed together
 
 
 def from_elsewhere(
@@ -111,26 +110,25 @@ def lines_of_point(
     along : float64 [channels, 3]
         Unit vectors along the track.
     """
-    every = np.arange(lines.channels)
-    range_m = bistatic_range_m(point_m, *antennas_of(lines, every))
-    amplitude = _two_way_pattern(lines, point_m, along) * _gains(lines)
+    range_m = bistatic_range_m(point_m, *antennas_of(lines, np.arange(lines.channels)))
     spectrum = measure_spectrum(lines)
-    # Without wrap-around of the response, which is shorter than a line.
-    padded = fft.next_fast_len(2 * lines.length)
-    frequency = fft.fftfreq(padded)
+    frequency = fft.fftfreq(lines.length)
     from_centre = np.abs((frequency - spectrum.centre + 0.5) % 1 - 0.5)
     band = np.sqrt(np.interp(from_centre, spectrum.frequency, spectrum.share))
     band[from_centre > 0.5 / spectrum.oversampling] = 0.0
-    cycles = (lines.first_range_m - range_m) / lines.range_step_m
+    pulse = fft.fftshift(fft.ifft(band))
+    # The lines need not end where those of the recording do, and fade before they end.
+    from_end = np.minimum(np.arange(lines.length), np.arange(lines.length)[::-1])
+    pulse *= np.sin(np.pi / 2 * np.minimum(4 * from_end / lines.length, 1)) ** 2
+    amplitude = _two_way_pattern(lines, point_m, along) * _gains(lines)
     turns = lines.carrier_cycles_per_m * range_m
-    samples = np.empty_like(lines.samples)
-    rows = max(1, _BLOCK // padded)
-    for first in range(0, lines.channels, rows):
-        some = slice(first, first + rows)
-        phase = np.exp(2j * np.pi * (cycles[some, None] * frequency - turns[some, None]))
-        made = fft.ifft(amplitude[some, None] * band * phase, workers=-1, overwrite_x=True)
-        samples[some] = made[:, : lines.length]
-    return replace(lines, samples=samples / max(float(np.abs(samples).max()), 1e-30))
+    received = amplitude * np.exp(-2j * np.pi * (turns - np.rint(turns)))
+    largest = float(np.abs(received).max() * np.abs(pulse).max())
+    return replace(
+        lines,
+        samples=np.outer(received / (largest or 1.0), pulse).astype(np.complex64),
+        first_range_m=range_m - lines.length // 2 * lines.range_step_m,
+    )
 
 
 def _gains(lines: RangeLines) -> NDArray[np.float64]:
