@@ -62,6 +62,7 @@ if TYPE_CHECKING:
     from clsas.simulation.scenes import PointTargets, Seabed
     from clsas.simulation.simulator import simulate, simulate_lines
     from clsas.sonar.beam import BeamWindow
+    from clsas.sonar.density import density_compensated, density_weights
     from clsas.sonar.sampling import Finding, check_sampling
     from clsas.sonar.system import Pulse, Sonar
     from clsas.sonar.track import Pointing, Track, channels
@@ -114,6 +115,8 @@ __all__ = [
     "check_sampling",
     "compress",
     "contrast",
+    "density_compensated",
+    "density_weights",
     "entropy",
     "export",
     "factorize",
@@ -207,6 +210,7 @@ _MODULES = {
     "simulation.scenes": "PointTargets Seabed",
     "simulation.simulator": "simulate simulate_lines",
     "sonar.beam": "BeamWindow",
+    "sonar.density": "density_compensated density_weights",
     "sonar.sampling": "Finding check_sampling",
     "sonar.system": "Pulse Sonar",
     "sonar.track": "Pointing Track channels",

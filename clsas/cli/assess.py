@@ -86,7 +86,9 @@ def assess(
             for name in ("motion_in_flight", "phase_centres", "sound_speed")
             if name in simulate
         }
-        lines = clsas.survey_lines(sonar, track, grid, **survey, **described.compress)
+        # Their band is flat, as if it were equalized.
+        band = {name: each for name, each in described.compress.items() if name != "equalize"}
+        lines = clsas.survey_lines(sonar, track, grid, **survey, **band)
         known = {"sonar": sonar, "track": track, "ends": False}
     if known:
         known |= {

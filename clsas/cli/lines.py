@@ -22,6 +22,7 @@ from clsas.files.cphd_writing import SUFFIXES as CPHD
 from clsas.files.formats import SUFFIXES
 from clsas.signal.compression import check_options
 from clsas.simulation.simulator import check_size
+from clsas.sonar.density import noise_penalty_db
 
 
 @command()
@@ -82,6 +83,10 @@ def _check_window(window: str) -> None:
     "--oversampling", type=float, help="Samples per bandwidth. [default: 2]",
     callback=options.checked(lambda rate: check_options(oversampling=rate)),
 )  # fmt: skip
+@click.option(
+    "--equalize", is_flag=True, default=None,
+    help="Remove the ripples of the pulse's spectrum, and the range side lobes that they cause.",
+)  # fmt: skip
 @options.picture("the lines")
 @options.levels
 @options.as_json
@@ -91,6 +96,7 @@ def compress(
     scene: Path | None,
     window: str | None,
     oversampling: float | None,
+    equalize: bool | None,
     picture: Path | None,
     dynamic_range_db: float | None,
     percentiles: tuple[float, float] | None,
@@ -99,14 +105,18 @@ def compress(
 ) -> None:
     """Compress echoes into range lines.
 
-    Window and oversampling are taken from the options or, without these, from --scene.
+    Window, oversampling and equalization are taken from the options or, without these, from
+    --scene.
 
     \b
     Example:  clsas compress echoes.h5 -o lines.h5 --window hamming
     """
     levels = read_levels(dynamic_range_db, percentiles, colour_map)
     settings = _overridden(
-        read_scene(scene).compress if scene else {}, window=window, oversampling=oversampling
+        read_scene(scene).compress if scene else {},
+        window=window,
+        oversampling=oversampling,
+        equalize=equalize,
     )
     echoes = load(echoes_file, clsas.Echoes)
     with progress_bar("compressing") as progress:
@@ -154,6 +164,12 @@ def compress(
     help="Fade the lines over this range at either end (m).",
     callback=options.checked(partial(validate.positive, "taper_m", unit="m")),
 )
+@click.option(
+    "--compensate-density",
+    is_flag=True,
+    help="Weight every channel by the length of track that its phase centre stands for, which "
+    "removes the ghosts of repeated phase centres.",
+)
 @options.as_json
 def convert(
     recording: Path,
@@ -163,6 +179,7 @@ def convert(
     without_background: str | None,
     high_pass_hz: float | None,
     taper_m: float | None,
+    compensate_density: bool,
     as_json: bool,
 ) -> None:
     """Convert a recording to HDF5 or CPHD.
@@ -186,18 +203,23 @@ def convert(
     if taper_m is not None:
         steps.append(partial(tapered_ends, length_m=taper_m, name="--taper-m"))
     obj: Any
-    if steps or bank is not None or output.suffix.lower() in CPHD:
+    if steps or compensate_density or bank is not None or output.suffix.lower() in CPHD:
         obj = load_lines(recording, bank)
     else:
         obj = clsas.load(recording)
     for step in steps:
         obj = step(obj)
+    noise: dict[str, float] = {}
+    if compensate_density:
+        weights = clsas.density_weights(obj)
+        obj, noise = obj.weighted(weights), {"noise_penalty_db": noise_penalty_db(weights)}
     clsas.save(output, obj)
     seconds = time.perf_counter() - start
     report(
         as_json,
-        f"{printable(output)}: {obj!r} in {seconds:.2f} s",
-        file=output, kind=type(obj).__name__, seconds=seconds,
+        f"{printable(output)}: {obj!r} in {seconds:.2f} s"
+        + "".join(f"\n  the weights raise the noise by {each:.2f} dB" for each in noise.values()),
+        file=output, kind=type(obj).__name__, seconds=seconds, **noise,
     )  # fmt: skip
 
 

@@ -112,6 +112,7 @@ class _Simulate(Table):
 class _Compress(Table):
     window: str | list[str | float] = "none"
     oversampling: float = 2.0
+    equalize: bool = False
 
     def build(self) -> dict[str, Any]:
         options = self.given()

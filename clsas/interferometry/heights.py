@@ -42,7 +42,8 @@ from clsas.interferometry.refinement import PASSES, Refined, filled, refine
 from clsas.interferometry.request import Request
 from clsas.interferometry.result import Heights
 from clsas.interferometry.shadows import in_shadow
-from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, sweep
+from clsas.interferometry.side_lobes import from_elsewhere, point_response
+from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, Sweep, sweep
 from clsas.interferometry.task import Task
 from clsas.opencl.device import Device, open_device
 from clsas.signal.spectrum import measure_spectrum
@@ -166,7 +167,9 @@ def heights(
     Images are coregistered because they are formed in the time domain, and a sway or yaw of the
     track is accounted for like any other motion. The mask leaves out what is not coherent, pixels
     on none of the curves or hidden by other pixels (shadow), and pixels on several curves or on
-    slopes that face the sonar too steeply (layover).
+    slopes that face the sonar too steeply (layover). It also leaves out windows that receive most
+    of their power from elsewhere, by side lobes and ambiguities of brighter places, as far as the
+    response to a point in the middle of the grid shows.
 
     Errors that all pixels have in common are not part of the deviation. A constant phase between
     the banks, as from a delay of one receiver, adds `Heights.m_per_rad` per radian. An error of the
@@ -277,12 +280,15 @@ def measured(
         lambda done: report(len(heights_m) + done, total),
     )
     report(total, total)
-    hidden = in_shadow(task.plane, refined.offset_m, refined.sd_m, refined.valid, sights, window)
+    response = point_response(task.pair, task.level)
+    power = np.abs(refined.image.pixels.astype(np.complex128)) ** 2
+    valid = refined.valid & ~from_elsewhere(power, response, window)
+    hidden = in_shadow(task.plane, refined.offset_m, refined.sd_m, valid, sights, window)
     found = Heights(
         refined.offset_m,
         refined.sd_m,
         refined.coherence,
-        refined.valid & ~hidden,
+        valid & ~hidden,
         refined.looks,
         refined.m_per_rad,
         refined.image,

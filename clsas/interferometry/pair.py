@@ -37,14 +37,18 @@ class Pair:
 
     def images(self, grid: Grid) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
         """Return the pixels of both banks' images."""
-        first, second = (
-            Imager(
-                lines, grid, tolerance_db=self.tolerance_db, accuracy_db=self.accuracy_db,
-                beam=self.beam, device=self.device,
-            )(lines).pixels
-            for lines in (self.a, self.b)
+        return self._image(self.a, grid), self._image(self.b, grid)
+
+    def first_image(self, grid: Grid) -> NDArray[np.complex64]:
+        """Return the pixels of the first bank's image."""
+        return self._image(self.a, grid)
+
+    def _image(self, lines: RangeLines, grid: Grid) -> NDArray[np.complex64]:
+        imager = Imager(
+            lines, grid, tolerance_db=self.tolerance_db, accuracy_db=self.accuracy_db,
+            beam=self.beam, device=self.device,
         )  # fmt: skip
-        return first, second
+        return imager(lines).pixels
 
     def within(self, tolerance_db: float) -> Pair:
         """Return the pair with a tolerance of at least so many decibels."""

@@ -28,8 +28,9 @@ class Heights:
     coherence : float64 [rows, columns]
         Magnitude of the coherence of both banks on the relief, 0 to 1, without bias.
     mask : bool [rows, columns]
-        True where the height is valid. False in shadow, in layover and where the images are not
-        coherent. Nothing is filled in there.
+        True where the height is valid. False in shadow, in layover, where the images are not
+        coherent, and where they mostly show side lobes of brighter places. Nothing is filled in
+        there.
     looks : float64 [rows, columns]
         Effective number of independent samples behind each height.
     m_per_rad : float64 [rows, columns]

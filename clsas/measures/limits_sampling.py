@@ -172,10 +172,11 @@ def along_track(survey: Survey) -> Iterator[Result]:
 def _overlap(survey: Survey, overlap: float) -> Limit:
     """Return the overlap of consecutive pings of an array."""
     shared = survey.sonar.receivers * max(1 - 1 / overlap, 0.0)
+    remedy = " clsas.density_compensated gives them half the weight." if shared >= 0.5 else ""
     return result(
         "overlap", overlap, "[31]",
         f"Half the array over the distance per ping: the next ping repeats {shared:.3g} of "
-        f"{survey.sonar.receivers} phase centres.",
+        f"{survey.sonar.receivers} phase centres.{remedy}",
         least=1.0, slack=SLACK,
         consequence="This is the same limit as that of the distance per ping",
     )  # fmt: skip

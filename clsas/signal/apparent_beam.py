@@ -51,8 +51,8 @@ def apparent_beam(
     sample: RaySample,
     straight: RangeLines,
     points_m: NDArray[np.float64],
-) -> tuple[ApparentBeam, float]:
-    """Return the beam for homogeneous water, and the relative error power that it leaves.
+) -> tuple[ApparentBeam, float, float]:
+    """Return the beam for homogeneous water, and the two relative error powers that it leaves.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def apparent_beam(
     weights, others = (beam.weights(each, at_antennas_m) for each in (wanted, ratio * given))
     inside = (weights > 0) & (others > 0)
     if not inside.any():
-        return found, 0.0
+        return found, 0.0, 0.0
     # Not relative to the weights of the sample: of few channels, all may lie near the edges.
     low, high = np.clip(beam.limits, -1, 1)
     sine = np.linspace(low, high, _SINES + 2)[1:-1]
@@ -105,7 +105,7 @@ def apparent_beam(
     smooth = float(np.mean((others - weights)[inside] ** 2) / usual2)
     errors = ratio * given[inside] - wanted[inside]
     steps = _step_error(beam, wanted[inside], errors, at_antennas_m) / float(usual2)
-    return found, smooth + steps
+    return found, smooth, steps
 
 
 def _step_error(

@@ -25,6 +25,11 @@ Window = str | float | tuple
 
 # Width, in bandwidths, of the edges that the band of the filter gets when the filter is truncated.
 _BAND_EDGE = 0.1
+# Power added to that of the pulse before the division by it, relative to the mean over the band.
+# Codes need it, whose spectra have zeros. For a chirp of 150 cycles, values from 1e-4 to 0.1 give
+# the same side lobes and noise to 0.1 dB.
+_LEAST_POWER = 0.01
+_PER_RIPPLE = 8  # frequencies per 1/T that measure the mean; arbitrary
 _BLOCK = 1 << 22  # complex128 samples of the channels that are compressed together
 # Model of the memory in use, fitted to measured peaks of 0.3 to 2 GiB, which it predicts to 30 %.
 _FFT_LINES = 3  # twiddle factors and work area of an FFT, in lines of the transform's length
@@ -39,9 +44,10 @@ def compress(
     oversampling: float = 2.0,
     bandwidth_hz: float | None = None,
     replica: Replica | None = None,
+    equalize: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RangeLines:
-    """Return the range lines of echoes, compressed by a matched filter.
+    """Return the range lines of echoes, compressed by a matched filter or an equalizing one.
 
     Parameters
     ----------
@@ -59,6 +65,12 @@ def compress(
         pulse. It is required without a pulse, and must lie within the sampled band of a replica.
     replica : Replica, optional
         Measured pulse, which the matched filter uses instead of the nominal one of `echoes`.
+    equalize : bool
+        If True, remove the ripples of the pulse's spectrum, so that only the window shapes the
+        band. With a matched filter, ripples of a chirp of the duration T cause side lobes up to
+        c T/4 and more from bright echoes: 41 dB below them with 150 cycles (bandwidth times T) and
+        a Hamming window. Equalized, they are 48 dB below, and the noise rises by 0.01 dB; without a
+        window, it rises by 0.3 dB, and the side lobes of the band's edges remain.
     progress : callable, optional
         Called as progress(channels done, channels).
 
@@ -88,7 +100,9 @@ def compress(
         h(t) = integral over the band of W(f) P*(f) exp(j 2 pi f t) df / integral of W |P|^2
 
     (Ødegaard 2004, equations [17] and [37]). P is the spectrum of the pulse or of the samples of
-    the replica, and flat without a pulse. The sharp ends of the band make h infinitely long. The
+    the replica, and flat without a pulse. If the band is equalized, W is the window divided by
+    |P|^2 + 0.01 mean |P|^2, where the second term, 20 dB below the mean over the band, keeps noise
+    low where the pulse is weak. The sharp ends of the band make h infinitely long. The
     part of h that is as long as the recording is left unchanged, and the rest fades smoothly within
     the padding. The result is therefore exactly the linear convolution, without wrap-around.
 
@@ -109,12 +123,14 @@ def compress(
     """
     validate.instance("echoes", echoes, Echoes)
     validate.progress(progress)
-    check_options(window=window, oversampling=oversampling)
+    check_options(window=window, oversampling=oversampling, equalize=equalize)
     if replica is not None:
         validate.instance("replica", replica, Replica)
     pulse, rate = replica or echoes.pulse, echoes.sample_rate_hz
     band = _band(echoes, bandwidth_hz, replica)
     weights = band_window(window, band)
+    if equalize and pulse is not None:
+        weights = _equalized(weights, pulse, band)
     duration = 0.0 if pulse is None else pulse.duration_s
     whole = echoes.length - 1 - duration * rate
     if whole < 0:
@@ -173,10 +189,13 @@ def compress(
     )
 
 
-def check_options(*, window: Window = "none", oversampling: float = 2.0) -> None:
+def check_options(
+    *, window: Window = "none", oversampling: float = 2.0, equalize: bool = False
+) -> None:
     """Raise TypeError or ValueError for options that `compress` refuses for all echoes."""
     band_window(window, 1.0)
     validate.oversampling(oversampling)
+    validate.flag("equalize", equalize)
 
 
 def band_window(
@@ -241,6 +260,24 @@ def _fraction(ratio: float) -> Fraction:
     if ratio > 1:
         return Fraction(ratio).limit_denominator(1000)
     return 1 / Fraction(1 / ratio).limit_denominator(1000)
+
+
+def _equalized(
+    weights: Callable[[NDArray], NDArray], pulse: Pulse | Replica, band: float
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Return weights over the band, divided by the power spectrum of the pulse."""
+
+    def power(frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.abs(pulse.spectrum(frequency)) ** 2
+
+    points = _PER_RIPPLE * math.ceil(band * pulse.duration_s + 1)
+    floor = _LEAST_POWER * float(power(band * ((np.arange(points) + 0.5) / points - 0.5)).mean())
+
+    def equalized(frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+        # Without any power the filter is 0, and refused.
+        return weights(frequency) / np.maximum(power(frequency) + floor, np.finfo(float).tiny)
+
+    return equalized
 
 
 def _filter_response(

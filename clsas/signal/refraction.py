@@ -191,7 +191,8 @@ def homogeneous(
     allowed = 0.0 if allowed_db is None else power(allowed_db)
     if mean_error <= SHARE * allowed:
         found = Homogeneous(grid, beam, mean_m_s, None, mean_error, straight)
-        return _with_beam(found, lines, sample)
+        found, of_steps = _with_beam(found, lines, sample)
+        return replace(found, error=found.error + of_steps)
     change = Change.of(lines, sample, allowed_db, sample.middle_m)
     best = Homogeneous(grid, beam, change.sound_speed_m_s, change, change.error(sample), straight)
     if best.error > SHARE * allowed and not _is_level(grid):
@@ -202,14 +203,14 @@ def homogeneous(
             best = replace(best, grid=moved, change=change, error=error)
     if corrected and best.error > _CORRECTED * allowed:
         best = _corrected(best, lines, grid, sample)
-    best = _with_beam(best, lines, sample)
+    best, of_steps = _with_beam(best, lines, sample)
     best = replace(best, error=best.error + power(change.accuracy_db))
     if allowed and best.error > allowed / 2:
         validate.warn(
             f"refraction leaves an error of up to {in_db(best.error):.0f} dB, and "
             f"{allowed_db:.3g} dB are requested"
         )
-    return best
+    return replace(best, error=best.error + of_steps)
 
 
 def _corrected(water: Homogeneous, lines: RangeLines, grid: Grid, sample: RaySample) -> Homogeneous:
@@ -233,14 +234,20 @@ def _is_level(grid: Grid) -> bool:
     return bool(high[2] - low[2] <= _LEVEL_M)
 
 
-def _with_beam(water: Homogeneous, lines: RangeLines, sample: RaySample) -> Homogeneous:
-    """Return homogeneous water with the apparent beam, and its error."""
+def _with_beam(
+    water: Homogeneous, lines: RangeLines, sample: RaySample
+) -> tuple[Homogeneous, float]:
+    """Return homogeneous water with the apparent beam and its error, and the error of steps.
+
+    Steps at the ends of a window lie elsewhere. The image is then as good as the intended one,
+    which is why this error, unlike all others, is no reason to warn.
+    """
     if water.beam is None:
-        return water
+        return water, 0.0
     if water.change is None:
         straight = at_speed(sample.lines, water.sound_speed_m_s)
     else:
         straight = water.change.antennas(sample.lines, sample.channels)
     points_m = sample_points_m(water.grid)
-    beam, error = apparent_beam(water.beam, lines, sample, straight, points_m)
-    return replace(water, beam=beam, error=water.error + error)
+    beam, error, of_steps = apparent_beam(water.beam, lines, sample, straight, points_m)
+    return replace(water, beam=beam, error=water.error + error), of_steps

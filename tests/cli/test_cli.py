@@ -200,6 +200,40 @@ def test_mending_options_are_called_by_their_names(made, tmp_path):
     assert not (tmp_path / "mended.h5").exists()
 
 
+def test_bands_are_equalized_by_option_and_by_scene(made, tmp_path):
+    folder, output = made[0], tmp_path / "lines.h5"
+    expected = clsas.compress(clsas.load(folder / "echoes.h5"), equalize=True)
+    run("compress", folder / "echoes.h5", "--equalize", "-o", output)
+    np.testing.assert_allclose(clsas.load(output).samples, expected.samples, rtol=1e-6)
+    scene = tmp_path / "equal.toml"
+    scene.write_text("[compress]\nequalize = true\n")
+    run("compress", folder / "echoes.h5", "--scene", scene, "-o", output)
+    np.testing.assert_allclose(clsas.load(output).samples, expected.samples, rtol=1e-6)
+
+
+def test_a_survey_that_is_equalized_is_assessed(made, tmp_path):
+    text, scene = (made[0] / "scene.toml").read_text(), tmp_path / "equal.toml"
+    assert "[compress]" in text
+    scene.write_text(text.replace("[compress]", "[compress]\nequalize = true"))
+    assert "needed" in run_json("assess", scene)
+
+
+def test_density_is_compensated_on_the_way(made, tmp_path):
+    """The last of 16 receivers repeats the phase centre of the first one, a ping before."""
+    lines = clsas.load(made[0] / "lines.h5")
+    weights = clsas.density_weights(lines).reshape(-1, 16)[1:-1]
+    assert weights[:, [0, -1]] == pytest.approx(weights[0, 1] / 2, rel=5e-3)
+    convert = "convert", made[0] / "lines.h5", tmp_path / "even.h5", "--compensate-density"
+    text, _ = run(*convert)
+    assert "the weights raise the noise by 0.13 dB" in text
+    even = clsas.load(tmp_path / "even.h5")
+    np.testing.assert_array_equal(even.samples, clsas.density_compensated(lines).samples)
+    assert run_json(*convert)["noise_penalty_db"] == pytest.approx(0.13, abs=0.005)
+    clsas.save(tmp_path / "one.h5", lines.select([0]))
+    _, stderr = run("convert", tmp_path / "one.h5", *convert[2:], code=1)
+    assert "Error: lines must come from receivers that move along a track" in stderr
+
+
 def test_a_plan_that_is_exact_is_as_accurate_as_asked_for(made, tmp_path):
     few = ("--x", "-0.02:0.02:3", "--y", "19.9:20.1:4", "--tolerance-db", -70)
     output = tmp_path / "image.h5"

@@ -86,6 +86,7 @@ def test_the_thesis_sensotek_case():
     found = clsas.limits(Sonar.sensotek(), track, range_m=(20, 270))
     assert found["overlap"].value == pytest.approx(1.33, abs=0.005)
     assert "repeats 24 of 96 phase centres" in found["overlap"].meaning
+    assert "clsas.density_compensated" in found["overlap"].meaning
     # The thesis neglects the pulse, which ends 5 ms later.
     assert found["last_echo_s"].value == pytest.approx(interval_s + 5e-3)
     assert found["unambiguous_range_m"].value == pytest.approx(270 - 5e-3 * 750)

@@ -68,6 +68,51 @@ def test_compressed_line_is_the_closed_form(name, oversampling, window):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("window", ["none", "hamming"])
+@pytest.mark.parametrize("name", PULSES)
+def test_equalized_line_is_the_closed_form(name, window):
+    """The band is that of the window, up to what keeps noise low where the pulse is weak."""
+    pulse, delay = PULSES[name], np.arange(-40, 40) / (2 * BAND)
+    echoes = echoes_of(pulse, [[0.1, 40.0, 0]], 0.7 - 0.4j, range_m=(38, 43))
+    lines = compress(echoes, window=window, oversampling=2.0, equalize=True)
+    rho = bistatic_range_m([0.1, 40.0, 0], echoes.tx_m, echoes.rx_m)[0]
+    delay = 2 / C * (ranges(lines)[0] - rho)
+    f = (np.arange(40000) + 0.5) / 40000 * BAND - BAND / 2
+    power = np.abs(pulse.spectrum(f)) ** 2
+    shape = power / (power + 0.01 * power.mean())
+    if window == "hamming":
+        shape *= 0.54 + 0.46 * np.cos(2 * np.pi * f / BAND)
+    expected = np.exp(2j * np.pi * np.multiply.outer(delay, f)) @ shape / shape.sum()
+    expected = (0.7 - 0.4j) * expected * np.exp(-2j * lines.wavenumber_rad_m * rho)
+    assert db(lines.samples[0] - expected) < -90
+
+
+@pytest.mark.parametrize("name", ["up", "down"])
+def test_equalized_chirps_have_no_distant_side_lobes(name):
+    """Ripples of the spectrum make paired echoes, up to half a pulse away from bright ones."""
+    pulse = PULSES[name]
+    echoes = echoes_of(pulse, [[0.1, 40.0, 0]], range_m=(38, 43))
+    lobes_db = []
+    for equalize in (False, True):
+        lines = compress(echoes, window="hamming", equalize=equalize)
+        distance_m = np.abs(ranges(lines)[0] - 40.0)
+        # Half a pulse is 0.375 m here.
+        some = (distance_m > 0.15) & (distance_m < 0.45)
+        lobes_db.append(db(lines.samples[0][some]))
+    assert lobes_db[0] > -45
+    assert lobes_db[1] < lobes_db[0] - 6
+
+
+def test_a_flat_band_is_not_equalized():
+    echoes = echoes_of(PULSES["up"], [[0.1, 40.0, 0]], range_m=(38, 43))
+    echoes = replace(echoes, pulse=None)
+    flat, same = (compress(echoes, bandwidth_hz=BAND, equalize=each) for each in (False, True))
+    np.testing.assert_array_equal(flat.samples, same.samples)
+    with pytest.raises(TypeError, match="equalize"):
+        compress(echoes, bandwidth_hz=BAND, equalize="yes")
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PULSES)
 def test_peak_is_at_the_range_with_amplitude_and_phase(name):
     """The peak between samples is found by band-limited interpolation of the line."""

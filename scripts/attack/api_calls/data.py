@@ -99,6 +99,8 @@ def data(folder: Path) -> dict[str, Call]:
             {"weights": np.linspace(0.5, 1, 40)},
             accepts={"weights": ("complex array",)},
         ),
+        "density_compensated": Call(clsas.density_compensated, {"lines": lines}),
+        "density_weights": Call(clsas.density_weights, {"lines": lines}),
         "Image": Call(
             clsas.Image,
             {"pixels": np.array(image.pixels), "grid": grid},

@@ -214,6 +214,7 @@ def sonars(folder: Path) -> dict[str, Call]:
                 "oversampling": 2.0,
                 "bandwidth_hz": 2e4,
                 "replica": clsas.Replica(np.exp(1j * np.linspace(0, 30, 41) ** 2 / 30), 4e4),
+                "equalize": True,
                 "progress": nothing,
             },
             accepts=dict.fromkeys(("bandwidth_hz", "replica", "progress"), optional),
