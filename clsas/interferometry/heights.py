@@ -43,7 +43,7 @@ from clsas.interferometry.request import Request
 from clsas.interferometry.result import Heights
 from clsas.interferometry.shadows import in_shadow
 from clsas.interferometry.side_lobes import from_elsewhere, point_response
-from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, Sweep, sweep
+from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, sweep
 from clsas.interferometry.task import Task
 from clsas.opencl.device import Device, open_device
 from clsas.signal.spectrum import measure_spectrum
