@@ -11,8 +11,9 @@ range in homogeneous water. `homogeneous` makes use of this:
   distance. At the middle of the grid this is a shift. The samples are interpolated once.
 - On a grid that is not level, pixels get *apparent positions*, a few millimetres to centimetres
   beside their own.
+- What is still missing is added to the ranges of groups of pixels, see
+  `clsas.signal.ray_corrections`. Relief of metres needs it, and so do arrays that are long or move.
 
-On level grids the remaining error is that of the bistatic geometry, usually far below -80 dB.
 Where straight rays of the mean speed are accurate enough, they are used, and samples stay as they
 are. Every error is computed from exact rays, at sample pixels and channels.
 """
