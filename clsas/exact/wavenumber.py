@@ -133,7 +133,7 @@ def wavenumber(
     if beam is not None and beam.normalise:
         raise ValueError("beam must not normalise here; use clsas.backproject for that")
     if lines.sound_speed is not None:
-        water = homogeneous(lines, grid, beam, None)
+        water = homogeneous(lines, grid, beam, None, corrected=False)
         if not water.grid.is_planar:
             raise ValueError("grid must be level for lines with a profile of the sound speed")
         lines, beam = water.lines(lines), water.beam

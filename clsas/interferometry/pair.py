@@ -74,6 +74,7 @@ class Pair:
             georeference=grid.georeference,
         )
         first, second = (
-            homogeneous(lines, level, self.beam, None).lines(lines) for lines in (self.a, self.b)
+            homogeneous(lines, level, self.beam, None, corrected=False).lines(lines)
+            for lines in (self.a, self.b)
         )
         return replace(self, a=first, b=second)

@@ -147,7 +147,7 @@ def assess(
     validate.instance("grid", grid, Grid)
     start, water = time.perf_counter(), None
     if lines.sound_speed is not None:
-        water = homogeneous(lines, grid, beam, None)
+        water = homogeneous(lines, grid, beam, None, corrected=False)
         lines, grid, beam = water.lines(lines), water.grid, water.beam
     refraction_s = time.perf_counter() - start
     survey = Survey(lines, grid, beam, sonar, track, pointing, element_pattern, ends, water)

@@ -161,7 +161,8 @@ def homogeneous(
         Allowed relative rms error of the image, dB. With None, or if straight rays are not within
         a small share of its power, there are apparent antennas.
     corrected : bool
-        Whether images will have the `corrections`.
+        Whether the image will have the `corrections`. The pixels of a level grid may then be given
+        as points.
 
     Raises
     ------

@@ -410,6 +410,17 @@ def test_a_plan_belongs_to_the_profile():
     assert clsas.relative_error_db(image, clsas.factorize(lines, grid, plan)) < -90
 
 
+def test_a_wavenumber_image_of_an_array_that_moves(recwarn):
+    """Its grid stays level, although other imagers would correct the ranges of points."""
+    tx = np.repeat(along_x(40, 0.12, z=-10), 4, axis=0)
+    rx = tx + np.tile(along_x(4, 0.06), (40, 1))
+    grid = Grid.plane((-1, 1, 32), (57, 61, 48), -22)
+    lines = lines_over(grid, tx, rx, carrier_hz=100e3, step_m=0.02, velocity=[1.8, 0, 0])
+    lines = replace(lines, sound_speed=SoundSpeed(*THERMOCLINE.values()))
+    assert homogeneous(lines, grid, None, None).corrections is not None
+    assert clsas.wavenumber(lines, grid).shape == grid.shape
+
+
 def test_a_wavenumber_image_has_the_same_water():
     lines, grid, ideal = made(QUICK)
     straight = clsas.backproject(replace(lines, sound_speed=None), grid)

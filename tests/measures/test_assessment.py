@@ -402,6 +402,18 @@ def test_refraction(gradient, tolerance_db):
     assert REFRACTION in found.describe()
 
 
+def test_a_level_grid_stays_level_where_ranges_are_corrected():
+    """Imagers take its pixels as points then, which must not look like relief."""
+    tx = np.repeat(along_x(15, 0.4, z=-10), 8, axis=0)
+    rx = tx + np.tile(along_x(8, 0.17) + [0.7, 0, 0], (15, 1))
+    grid = Grid.plane((-1, 1, 40), (57, 61, 40), -22)
+    lines = lines_over(grid, tx, rx, carrier_hz=100e3, step_m=0.02, velocity=[1.8, 0, 0])
+    profile = SoundSpeed([0, 14, 17, 60], [1505, 1505, 1495, 1495.5])
+    lines = replace(lines, sound_speed=profile)
+    assert homogeneous(lines, grid, None, None).corrections is not None
+    assert not assess(lines, grid)[RELIEF].modelled
+
+
 def test_lines_without_a_profile_have_no_refraction():
     effect = assess(lines_on(GRID, APERTURE), GRID)[REFRACTION]
     assert (effect.modelled, effect.error_db, effect.seconds) == (False, None, None)
