@@ -20,6 +20,7 @@ from clsas.signal.readout import Readout
 _NODES = 48  # distances from which the change of a range axis follows
 _DEGREE = 20  # of the polynomial through them
 _CHANGED_AT_ONCE = 1 << 16  # samples that are interpolated together; they fit into a cache
+_BEYOND = 0.1  # of the distances of sample pixels, by which those of others may extend farther
 _RESAMPLED_DB = -80.0  # largest error of the interpolation of samples
 _MARGIN_DB = 13.0  # by which interpolation is better than the image: its share is a twentieth
 
@@ -183,8 +184,8 @@ def _limits_m(sample: RaySample, level_m: float) -> tuple[float, float]:
     """Return the distances between which a level has all ranges of the visible pixels, metres.
 
     Pixels above the level are as far away as pixels of the level that are nearer, and pixels below
-    it as far away as farther ones. Distances do not go beyond the farthest pixel by more than rays
-    do.
+    it as far away as farther ones. Other pixels may be a little nearer or farther than those of
+    the sample. Where rays do not reach farther, the limit is the farthest pixel.
     """
     distance = sample.distances_m
     antenna_z = sample.lines.phase_centres_m[:, 2]
@@ -192,6 +193,7 @@ def _limits_m(sample: RaySample, level_m: float) -> tuple[float, float]:
     on_level = np.sqrt(np.maximum(square, 0.0))[sample.visible]
     distance = distance[sample.visible]
     near, far = min(on_level.min(), distance.min()), max(on_level.max(), distance.max())
+    near, far = near - min(_BEYOND * (far - near), near / 2), far + _BEYOND * (far - near)
     profile = sample.lines.sound_speed
     assert profile is not None
     for z in (antenna_z.min(), antenna_z.max()):

@@ -9,7 +9,7 @@ import clsas
 from clsas import BeamWindow, ClsasWarning, Grid, SoundSpeed
 from clsas.core.decibels import in_db
 from clsas.exact.groups import gather
-from clsas.signal.ray_delays import RaySample, delays_s
+from clsas.signal.ray_delays import RaySample, delays_s, sample_points_m
 from clsas.signal.refraction import homogeneous
 from clsas.sonar.simplify import REFRACTION
 
@@ -114,6 +114,16 @@ def test_points_in_any_order():
     points = np.random.default_rng(3).uniform([-2, 58, -26], [2, 63, -24], (300, 3))
     error, bound = error_db(over(), Grid.points(points))
     assert error < min(-45, bound + 1)
+
+
+def test_pixels_nearer_and_farther_than_those_of_the_sample():
+    """81 of 400 points are sampled; a twentieth of their extent beyond these, delays are right."""
+    points = np.column_stack([np.zeros(400), np.linspace(58, 63, 400), np.full(400, SEABED)])
+    points[[3, 7], 1] = 57.75, 63.25
+    points = points[np.random.default_rng(3).permutation(400)]
+    assert not {57.75, 63.25} & set(sample_points_m(Grid.points(points))[:, 1])
+    error, _ = error_db(over(), Grid.points(points))
+    assert error < -78
 
 
 def test_a_beam_limits_what_has_to_be_right():
