@@ -51,7 +51,7 @@ def apparent_grid(grid: Grid, lines: RangeLines, sample: RaySample, change: Chan
         some = slice(first, first + _MOVED_AT_ONCE)
         z_m = moved_m[some, 2]
         delay_s = np.sum([times.between(distance_m[some], z, z_m) for z in real_z_m], axis=0)
-        # There is no ray only to pixels that no channel sees.
+        # The sample shows that there are rays to all pixels that channels see.
         delay_s = np.where(np.isfinite(delay_s), delay_s, 0.0)
         channel, away_m = nearest[some], moved_m[some, :2] - sample.centre_m
         moved_m[some, :2] += bend * (z_m - change.level_m)[:, None] * away_m

@@ -22,7 +22,7 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.threads import in_threads
 from clsas.signal.apparent_antennas import Change
-from clsas.signal.ray_delays import FLIGHT_STEPS, RaySample, in_beam, sample_pixels, straight_m
+from clsas.signal.ray_delays import FLIGHT_STEPS, RaySample, in_beam, straight_m
 from clsas.signal.ray_times import RayTimes
 from clsas.sonar.beam import BeamWindow
 
@@ -138,12 +138,11 @@ class Corrections:
         It is that of a pixel as far from the one whose correction it has as groups are wide, for
         other channels than the nodes.
         """
-        pixels = sample_pixels(self.grid)
-        beside = _beside(self.grid, pixels)
+        beside = _beside(self.grid, sample.pixels)
         there = sample.at(self.grid.at(beside))
         antennas = self.change.antennas(there.lines, there.channels)
         range_m = straight_m(antennas, self.apparent.at(beside))
-        range_m += self.of(pixels, there.channels)
+        range_m += self.of(sample.pixels, there.channels)
         range_m += self.change.offsets_m(there.channels, range_m.T).T
         return there.error(antennas, range_m)
 

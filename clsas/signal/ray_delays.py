@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,8 @@ from clsas.sonar.visibility import sines
 
 POINTS = 9
 """Number of sample pixels along either side of a grid; points without rows have its square."""
+
+_PARTS = 8  # along either side of a grid, whose highest and lowest pixels are sampled as well
 
 FLIGHT_STEPS = 4
 """Iterations for a moving receiver. Each multiplies the error by v/c, which is below 0.05."""
@@ -114,7 +117,10 @@ class RaySample:
     lines : RangeLines
         Lines of the sample channels, with the profile.
     channels : int64 [channels]
+    pixels : int64 [points]
+        Indices of the pixels.
     points_m : float64 [points, 3]
+        Their positions.
     visible : bool
         False for pixels outside the beam or beyond the ends of a line.
     delay_s : float64
@@ -123,6 +129,7 @@ class RaySample:
 
     lines: RangeLines
     channels: NDArray[np.int64]
+    pixels: NDArray[np.int64]
     points_m: NDArray[np.float64]
     visible: NDArray[np.bool_]
     delay_s: NDArray[np.float64]
@@ -135,7 +142,8 @@ class RaySample:
         some = np.union1d(
             some_channels(lines.channels, _CHANNELS), [0, lines.channels - 1, *extreme]
         ).astype(np.int64)
-        part, points_m = lines.select(some), sample_points_m(grid)
+        part, pixels = lines.select(some), sample_pixels(grid)
+        points_m = grid.at(pixels)
         assert part.sound_speed is not None
         # Sound is faster or slower than the nominal speed, and pixels lie around the sample.
         range_m = straight_m(part, points_m)
@@ -145,7 +153,7 @@ class RaySample:
         visible &= range_m * ratio.min() - slack_m <= part.last_range_m
         if beam is not None:
             visible &= in_beam(part, points_m, beam, beam.directions(lines)[some], slack_m)
-        return cls(part, some, points_m, visible, np.zeros(visible.shape)).at(points_m)
+        return cls(part, some, pixels, points_m, visible, np.zeros(visible.shape)).at(points_m)
 
     def at(self, points_m: NDArray[np.float64]) -> RaySample:
         """Return the same pairs of channels and points, with the points elsewhere.
@@ -218,13 +226,28 @@ class RaySample:
 
 
 def sample_pixels(grid: Grid) -> NDArray[np.int64]:
-    """Return the indices of sample pixels all over a grid, [n]."""
-    return grid.spread_indices(POINTS if len(grid.shape) == 2 else POINTS**2)
+    """Return the indices of sample pixels, [n].
 
-
-def sample_points_m(grid: Grid) -> NDArray[np.float64]:
-    """Return sample pixels all over a grid, [n, 3], metres."""
-    return grid.at(sample_pixels(grid))
+    They are spread evenly, edges included. On a grid with relief, the highest and the lowest pixel
+    of each of 64 parts follow, so that no rock lies unseen between the others.
+    """
+    spread = grid.spread_indices(POINTS if len(grid.shape) == 2 else POINTS**2)
+    if grid.is_planar:
+        return spread
+    height_m = grid.height_m if grid.points_m is None else grid.points_m[..., 2]
+    assert height_m is not None
+    number = np.arange(grid.size).reshape(grid.shape)
+    sides = [min(n, _PARTS if len(grid.shape) == 2 else _PARTS**2) for n in grid.shape]
+    slices = [
+        [slice(i * n // side, (i + 1) * n // side) for i in range(side)]
+        for n, side in zip(grid.shape, sides, strict=True)
+    ]
+    extreme = [
+        number[part].flat[find(height_m[part])]
+        for part in itertools.product(*slices)
+        for find in (np.argmax, np.argmin)
+    ]
+    return np.union1d(spread, extreme)
 
 
 def straight_m(lines: RangeLines, points_m: NDArray[np.float64]) -> NDArray[np.float64]:

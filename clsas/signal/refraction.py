@@ -35,7 +35,7 @@ from clsas.signal.apparent_antennas import Change
 from clsas.signal.apparent_beam import apparent_beam
 from clsas.signal.apparent_pixels import apparent_grid
 from clsas.signal.ray_corrections import Corrections
-from clsas.signal.ray_delays import RaySample, at_speed, sample_points_m, straight_m
+from clsas.signal.ray_delays import RaySample, at_speed, straight_m
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import REFRACTION, SHARE
 
@@ -105,7 +105,7 @@ class Homogeneous:
         Straight rays of the mean speed and their errors; None without a profile.
     corrections : Corrections or None
         Ranges that apparent antennas lack, for groups of pixels; None where they are accurate
-        enough, and on level grids.
+        enough.
     """
 
     grid: Grid
@@ -200,7 +200,7 @@ def homogeneous(
     if best.error > SHARE * allowed and not _is_level(grid):
         change = Change.of(lines, sample, allowed_db, sample.middles_m(lines))
         moved = apparent_grid(grid, lines, sample, change)
-        error = change.error(sample, sample_points_m(moved))
+        error = change.error(sample, moved.at(sample.pixels))
         if error < best.error:
             best = replace(best, grid=moved, change=change, error=error)
     if corrected and best.error > _CORRECTED * allowed:
@@ -209,8 +209,9 @@ def homogeneous(
     best = replace(best, error=best.error + power(change.accuracy_db))
     if allowed and best.error > allowed / 2:
         validate.warn(
-            f"refraction leaves an error of up to {in_db(best.error):.0f} dB, and "
-            f"{allowed_db:.3g} dB are requested"
+            f"refraction alone causes an error of up to {in_db(best.error):.0f} dB in some pixels, "
+            f"which leaves little of the requested {allowed_db:.3g} dB, or nothing, to the rest: "
+            "request less, or use smaller pixels or a mosaic"
         )
     return replace(best, error=best.error + of_steps)
 
@@ -250,6 +251,6 @@ def _with_beam(
         straight = at_speed(sample.lines, water.sound_speed_m_s)
     else:
         straight = water.change.antennas(sample.lines, sample.channels)
-    points_m = sample_points_m(water.grid)
+    points_m = water.grid.at(sample.pixels)
     beam, error, of_steps = apparent_beam(water.beam, lines, sample, straight, points_m)
     return replace(water, beam=beam, error=water.error + error), of_steps
