@@ -29,6 +29,10 @@ _COINCIDENT = 0.1
 # Spacing, relative to the usual one, up to which the phase centres beside a gap stand for the whole
 # gap. Nothing else samples it, so that larger weights only raise the side lobes.
 _MOST_SPACING = 2.0
+# Advance, relative to the usual one, as which a gap counts at most where the usual spacing is
+# measured. Long gaps are up to 5 % of the steps, and thus up to 10 % of the length that counts.
+_MOST_ADVANCE = 2.0
+_MUCH_NOISE_DB = 3.0  # noise raised by weights that are worth a warning
 
 
 def density_compensated(lines: RangeLines) -> RangeLines:
@@ -95,6 +99,11 @@ def density_weights(lines: RangeLines) -> NDArray[np.float64]:
         If the platform stands still, as with a single ping or a full matrix capture; or if the
         track turns back, or its positions are so noisy that they have no order along it.
 
+    Warns
+    -----
+    ClsasWarning
+        If the weights of a bank raise the noise by more than 3 dB.
+
     See Also
     --------
     density_compensated : Lines with these weights.
@@ -107,7 +116,9 @@ def density_weights(lines: RangeLines) -> NDArray[np.float64]:
     coincide, within a tenth of the usual spacing, share their part equally. A gap counts as at most
     twice the usual spacing, so that phase centres beside a lost ping weigh 1.5 times as much as
     others, and not more. At the ends of the track the first and the last spacing continue. Half of
-    the track lies in spacings that are smaller than the usual one.
+    the track lies in spacings that are smaller than the usual one, where gaps count as at most
+    twice the usual advance from ping to ping, however long they are. At most 5 % of the steps may
+    be gaps of more than ten advances.
 
     With weights w of mean 1, equal weights would instead cause ghosts with the total power ::
 
@@ -140,10 +151,10 @@ def density_weights(lines: RangeLines) -> NDArray[np.float64]:
     """
     validate.instance("lines", lines, RangeLines)
     if lines.bank_numbers is None:
-        return _of_bank(lines)
+        return _of_bank(lines, "")
     weights = np.empty(lines.channels)
     for number in banks.present(lines.bank_numbers):
-        weights[lines.bank_numbers == number] = _of_bank(lines.bank(number))
+        weights[lines.bank_numbers == number] = _of_bank(lines.bank(number), f"bank {number}: ")
     return weights
 
 
@@ -152,20 +163,32 @@ def noise_penalty_db(weights: NDArray[np.float64]) -> float:
     return decibels.in_db(float(np.mean(weights**2) / np.mean(weights) ** 2))
 
 
-def _of_bank(lines: RangeLines) -> NDArray[np.float64]:
-    """Return the weights of one bank, [channels]."""
-    lengths_m = lengths(_along_m(lines))
-    return lengths_m / lengths_m.mean()
+def _of_bank(lines: RangeLines, prefix: str) -> NDArray[np.float64]:
+    """Return the weights of one bank, [channels]; `prefix` is that of messages."""
+    pings = Transmissions.of(lines)
+    try:
+        along_m = _along_m(lines, pings)
+    except ValueError as error:
+        raise ValueError(f"{prefix}{error}") from None
+    lengths_m = lengths(along_m, pings.usual_step_m)
+    weights: NDArray[np.float64] = lengths_m / lengths_m.mean()
+    penalty_db = noise_penalty_db(weights)
+    if penalty_db > _MUCH_NOISE_DB:
+        validate.warn(
+            f"{prefix}weights raise the noise by {penalty_db:.1f} dB, since phase centres crowd in "
+            "parts of the track. If the platform stood still there, use "
+            "lines.without_still_pings()"
+        )
+    return weights
 
 
-def _along_m(lines: RangeLines) -> NDArray[np.float64]:
+def _along_m(lines: RangeLines, pings: Transmissions) -> NDArray[np.float64]:
     """Return the distance of every phase centre along the track, [channels].
 
     The track is a chain of the positions of the pings, without those that stand still. Each phase
     centre lies ahead of its ping, or of the last one that advanced before it, by as much as it is
     displaced along the course there.
     """
-    pings = Transmissions.of(lines)
     numbers = np.flatnonzero(pings.advancing(STILL * pings.usual_step_m))
     moves_m = np.diff(pings.places_m[numbers], axis=0)
     receivers_m = means(lines.rx_m, pings.starts[:-1])[numbers]
@@ -182,13 +205,14 @@ def _along_m(lines: RangeLines) -> NDArray[np.float64]:
 
 def _check_moving(pings: Transmissions, receivers_m: NDArray[np.float64]) -> None:
     """Raise ValueError unless the receivers move from ping to ping, [pings, 3]."""
+    needed = "lines must come from receivers that move along a track"
+    if pings.count == 1:
+        raise ValueError(f"{needed}, got a single ping")
     moved_m = float(np.ptp(receivers_m, axis=0).max(initial=0.0))
     if len(receivers_m) < 2 or moved_m <= STILL * pings.usual_step_m:
-        many = f"{pings.count} ping{'s' * (pings.count != 1)}"
         raise ValueError(
-            "lines must come from receivers that move along a track: the receivers of "
-            f"{many} move by {reprs.quantity(moved_m, 'm')} in all. The phase centres of a "
-            "stationary array need no weights"
+            f"{needed}: the receivers of {pings.count} pings move by "
+            f"{reprs.quantity(moved_m, 'm')} in all. Receivers that stay in place need no weights"
         )
 
 
@@ -218,15 +242,16 @@ def _courses(moves_m: NDArray[np.float64], numbers: NDArray[np.int64]) -> NDArra
     return unit
 
 
-def lengths(along_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def lengths(along_m: NDArray[np.float64], advance_m: float) -> NDArray[np.float64]:
     """Return the length of track that each phase centre stands for, metres; `density_weights`.
 
-    `along_m` are the distances of the phase centres along the track, [channels], in any order.
+    `along_m` are the distances of the phase centres along the track, [channels], in any order, and
+    `advance_m` is the usual one from ping to ping.
     """
     order = np.argsort(along_m, kind="stable")
     sorted_m = along_m[order]
     gaps_m = np.diff(sorted_m)
-    usual_m = _usual(gaps_m)
+    usual_m = _usual(gaps_m, advance_m)
     group = _groups(sorted_m, _COINCIDENT * usual_m)
     members = np.bincount(group)
     means_m = np.bincount(group, sorted_m) / members
@@ -242,21 +267,26 @@ def lengths(along_m: NDArray[np.float64]) -> NDArray[np.float64]:
 def usual_spacing_m(lines: RangeLines) -> float:
     """Return the usual spacing of the phase centres along the direction of the track, metres.
 
-    It is 0 if all of them coincide.
+    Gaps in the track do not count, nor do coincident phase centres. It is 0 if all coincide.
     """
     centres_m = lines.phase_centres_m
     gaps_m = np.diff(np.sort(centres_m @ course(centres_m)))
-    return _usual(gaps_m) if gaps_m.any() else 0.0
+    return _usual(gaps_m, Transmissions.of(lines).usual_step_m)
 
 
-def _usual(gaps_m: NDArray[np.float64]) -> float:
-    """Return the median of ascending phase centres' gaps, weighted by length.
+def _usual(gaps_m: NDArray[np.float64], advance_m: float) -> float:
+    """Return the median of ascending phase centres' gaps, weighted by length; 0 without any.
 
     A place on the track lies as often in a larger gap as in a smaller one. Coincident phase centres
-    do not count, however many there are.
+    do not count, however many there are. Phase centres are no farther apart than pings, except
+    beside gaps in the track. These count as a few pings' advance, so that a few do not outweigh the
+    rest.
     """
+    if not gaps_m.any():
+        return 0.0
     ascending_m = np.sort(gaps_m)
-    covered_m = np.cumsum(ascending_m)
+    counted_m = np.minimum(ascending_m, _MOST_ADVANCE * advance_m) if advance_m else ascending_m
+    covered_m = np.cumsum(counted_m)
     return float(ascending_m[np.searchsorted(covered_m, covered_m[-1] / 2)])
 
 

@@ -7,7 +7,12 @@ import pytest
 from factorizing import EXACT_IS_SLOW
 
 import clsas
-from clsas.sonar.density import density_compensated, density_weights, noise_penalty_db
+from clsas.sonar.density import (
+    density_compensated,
+    density_weights,
+    noise_penalty_db,
+    usual_spacing_m,
+)
 from clsas.sonar.system import line_array
 
 CARRIER_HZ, SPEED_M_S = 100e3, 1500.0
@@ -168,6 +173,59 @@ def test_lost_pings(lost):
     assert noise_penalty_db(weights) < 0.03
 
 
+@pytest.mark.parametrize("gap_m", [1.5, 24.0, 25.5, 60.0, 5000.0])
+@pytest.mark.parametrize("scatter_m", [0.0, 1e-4], ids=["exact", "nearly"])
+@pytest.mark.parametrize(
+    ("receivers", "advance"),
+    [(1, 1), (4, 4), (4, 3), (RECEIVERS, 1)],
+    ids=["single", "array", "repeated", "crowded"],
+)
+def test_gaps_of_any_length(gap_m, scatter_m, receivers, advance):
+    """Two gaps, longer than the rest or not, also where phase centres coincide."""
+    advances = np.full(59, float(advance))
+    x_m = straight(advances, scatter_m)
+    whole = array_lines(x_m)
+    x_m[20:, 0] += gap_m
+    x_m[40:, 0] += gap_m
+    parted = array_lines(x_m)
+    some = np.flatnonzero(np.arange(whole.channels) % RECEIVERS < receivers)
+    whole, parted = whole.select(some), parted.select(some)
+    before, after = density_weights(whole), density_weights(parted)
+    # Pings that the gaps take apart neither share their places with others as before, nor end
+    # where they did.
+    ping = np.arange(60).repeat(receivers)
+    near = -(-receivers // advance)
+    apart = (np.abs(ping[:, None] - [19.5, 39.5]) > near + 1).all(axis=1)
+    ratio = after[apart] / before[apart]
+    np.testing.assert_allclose(ratio / ratio[0], 1, rtol=1e-6)
+    # Those beside a gap stand for as much as other pings' places, and half a spacing more.
+    beside = after[~apart] / after[apart].max()
+    assert beside.max() < 1.51
+    assert usual_spacing_m(parted) == pytest.approx(SPACING_M, rel=0.01)
+    assert usual_spacing_m(whole) == pytest.approx(SPACING_M, rel=0.01)
+
+
+def test_spacing_of_stretches_far_apart():
+    x_m = 0.3 * np.arange(50)
+    x_m = np.append(x_m, x_m + 14.7 + 40)
+    lines = lines_of(x_m[:, None] * [1, 0, 0], x_m[:, None] * [1, 0, 0])
+    assert usual_spacing_m(lines) == pytest.approx(0.3)
+    # Rows along the short side of a raster are farther apart than the pings along them.
+    across, along = np.meshgrid(0.01 * np.arange(5), 0.3 * np.arange(30))
+    raster_m = np.stack([along.ravel(), across.ravel(), np.zeros(150)], axis=1)
+    assert usual_spacing_m(lines_of(raster_m, raster_m)) == pytest.approx(0.3, rel=1e-3)
+    assert usual_spacing_m(lines_of(np.zeros((4, 3)), np.zeros((4, 3)))) == 0
+
+
+def test_much_noise_is_told():
+    """Most pings were taken standing still, and share one place."""
+    x_m = straight([RECEIVERS] * 100)
+    x_m = np.insert(x_m, [50] * 400, x_m[50] + [1e-5, 0, 0], axis=0)
+    with pytest.warns(clsas.ClsasWarning, match=r"raise the noise by 6\.9 dB.*still_pings"):
+        weights = density_weights(array_lines(x_m))
+    assert noise_penalty_db(weights) == pytest.approx(10 * np.log10(501 / 101), abs=0.05)
+
+
 @pytest.mark.parametrize("radius_m", [30.0, 100.0])
 def test_turning_tracks(radius_m):
     """A track that turns by more than a quarter, with an array along its tangent."""
@@ -219,6 +277,19 @@ def test_what_has_no_track_is_refused():
     for stationary in (array_lines(straight([])), array_lines(straight([0] * 5)), capture):
         with pytest.raises(ValueError, match="must come from receivers that move along a track"):
             density_weights(stationary)
+    with pytest.raises(ValueError, match=r"along a track, got a single ping$"):
+        density_weights(array_lines(straight([])))
+    with pytest.raises(ValueError, match=r"the receivers of 6 pings move by 0 m in all"):
+        density_weights(array_lines(straight([0] * 5)))
+    moving, still = array_lines(straight([RECEIVERS] * 4)), array_lines(straight([]))
+    numbers = [2] * moving.channels + [7] * still.channels
+    both = lines_of(
+        np.concatenate([moving.tx_m, still.tx_m]),
+        np.concatenate([moving.rx_m, still.rx_m]),
+        bank_numbers=numbers,
+    )
+    with pytest.raises(ValueError, match=r"^bank 7: lines must .* a single ping$"):
+        density_weights(both)
     there_m = straight([RECEIVERS] * 20)
     with pytest.raises(ValueError, match=r"around ping 2[0-9], 11 steps .*Sort pings by time"):
         density_weights(array_lines(np.concatenate([there_m, there_m[::-1] + [0, 0.5, 0]])))
