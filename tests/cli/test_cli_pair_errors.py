@@ -113,7 +113,7 @@ def test_mistakes_are_reported(files, tmp_path):
         ("--known-height-m", 1e300, "--known-height-m must be finite and >= -1e+09"),
         ("--known-height-m", 1e9, "--known-height-m must lie close enough to the heights"),
         ("--point", "0,32,1e300", "the farthest of --point must be finite and <= 1e+09"),
-        ("--point", "0,32,1e9", "must share places with the valid heights"),
+        ("--point", "0,32,1e9", "--point must lie close enough to the heights"),
     ],
 )
 def test_heights_beyond_all_reason_give_one_message(option, value, message, files, tmp_path):
