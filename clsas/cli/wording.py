@@ -154,9 +154,7 @@ def _without_paths(text: str, running: click.Context) -> tuple[str, dict[str, st
     names = {str(path) for path in typed if isinstance(path, Path)}
     unused = (chr(code) for code in _STAND_INS if chr(code) not in text)
     paths = {}
-    for name in sorted(
-        names, key=len, reverse=True
-    ):  # so that no path takes a part of a longer one
+    for name in sorted(names, key=len, reverse=True):  # a short one may be part of a longer one
         if re.search(r"\w", name) and re.search("[./]", name):
             character = next(unused)
             paths[character] = name
