@@ -17,6 +17,7 @@ from clsas.cli.wording import command
 from clsas.core import banks, validate
 from clsas.files.scene_files import SceneFile
 from clsas.interferometry.pair_errors_result import UNKNOWNS
+from clsas.mosaics.stored_heights import check_heights
 
 
 @command("pair-errors")
@@ -95,8 +96,14 @@ def pair_errors(
             "give one of --known-height-m, --point and --other, got "
             + (" and ".join(used) or "none")
         )
+    if other and other[0].is_dir():
+        raise click.UsageError(
+            "the first value of --other must be a file of range lines, got the folder "
+            f"{str(other[0])!r}"
+        )
     for store in (heights_file, *(other or ())[1:]):
         if store.is_dir():
+            check_heights(clsas.Store.opened(store))
             keep_out("--output", output, "the store", store)
     lines, numbers = load_banks(lines_file)
     first, second = (lines.bank(number) for number in numbers)

@@ -14,6 +14,8 @@ from clsas.cli.outputs import printable, report, step_bar
 from clsas.cli.parameters import INPUT, keep_apart
 from clsas.cli.wording import command
 from clsas.files.process_tables import STEPS
+from clsas.interferometry.pair_errors_result import in_words as error_in_words
+from clsas.navigation.calibration_result import in_words as correction_in_words
 from clsas.processing.record import StepRecord
 
 
@@ -88,8 +90,9 @@ def _in_words(step: StepRecord) -> str:
         count = len(numbers["findings"])
         return f"; {count} finding{'s' * (count != 1)}"
     if step.name in ("calibrate", "pair_errors"):
-        pairs = zip(numbers["unknowns"], numbers["values"], numbers["sd"], strict=True)
-        return "; " + ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, value, sd in pairs)
+        shown = correction_in_words if step.name == "calibrate" else error_in_words
+        found = zip(numbers["unknowns"], numbers["values"], numbers["sd"], strict=True)
+        return "; " + ", ".join(shown(name, value, sd) for name, value, sd in found)
     if step.name == "navigate":
         return (
             f"; {1e3 * numbers['sway_rms_m']:.3g} mm of sway rms, coherence "

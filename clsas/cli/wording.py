@@ -98,14 +98,16 @@ _PHRASES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"\bshape 'inverse'", "--beam-shape inverse"),
     (r", which was requested\b(?! by)", " (--device)"),
     (r"\bof kind '(\w+)'", r"with --as \1"),
-    (r"\bclsas\.(\w+)\b", lambda found: _OF_LIBRARY.get(found[1], found[0])),
+    (r"\bclsas\.(\w+)\b(?!\.\w)", lambda found: _OF_LIBRARY.get(found[1], found[0])),
     (
         rf"\b(hold|contain|got|has|or)( only)?(?: an?)? ({'|'.join(_KINDS)})\b",
         lambda found: f"{found[1]}{found[2] or ''} {_KINDS[found[3]]}",
     ),
 )
-# An argument's name is one, unless it follows a table of a scene file, a quote or a dot.
-_BEFORE, _AFTER = r"(?<![\w.\-'\"`\[])(?<!\] )", r"(?![\w.\-'\"`(\]])"
+# An argument's name is one, unless it follows a table of a scene file, a quote or a dot, or is part
+# of a path.
+_BEFORE, _AFTER = r"(?<![\w.\-'\"`\[/])(?<!\] )", r"(?![\w.\-'\"`(\]/])"
+_STAND_INS = range(0xE000, 0xF900)  # characters for private use, which stand for paths
 
 
 class Command(click.Command):
@@ -130,19 +132,45 @@ def in_options(text: str) -> str:
     """Return a message of the library in the words of the command that is running, if any.
 
     Names of arguments become options or, if a scene file gave the value, its tables. Names of
-    functions become commands. Messages about the contents of a file keep the file's words.
+    functions become commands. Messages about the contents of a file keep the file's words, and
+    paths that were typed remain as they are.
     """
     context = click.get_current_context(silent=True)
     running = context.meta.get(_RUNNING) if context is not None else None
     if running is None:
         return text
+    text, paths = _without_paths(text, running)
+    text = _translated(text, running, tuple(paths))
+    return "".join(paths.get(character, character) for character in text)
+
+
+def _without_paths(text: str, running: click.Context) -> tuple[str, dict[str, str]]:
+    """Return a text with a character for every path that was typed, and the paths by character.
+
+    Single words, such as the folder lines, are left as they are: they may be words of the message.
+    """
+    values = running.params.values()
+    typed = [each for value in values for each in (value if isinstance(value, tuple) else (value,))]
+    names = {str(path) for path in typed if isinstance(path, Path)}
+    unused = (chr(code) for code in _STAND_INS if chr(code) not in text)
+    paths = {}
+    for name in sorted(names, key=len, reverse=True):  # a short one may be part of a longer one
+        if re.search(r"\w", name) and re.search("[./]", name):
+            character = next(unused)
+            paths[character] = name
+            text = re.sub(rf"(?<![\w.\-]){re.escape(name)}(?![\w\-])", character, text)
+    return text, paths
+
+
+def _translated(text: str, running: click.Context, paths: tuple[str, ...]) -> str:
+    """Return a message with options for arguments, whose paths are single characters."""
     for pattern, words in _PHRASES:
         if isinstance(words, str):
             has_bank = any(param.name == "bank" for param in running.command.params)
             words = words.replace("{bank}", "--bank" if has_bank else "clsas convert --bank")
         text = re.sub(pattern, words, text)
-    files = tuple(f"{value}:" for value in running.params.values() if isinstance(value, Path))
-    if files and text.startswith(files):
+    words_as_paths = (str(path) for path in running.params.values() if isinstance(path, Path))
+    if text.startswith(tuple(f"{path}:" for path in (*paths, *words_as_paths))):
         return text
     options = _options(running)
     for name, option in options.items():

@@ -12,9 +12,16 @@ from pydantic import Field
 
 from clsas.core import validate
 from clsas.files.tables import Table, Vector, located
-from clsas.interferometry.checks import checked_coherence, checked_search
+from clsas.interferometry.checks import (
+    checked_coherence,
+    checked_known_sd,
+    checked_level,
+    checked_points,
+    checked_search,
+)
 from clsas.interferometry.pair_errors_result import UNKNOWNS as OF_PAIRS
 from clsas.navigation.autofocus import UNKNOWNS as FOCUSED
+from clsas.navigation.checks import checked_unknowns
 from clsas.navigation.known_points import UNKNOWNS as CALIBRATED
 from clsas.navigation.micronavigation import UNKNOWNS as NAVIGATED
 from clsas.planning.request import tolerance_in_db
@@ -109,13 +116,12 @@ class _PairErrors(Table):
                     "one of known_height_m and points_m must be given, got "
                     + (" and ".join(names) or "none")
                 )
-            _check(options, validate.number, known_height_m="m")
+            if self.known_height_m is not None:
+                checked_level(self.known_height_m)
             if self.points_m is not None:
-                options["points_m"] = validate.array(
-                    "points_m", self.points_m, np.float64, (None, 3)
-                )
+                options["points_m"] = checked_points(self.points_m)
             if self.known_sd_m is not None:
-                validate.number("known_sd_m", self.known_sd_m, "m", least=0.0)
+                checked_known_sd(self.known_sd_m)
             _check_unknowns(options, OF_PAIRS)
         return options
 
@@ -169,6 +175,9 @@ class ProcessTable(Table):
         for name in _OPTIONAL:
             if (table := getattr(self, name)) is not None:
                 options[name] = table.build(folder) if name == "heights" else table.build()
+        if self.steps is None and self.pair_errors is not None and self.heights is None:
+            with located("[process.pair_errors]"):
+                raise ValueError("needs [process.heights] with search_m")
         with located("[process]"):
             if self.steps is not None:
                 options["steps"] = checked_steps(self.steps, options)
@@ -204,4 +213,4 @@ def _check(options: dict[str, Any], check: Callable[..., float], **units: str) -
 
 def _check_unknowns(options: dict[str, Any], allowed: tuple[str, ...]) -> None:
     if "unknowns" in options:
-        options["unknowns"] = validate.named("unknowns", options["unknowns"], allowed)
+        options["unknowns"] = checked_unknowns(options["unknowns"], allowed)

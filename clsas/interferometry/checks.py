@@ -39,6 +39,25 @@ def checked_coherence(least_coherence: float) -> float:
     return validate.number("least_coherence", least_coherence, least=0.1, most=0.99)
 
 
+def checked_level(known_height_m: float) -> float:
+    """Return the height of a level seabed above the grid, metres."""
+    limit_m = validate.FARTHEST_M
+    return validate.number("known_height_m", known_height_m, "m", least=-limit_m, most=limit_m)
+
+
+def checked_points(points_m: ArrayLike) -> NDArray[np.float64]:
+    """Return control points on the seabed, metres, float64 [points, 3]."""
+    checked_m = validate.array("points_m", points_m, np.float64, (None, 3))
+    farthest_m = float(np.abs(checked_m).max())
+    validate.number("the farthest of points_m", farthest_m, "m", most=validate.FARTHEST_M)
+    return checked_m
+
+
+def checked_known_sd(known_sd_m: float) -> float:
+    """Return the standard deviation of known heights, metres."""
+    return validate.number("known_sd_m", known_sd_m, "m", least=0.0, most=validate.FARTHEST_M)
+
+
 def check_grid(grid: Grid) -> None:
     """Raise ValueError unless a grid is a plane or height map that heights along z can raise."""
     if grid.points_m is not None:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import validate
+from clsas.interferometry.checks import checked_level, checked_points
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.displaced import Displaced
 from clsas.interferometry.error_fit import Equations, Places
@@ -59,7 +60,7 @@ def at_pixels(surface: Displaced, known_height_m: ArrayLike, known_sd_m: float) 
 def _checked_heights(known_height_m: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
     """Return known heights as float64 [rows, columns]; NaN is allowed."""
     if isinstance(known_height_m, Real):
-        known_height_m = validate.number("known_height_m", known_height_m, "m")
+        known_height_m = checked_level(known_height_m)
     given = np.asanyarray(known_height_m)
     if np.ma.isMaskedArray(given) or given.dtype.kind not in "iuf":
         raise TypeError(
@@ -77,13 +78,17 @@ def _checked_heights(known_height_m: ArrayLike, shape: tuple[int, int]) -> NDArr
             "known_height_m must be finite, or NaN where it is not known; got "
             + ("infinite heights" if np.isinf(known_m).any() else "NaN everywhere")
         )
+    if float(np.nanmax(np.abs(known_m))) > validate.FARTHEST_M:
+        raise ValueError(
+            f"known_height_m must lie within {validate.FARTHEST_M:g} m of the grid, got heights "
+            f"from {np.nanmin(known_m):g} to {np.nanmax(known_m):g} m"
+        )
     return known_m
 
 
 def at_points(surface: Displaced, points_m: ArrayLike, known_sd_m: float) -> Comparison:
     """Compare heights with control points."""
-    checked_m = validate.array("points_m", points_m, np.float64, (None, 3))
-    return _against(surface, checked_m, known_sd_m, "one of points_m")
+    return _against(surface, checked_points(points_m), known_sd_m, "one of points_m")
 
 
 def _against(

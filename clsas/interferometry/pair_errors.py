@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from clsas.core import validate
 from clsas.core.lines import RangeLines
-from clsas.interferometry.checks import check_pair
+from clsas.interferometry.checks import check_pair, checked_known_sd
 from clsas.interferometry.comparisons import Comparison, at_pixels, at_points, in_overlap
 from clsas.interferometry.displaced import Displaced
 from clsas.interferometry.estimate import MOST_SD_RAD, Estimate, estimated
@@ -160,7 +160,7 @@ def pair_errors(
     unknowns = _checked_unknowns(unknowns)
     tolerance_db = checked_tolerance_db(tolerance_db)
     validate.instance("beam", beam, BeamWindow, type(None))
-    known_sd_m = validate.number("known_sd_m", known_sd_m, "m", least=0.0)
+    known_sd_m = checked_known_sd(known_sd_m)
     given = {"known_height_m": known_height_m, "points_m": points_m, "other": other}
     names = [name for name, value in given.items() if value is not None]
     if len(names) != 1:

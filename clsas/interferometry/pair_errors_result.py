@@ -17,6 +17,14 @@ from clsas.sonar.directions import track_directions
 UNKNOWNS = ("phase", "delay", "roll")
 """Errors that `pair_errors` can estimate."""
 
+_SHOWN = {"phase": (1.0, "rad"), "delay": (1e6, "µs"), "roll": (1e3, "mrad")}
+
+
+def in_words(name: str, value: float, sd: float) -> str:
+    """Return an error and its standard deviation, such as "delay 3.300 ± 0.020 µs"."""
+    factor, unit = _SHOWN[name]
+    return f"{name} {reprs.with_deviation(factor * value, factor * sd, unit)}"
+
 
 @dataclass(frozen=True, eq=False)
 class PairErrors:
@@ -108,12 +116,8 @@ class PairErrors:
                 )
 
     def _found(self) -> list[str]:
-        units = {"phase": (1.0, "rad"), "delay": (1e6, "µs"), "roll": (1e3, "mrad")}
-        found = []
-        for name, value, sd in zip(self.unknowns, self.values, self.sd, strict=True):
-            factor, unit = units[name]
-            shown = reprs.with_deviation(factor * float(value), factor * float(sd), unit)
-            found.append(f"{name} {shown}")
+        estimated = zip(self.unknowns, self.values.tolist(), self.sd.tolist(), strict=True)
+        found = [in_words(name, value, sd) for name, value, sd in estimated]
         found += [f"{name} held" for name in self.held]
         residual = reprs.quantity(float(f"{self.residual_m:.3g}"), "m")
         return [*found, f"residual {residual} rms at {self.samples:.0f} independent places"]

@@ -17,6 +17,11 @@ UNITS = {"time_offset": "s", "sound_speed": "m/s", "forward": "m", "port": "m", 
 """Units of the unknowns."""
 
 
+def in_words(name: str, value: float, sd: float) -> str:
+    """Return a value and its standard deviation, such as "time offset 10.0 ± 1.5 µs"."""
+    return f"{name.replace('_', ' ')} {reprs.with_deviation(value, sd, UNITS[name])}"
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """Result of a calibration with known points. Its values are the corrections that were added.
@@ -65,8 +70,7 @@ class Calibration:
         found = []
         for name, value, deviation in zip(self.unknowns, self.values, self.sd, strict=True):
             whole = self.sound_speed_m_s if name == "sound_speed" else float(value)
-            shown = reprs.with_deviation(whole, float(deviation), UNITS[name])
-            found.append(f"{name.replace('_', ' ')} {shown}")
+            found.append(in_words(name, whole, float(deviation)))
         found += [f"{name.replace('_', ' ')} held" for name in self.held]
         residual_m = float(np.sqrt(np.nanmean(self.residual_m**2)))
         found.append(f"residual {reprs.quantity(residual_m, 'm')} rms")

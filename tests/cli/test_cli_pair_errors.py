@@ -74,7 +74,8 @@ def test_heights_may_be_those_of_a_store(files, tmp_path):
     clsas.mosaic(pair[0], GRID, tmp_path / "image.zarr", tolerance_db=-20).image()
     images = run("pair-errors", given[0], tmp_path / "image.zarr", *given[2:], *known, code=1)
     assert "must be a mosaic of heights" in images.stderr
-    swapped = run("pair-errors", *given, "--other", store, store, code=1)
+    swapped = run("pair-errors", *given, "--other", store, files / "lines.h5", code=2)
+    assert "first value of --other must be a file of range lines, got the folder" in swapped.stderr
     assert "heights.zarr" in swapped.stderr
 
 
@@ -100,7 +101,26 @@ def test_mistakes_are_reported(files, tmp_path):
     assert "must have at least 2 receiver banks, got 1\n" in one.stderr
     no = run("pair-errors", given[0], given[0], *given[2:], "--known-height-m", 0, code=1)
     assert "must hold heights (clsas heights makes them), got range lines" in no.stderr
+    for folder in ((files, "--known-height-m", 0), (files / "heights.h5", *other[:2], files)):
+        no = run("pair-errors", given[0], *folder, "-o", files / "corrected.h5", code=1)
+        assert f"{files} exists and is not a mosaic of clsas" in no.stderr
     assert not (tmp_path / "corrected.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--known-height-m", 1e300, "--known-height-m must be finite and >= -1e+09"),
+        ("--known-height-m", 1e9, "--known-height-m must lie close enough to the heights"),
+        ("--point", "0,32,1e300", "the farthest of --point must be finite and <= 1e+09"),
+        ("--point", "0,32,1e9", "--point must lie close enough to the heights"),
+    ],
+)
+def test_heights_beyond_all_reason_give_one_message(option, value, message, files, tmp_path):
+    given = files / "lines.h5", files / "heights.h5", "-o", tmp_path / "corrected.h5"
+    refused = run("pair-errors", *given, option, value, "--unknown", "phase", code=1)
+    assert message in refused.stderr
+    assert "Warning" not in refused.stderr
 
 
 def test_another_track_may_be_given_before_the_output(files, tmp_path):

@@ -1,6 +1,7 @@
 """Messages of commands name options and files, not arguments and functions of Python."""
 
 import re
+import shutil
 import warnings
 from dataclasses import replace
 
@@ -133,6 +134,35 @@ def test_every_kind_of_name_is_translated():
         assert expected in said(text), text
     assert said("use lines.bank(2)", options=()) == "use clsas convert --bank 2"
     assert in_options("search_m must be") == "search_m must be"  # no command is running
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "tx_m/image.h5",
+        "clsas.heights.h5",
+        "my sound_speed/x and rx_m.h5",
+        "search_m.h5",
+        "a.b or Image",
+    ],
+)
+def test_paths_keep_their_words(name, folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    shutil.copy(folder / "image.h5", path)
+    for typed in (name, path):
+        arguments = "convert", str(typed), "new.h5", "--compensate-density"
+        result = CliRunner().invoke(cli.main, arguments, prog_name="clsas")
+        assert result.exit_code == 1
+        assert result.stderr.startswith(f"Error: {typed} must hold range lines"), result.stderr
+
+
+def test_paths_from_elsewhere_keep_their_words():
+    for text in ("/data/tx_m/one.h5", "/tx_m dir/b.h5", "new/rx_m", "clsas.heights.h5", "tx_m.h5"):
+        assert said(f"{text} must hold RangeLines") == f"{text} must hold range lines"
+    assert said("tx_m must be finite") == "transmitter positions must be finite"
+    assert said("\ue000 tx_m") == "\ue000 transmitter positions"
 
 
 def test_warnings_are_translated_too(folder, monkeypatch):

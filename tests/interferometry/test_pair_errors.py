@@ -372,6 +372,10 @@ class TestBadInput:
         self.refused("got known_height_m and points_m", points_m=[[0, 32, 0]])
         self.refused("got NaN everywhere", known_height_m=np.full(shape, np.nan))
         self.refused("known_height_m must be finite", known_height_m=np.inf)
+        self.refused("must be finite and >= -1e.09 and <= 1e.09 m", known_height_m=1e300)
+        self.refused(
+            "known_height_m must lie within 1e.09 m", known_height_m=np.full(shape, -1e300)
+        )
         self.refused(
             r"the shape of the heights, \(121, 81\), got \(3, 4\)", known_height_m=np.zeros((3, 4))
         )

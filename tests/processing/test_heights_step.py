@@ -12,10 +12,12 @@ from reliefs import flat_banks
 
 import clsas
 from clsas.cli import main
+from clsas.cli.processing import _in_words
 from clsas.core.validate import ClsasWarning
 from clsas.files.process_tables import checked_steps
 from clsas.files.scene_files import read_scene
 from clsas.mosaics.documents import read_document
+from clsas.processing.record import StepRecord
 from clsas.processing.steps import is_mosaic
 
 pytest.importorskip("matplotlib")
@@ -347,6 +349,22 @@ def test_errors_of_the_pair_are_corrected(scene, patches):
     }  # fmt: skip
     printed = CliRunner().invoke(main, ["process", str(scene)])
     assert printed.exit_code == 0, printed.output
+    assert re.search(r"unchanged: pair_errors\.h5; phase 0\.\d+ ± 0\.\d+ rad\n", printed.output)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sd", "expected"),
+    [
+        ("phase", -0.2207, 0.081, "phase -0.221 ± 0.081 rad"),
+        ("delay", -3.486e-7, 2.1e-8, "delay -0.349 ± 0.021 µs"),
+        ("delay", 3.486e-9, 2.1e-10, "delay 0.00349 ± 0.00021 µs"),
+        ("roll", 2e-3, 2e-4, "roll 2.00 ± 0.20 mrad"),
+    ],
+)
+def test_printed_errors_have_units(name, value, sd, expected):
+    numbers = {"unknowns": [name], "values": [value], "sd": [sd]}
+    step = StepRecord("pair_errors", "", numbers=numbers)
+    assert _in_words(step) == f"; {expected}"
 
 
 @pytest.mark.parametrize(
@@ -356,6 +374,9 @@ def test_errors_of_the_pair_are_corrected(scene, patches):
         ("known_height_m = 0.0\npoints_m = [[0, 32, 0]]", "got known_height_m and points_m"),
         ("known_height_m = 0.0\nknown_sd_m = -1", "known_sd_m must be"),
         ('known_height_m = 0.0\nunknowns = ["heave"]', "unknowns"),
+        ("known_height_m = 1e300", r"\[process.pair_errors\] known_height_m must be finite and"),
+        ("points_m = [[0, 32, 1e300]]", "the farthest of points_m must be finite and <= 1e"),
+        ("known_height_m = 0.0\nknown_sd_m = 1e300", "known_sd_m must be finite and"),
         ("points_m = [[0, 32]]", "points_m"),
         ("height = 0", "unknown key 'height'"),
     ],
@@ -388,3 +409,26 @@ def test_pair_errors_need_both_tables(scene):
     )
     with pytest.raises(ValueError, match=r"only with search_m in \[process.heights\]"):
         clsas.process(scene)
+    change(scene, 'steps = ["pair_errors"]\n', "")  # its table alone asks for the step
+    needed = r"scene.toml.*\[process.pair_errors\] needs \[process.heights\] with search_m"
+    with pytest.raises(ValueError, match=needed) as raised:
+        clsas.process(scene)
+    assert "steps" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("step", "required"),
+    [
+        ("calibrate", "points_m = [[0, 32, 0]]"),
+        ("navigate", ""),
+        ("focus", ""),
+        ("pair_errors", "known_height_m = 0"),
+    ],
+)
+@pytest.mark.parametrize("unknowns", ["", '"name", "name"'])
+def test_no_and_repeated_unknowns_are_refused(step, required, unknowns, scene):
+    first = {"calibrate": "time_offset", "pair_errors": "phase"}.get(step, "sway")
+    chosen = unknowns.replace("name", first)
+    scene.write_text(f"{SCENE}\n[process.{step}]\n{required}\nunknowns = [{chosen}]\n")
+    with pytest.raises(ValueError, match=rf"\[process.{step}\] unknowns must be one or several of"):
+        read_scene(scene)
