@@ -207,7 +207,7 @@ def _check_moving(pings: Transmissions, receivers_m: NDArray[np.float64]) -> Non
     """Raise ValueError unless the receivers move from ping to ping, [pings, 3]."""
     needed = "lines must come from receivers that move along a track"
     if pings.count == 1:
-        raise ValueError(f"{needed}, got a single ping")
+        raise ValueError(f"{needed}: there is a single ping")
     moved_m = float(np.ptp(receivers_m, axis=0).max(initial=0.0))
     if len(receivers_m) < 2 or moved_m <= STILL * pings.usual_step_m:
         raise ValueError(

@@ -231,7 +231,7 @@ def test_density_is_compensated_on_the_way(made, tmp_path):
     assert run_json(*convert)["noise_penalty_db"] == pytest.approx(0.13, abs=0.005)
     clsas.save(tmp_path / "one.h5", lines.select([0]))
     _, stderr = run("convert", tmp_path / "one.h5", *convert[2:], code=1)
-    assert "Error: lines must come from receivers that move along a track" in stderr
+    assert "Error: FILE must come from receivers that move along a track" in stderr
 
 
 def test_a_plan_that_is_exact_is_as_accurate_as_asked_for(made, tmp_path):
