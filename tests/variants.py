@@ -81,7 +81,7 @@ EVERY_VARIANT = {
     ),
     "test_beam.py::test_a_window_open_on_all_sides_changes_nothing": (),
     # Ranges of groups of pixels that are corrected along rays.
-    "test_refraction.py::test_corrections_on_every_device": EVERY_CASE,
+    "test_corrected_ranges.py::test_corrections_on_every_device": EVERY_CASE,
     # Stages and leaves, in single and in half precision, with filters of each length.
     "test_stages.py::test_the_error_is_what_was_asked_for": ("--20", "--60"),
     "test_stages.py::test_pixels_much_coarser_than_the_resolution": ("--40",),

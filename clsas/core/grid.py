@@ -431,15 +431,7 @@ class Grid:
         TypeError, ValueError
             If `most` is not a whole number of at least 1.
         """
-        return self.at(self.spread_indices(most))
-
-    def spread_indices(self, most: int) -> NDArray[np.int64]:
-        """Return the row-major indices of the sample points of `spread`, [n]."""
-        most = validate.count("most", most)
-        indices = [
-            np.unique(np.linspace(0, n - 1, min(most, n)).round().astype(int)) for n in self.shape
-        ]
-        return np.ravel_multi_index(np.ix_(*indices), self.shape).ravel()
+        return self.at(spread_indices(self, most))
 
     def window(self, rows: slice = _ALL, columns: slice = _ALL) -> Self:
         """Return the grid of some rows and columns. For points these are the first two axes.
@@ -482,6 +474,15 @@ class Grid:
         if columns != _ALL:
             raise ValueError(f"columns must be left out for points of shape {self.shape}")
         return (rows,)
+
+
+def spread_indices(grid: Grid, most: int) -> NDArray[np.int64]:
+    """Return the row-major indices of the sample points of `Grid.spread`, [n]."""
+    most = validate.count("most", most)
+    indices = [
+        np.unique(np.linspace(0, n - 1, min(most, n)).round().astype(int)) for n in grid.shape
+    ]
+    return np.ravel_multi_index(np.ix_(*indices), grid.shape).ravel()
 
 
 def _coordinate(name: str, value: float) -> float:

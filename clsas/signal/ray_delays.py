@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.geometry import pairwise_range_m
-from clsas.core.grid import Grid
+from clsas.core.grid import Grid, spread_indices
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.rays import rays, shadow
 from clsas.core.sound_speed import SoundSpeed
@@ -231,7 +231,7 @@ def sample_pixels(grid: Grid) -> NDArray[np.int64]:
     They are spread evenly, edges included. On a grid with relief, the highest and the lowest pixel
     of each of 64 parts follow, so that no rock lies unseen between the others.
     """
-    spread = grid.spread_indices(POINTS if len(grid.shape) == 2 else POINTS**2)
+    spread = spread_indices(grid, POINTS if len(grid.shape) == 2 else POINTS**2)
     if grid.is_planar:
         return spread
     height_m = grid.height_m if grid.points_m is None else grid.points_m[..., 2]

@@ -13,8 +13,6 @@ from factorizing import EXACT_IS_SLOW
 import clsas
 from clsas import Grid, RangeLines, SoundSpeed
 from clsas.core.decibels import in_db
-from clsas.signal.ray_delays import delays_s
-from clsas.signal.readout import Readout
 from clsas.signal.refraction import homogeneous
 from clsas.sonar.simplify import REFRACTION
 from clsas.trials import oracle
@@ -284,38 +282,6 @@ def test_arrays_that_move_see_along_exact_rays(speed_m_s):
     assert oracle.error_db(image.pixels.ravel()[pixels], ideal) < -50
 
 
-@cache
-def corrected_scene():
-    """Noise over steep relief below a thermocline, and the sum along exact rays."""
-    plane = Grid.plane((-0.5, 0.5, 40), (57.5, 60.5, 48), -22)
-    x, y = plane.axes_m
-    grid = plane.with_height(np.sin(0.6 * y)[:, None] + 0.3 * np.cos(2 * x))
-    lines = lines_over(grid, along_x(80, 0.1, z=-10), carrier_hz=100e3, step_m=0.02, occupied=0.6)
-    lines = replace(lines, sound_speed=SoundSpeed(*THERMOCLINE.values()))
-    channel, points = np.repeat(np.arange(80), grid.size), grid.positions_m().reshape(-1, 3)
-    ranges = delays_s(lines, channel, np.tile(points, (80, 1))).reshape(80, -1) * NOMINAL / 2
-    read = Readout.of(lines, -85).read(np.arange(80), ranges)
-    ideal = np.sum(read * np.exp(4j * np.pi * 100e3 / NOMINAL * ranges), axis=0)
-    return lines, grid, ideal.reshape(grid.shape)
-
-
-@pytest.mark.parametrize("method", ["exact", "factorized", "normalised"])
-def test_corrections_on_every_device(device, method):
-    lines, grid, ideal = corrected_scene()
-    assert homogeneous(lines, grid, None, -60).corrections is not None
-    if method == "exact":
-        image = clsas.backproject(lines, grid, accuracy_db=-60, device=device)
-        assert oracle.error_db(image.pixels, ideal) < -60
-        return
-    beam = clsas.BeamWindow(30, "hann", normalise=True) if method == "normalised" else None
-    given = {"beam": beam, "device": device}
-    plan = clsas.plan(lines, grid, tolerance_db=-50, costs=EXACT_IS_SLOW, **given)
-    assert not plan.is_exact
-    image = clsas.factorize(lines, grid, plan, device=device)
-    exact = clsas.backproject(lines, grid, accuracy_db=-60, **given)
-    assert clsas.relative_error_db(image, exact) < -50
-
-
 BEAMS = [
     clsas.BeamWindow(8, "hann", along=[1, 0, 0]),
     clsas.BeamWindow(8, "tukey", 1.0, along=[1, 0, 0]),
@@ -360,8 +326,8 @@ def test_steps_of_a_beam_that_lie_elsewhere_are_predicted(name, shape):
     speed = np.interp(case.sonar_m, case.depths_m, case.speeds_m_s)
     weights = beam.weights(speed * scene.slowness_s_m, speed / case.carrier_hz)
     ideal = oracle.image(scene.echoes, scene.pixels_m, weights)
-    exact = clsas.backproject(scene.lines, scene.grid, beam=beam, accuracy_db=-55)
-    water = homogeneous(scene.lines, scene.grid, beam, -55)
+    exact = clsas.backproject(scene.lines, scene.grid, beam=beam, accuracy_db=-50)
+    water = homogeneous(scene.lines, scene.grid, beam, -50)
     error_db, predicted_db = oracle.error_db(exact.pixels, ideal), 10 * np.log10(water.error)
     assert error_db < predicted_db < error_db + 10
 
