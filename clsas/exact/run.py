@@ -195,6 +195,7 @@ class _Run:
         self.phase_polynomials = phase_polynomials(p.device, p.phase_terms)
         self.beam = beam_table(p.device, p.beam, p.lines)
         self.corner = p.device.upload(np.zeros(2, np.int32))
+        self.at_nodes_m: dict[tuple[int, int], NDArray[np.float64]] = {}
         self.progress = progress
         self.done = 0
 
@@ -314,11 +315,14 @@ class _Run:
 
     def _correction_m(self, channels: slice, parts: slice) -> NDArray[np.float64] | None:
         """Return the corrections of ranges for some parts, [parts, channels], if there are any."""
-        water, layout = self.p.water, self.p.layout
-        if water is None or water.corrections is None:
+        corrections = None if self.p.water is None else self.p.water.corrections
+        if corrections is None:
             return None
+        layout, key = self.p.layout, (parts.start, parts.stop)
         assert isinstance(layout, Groups)
-        return water.corrections.of(layout.middle_pixels(parts), channels)
+        if key not in self.at_nodes_m:  # along exact rays, once for all blocks of channels
+            self.at_nodes_m[key] = corrections.at(layout.middle_pixels(parts))
+        return self.at_nodes_m[key] @ corrections.weights(corrections.antennas[channels]).T
 
     def _launch(self, job: _Job, pixels: dict[str, Any]) -> cl.Event:
         """Run the kernels of a job; `pixels` are the pixel and weight buffers of its band."""

@@ -30,8 +30,8 @@ _GROUP = 8  # rows and columns of the largest groups of pixels, which have 64
 _NODES = 32  # channels that see a pixel; twice as many if receivers differ
 _MOST_NODES = 512  # bounds memory
 _NEAREST = 12  # nodes from which others are interpolated
-_BESIDE = 4  # nodes beside the visible ones that are computed as well, to interpolate at the ends
-_SINGULAR = 1e-3  # relative extent across a row of nodes, squared, below which it does not count
+_BESIDE = 4  # further nodes on either side of the beam, so that its ends are interpolated too
+_SINGULAR = 1e-3  # squared ratio of width to length below which nodes count as a straight row
 _PAIRS_AT_ONCE = 1 << 16  # rays that a thread finds together; bounds memory
 
 
@@ -97,9 +97,16 @@ class Corrections:
         return cls(part, nodes, along, beam, change, antennas, *grids, times)
 
     def at(self, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the corrections of some pixels for all nodes, [pixels, nodes], metres of range.
+        """Return the corrections of the ranges of pixels at the nodes, metres.
 
-        Nodes that do not see a pixel have the correction of a node that does, or 0.
+        Parameters
+        ----------
+        pixels : int64 [pixels]
+
+        Returns
+        -------
+        float64 [pixels, nodes]
+            Nodes that do not see a pixel have the correction of a node that does, or 0.
         """
         found = np.empty((len(pixels), len(self.nodes)))
         at_once = max(_PAIRS_AT_ONCE // len(self.nodes), 1)
@@ -112,19 +119,24 @@ class Corrections:
             pass
         return found
 
-    def of(
-        self, pixels: NDArray[np.int64], channels: NDArray[np.int64] | slice
-    ) -> NDArray[np.float64]:
-        """Return the corrections of pixels for some channels, [pixels, channels], metres."""
-        return self.at(pixels) @ self.weights(self.antennas[channels]).T
-
     def usual(self, centres_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return antennas [n, 6] at phase centres [n, 3], with receivers as far away as usual."""
         apart_m = np.broadcast_to(self.antennas[:, 3:].mean(axis=0), centres_m.shape)
         return np.concatenate([centres_m, apart_m], axis=1)
 
     def weights(self, antennas: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the weights of nodes that interpolate to antennas [n, 6], [n, nodes]."""
+        """Return the weights with which corrections are interpolated between nodes.
+
+        Parameters
+        ----------
+        antennas : float64 [n, 6]
+            Like `antennas`, of any channels.
+
+        Returns
+        -------
+        float64 [n, nodes]
+            Corrections of pixels for these antennas are ``at(pixels) @ weights.T``.
+        """
         nodes = self.antennas[self.nodes]
         count = min(_NEAREST, len(nodes))
         nearest = cKDTree(nodes).query(antennas, k=count)[1].reshape(-1, count)
@@ -142,7 +154,7 @@ class Corrections:
         there = sample.at(self.grid.at(beside))
         antennas = self.change.antennas(there.lines, there.channels)
         range_m = straight_m(antennas, self.apparent.at(beside))
-        range_m += self.of(sample.pixels, there.channels)
+        range_m += self.at(sample.pixels) @ self.weights(self.antennas[there.channels]).T
         range_m += self.change.offsets_m(there.channels, range_m.T).T
         return there.error(antennas, range_m)
 
@@ -162,7 +174,10 @@ class Corrections:
         return _filled(range_m - straight, known)
 
     def _visible(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which nodes see points, or lie beside one that does, [points, nodes]."""
+        """Return, for each point and node, whether rays are computed, [points, nodes].
+
+        They are if the node sees the point, or lies beside a node that does.
+        """
         if self.beam is None or self.along is None:
             return np.ones((len(points_m), len(self.nodes)), np.bool_)
         visible = in_beam(self.lines, points_m, self.beam, self.along, 0.0)
