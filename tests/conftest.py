@@ -8,7 +8,8 @@ import warnings
 import hypothesis
 import numpy as np
 import pytest
-from variants import DEFAULT, EVERY_VARIANT, OTHERS, OWN, is_repeated, variant
+import tiers
+from variants import DEFAULT, EVERY_VARIANT, OTHERS, OWN, repeated_in, variant
 
 from clsas.opencl.device import Device, list_devices
 from clsas.planning import costs
@@ -100,8 +101,33 @@ def pytest_sessionstart(session):
         reporter.write_line(f"random order: repeat it with --randomly-seed={seed}")
 
 
+def pytest_addoption(parser):
+    """Let a run choose its tier."""
+    tiers.add_options(parser)
+
+
+def pytest_configure(config):
+    """Begin a run in the process that others report to."""
+    if not hasattr(config, "workerinput"):
+        tiers.begin(config)
+        config.pluginmanager.register(_Reporting(config))
+
+
+class _Reporting:
+    """Remembers the tests that passed, and says at the end which ran."""
+
+    def __init__(self, config):
+        self.config = config
+
+    def pytest_runtest_logreport(self, report):
+        tiers.keep(self.config, report)
+
+    def pytest_terminal_summary(self, terminalreporter):
+        terminalreporter.write_line(tiers.summary(self.config))
+
+
 def pytest_collection_modifyitems(config, items):
-    """Leave out cases that are not worth repeating on another device; repeated ones are slow."""
+    """Leave out other tiers, and cases that are not worth repeating on another device."""
     kept, left_out = [], []
     for item in items:
         name = _device_of(item)
@@ -110,13 +136,14 @@ def pytest_collection_modifyitems(config, items):
             raise pytest.UsageError(f"{test} takes `device`: say in tests/variants.py which cases")
         if name in (None, DEFAULT):
             kept.append(item)
-        elif is_repeated(test, item.name, name):
-            item.add_marker(pytest.mark.slow)
+        elif mark := repeated_in(test, item.name, name):
+            item.add_marker(mark)
             kept.append(item)
         else:
             left_out.append(item)
-    config.hook.pytest_deselected(items=left_out)
-    items[:] = kept
+    other_tiers = set(tiers.left_out(config, kept))
+    config.hook.pytest_deselected(items=[*left_out, *other_tiers])
+    items[:] = [item for item in kept if item not in other_tiers]
 
 
 def _device_of(item):

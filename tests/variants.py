@@ -116,8 +116,16 @@ SOME_ELSEWHERE = {
 """Tests of which some cases run on platforms other than the default one; of others all do."""
 
 
-def is_repeated(test, case, name):
-    """Whether a case of a test, both by name, runs on a device that is not the default one."""
-    if name in OTHERS:
-        return any(part in case for part in EVERY_VARIANT[test])
-    return any(part in case for part in SOME_ELSEWHERE.get(test, EVERY_CASE))
+EVERY_CHANGE = (
+    "test_device.py", "test_kernels.py", "test_phases.py", "test_unused_memory.py",
+    "test_upsampling.py", "test_stages.py::test_overlapping_pings_of_a_swaying_array",
+)  # fmt: skip
+"""Tests whose repetitions run for every change; those of others run with all tests only."""
+
+
+def repeated_in(test, case, name):
+    """Mark of a test's case, both by name, on a device that is not the default one, or None."""
+    cases = EVERY_VARIANT[test] if name in OTHERS else SOME_ELSEWHERE.get(test, EVERY_CASE)
+    if not any(part in case for part in cases):
+        return None
+    return "slow" if test.startswith(EVERY_CHANGE) else "exhaustive"

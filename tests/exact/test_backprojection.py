@@ -25,6 +25,7 @@ from cases import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tiers import name_of, thinned
 
 from clsas.core.grid import Grid
 from clsas.core.image import Image
@@ -54,9 +55,13 @@ def test_rounding_stays_below_80_db(case, device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("taps", "upsampling"), [(2, 5.0), (4, 4.0), (8, 2.0)])
-@pytest.mark.parametrize("case", [thesis, height_map], ids=lambda case: case.__name__)
-def test_rounding_does_not_depend_on_the_interpolator(case, device, taps, upsampling):
+@pytest.mark.parametrize(
+    ("interpolator", "case"),
+    thinned([(2, 5.0), (4, 4.0), (8, 2.0)], [thesis, height_map]),
+    ids=name_of,
+)
+def test_rounding_does_not_depend_on_the_interpolator(case, device, interpolator):
+    taps, upsampling = interpolator
     assert rounding_error_db(case, device, taps=taps, upsampling=upsampling) <= -80
 
 
@@ -74,8 +79,9 @@ SCATTER_DB = 0.6
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("accuracy_db", [-30, -50, -60, -80])
-@pytest.mark.parametrize("case", [thesis, own_starts], ids=lambda case: case.__name__)
+@pytest.mark.parametrize(
+    ("accuracy_db", "case"), thinned([-30, -50, -60, -80], [thesis, own_starts]), ids=name_of
+)
 def test_the_true_error_is_what_was_asked_for(case, platform, accuracy_db):
     image = backproject(*made(case), device=platform, accuracy_db=accuracy_db)
     assert true_error_db(case, image) <= accuracy_db + SCATTER_DB
@@ -138,8 +144,10 @@ def test_any_number_of_channels(device, channels):
     assert relative_error_db(execute(preparation), wanted) <= -80
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (3, 5), (17, 33), (65, 2)])
-@pytest.mark.parametrize("kind", ["plane", "heights", "points"])
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    thinned([(1, 1), (1, 40), (3, 5), (17, 33), (65, 2)], ["plane", "heights", "points"]),
+)
 def test_any_shape_of_grid(device, shape, kind):
     grid = patch(1.3, 42, shape[1], shape[0])
     if kind == "heights":

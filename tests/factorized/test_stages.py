@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from factorizing import (
     swaying_while_moving,
     with_gap,
 )
+from tiers import also, name_of, thinned
 
 from clsas import plan
 from clsas.core.decibels import in_db
@@ -167,10 +169,6 @@ TRACKS = (
 CASES = (*STRAIGHT, *TRACKS, arc, circle, one_sided_band, *OFF_A_PLANE)
 
 
-def name_of(value):
-    return getattr(value, "__name__", None)
-
-
 def check(case, tolerance_db, device, beam=None):
     """Check that the error is within the tolerance and at most 6 dB below its predicted bound."""
     chosen = planned(case, tolerance_db, beam)
@@ -191,8 +189,11 @@ def test_the_error_is_what_was_asked_for(device, tolerance_db):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance_db", [-10, -50, -65])
-@pytest.mark.parametrize("case", CASES, ids=name_of)
+@pytest.mark.parametrize(
+    ("case", "tolerance_db"),
+    thinned(CASES, [-50, -10, -65], whole=(near, swaying, hills)),
+    ids=name_of,
+)
 def test_whatever_the_track_and_the_grid(case, tolerance_db):
     check(case, tolerance_db, None)
 
@@ -211,8 +212,7 @@ def test_on_every_platform(case, platform):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance_db", [-30, -50])
-@pytest.mark.parametrize("band", [0.05, 0.3])
+@pytest.mark.parametrize(("band", "tolerance_db"), thinned([0.05, 0.3], [-30, -50]))
 def test_a_point_where_subimages_of_all_sizes_meet(band, tolerance_db):
     """Phases turn fastest at the corners of subimages, where errors of filters are largest."""
     grid = around(0, 40, shape=(512, 512))
@@ -269,20 +269,24 @@ def test_arrays_whose_channels_come_in_regular_steps(tolerance_db):
     assert relative_error_db(factorize(lines, grid, chosen), exact(few_arrays)) <= tolerance_db
 
 
-KINKED = BeamWindow(8, "tukey", squint_deg=2.0, taper=0.2)
+KINKED = (
+    BeamWindow(8, "tukey", squint_deg=2.0, taper=0.2),
+    *(BeamWindow(12, shape) for shape in ("tukey", "hamming", "taylor")),
+)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance_db", [-20, -50, -65])
-@pytest.mark.parametrize("beam", BEAMS, ids=["hann", "wide", "squint"])
+@pytest.mark.parametrize(("beam", "tolerance_db"), thinned(BEAMS, [-20, -50, -65]))
 def test_with_a_beam(beam, tolerance_db):
     check(near, tolerance_db, None, beam)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance_db", [-20, -50, -65])
 @pytest.mark.parametrize(
-    "beam", [KINKED, BeamWindow(12, "tukey"), BeamWindow(12, "hamming"), BeamWindow(12, "taylor")]
+    ("beam", "tolerance_db"),
+    thinned(
+        [KINKED, *(BeamWindow(12, of) for of in ("tukey", "hamming", "taylor"))], [-20, -50, -65]
+    ),
 )
 def test_windows_with_kinks_and_steps_keep_the_tolerance(beam, tolerance_db):
     """The image may be exact: virtual channels and blocks of pixels follow such windows poorly."""
@@ -304,7 +308,11 @@ def jittery_and_few(off_m):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("costs", [EXACT_IS_SLOW, None], ids=["forced", "as they are"])
+@pytest.mark.parametrize(
+    "costs",
+    [EXACT_IS_SLOW, pytest.param(None, marks=pytest.mark.exhaustive)],
+    ids=["forced", "as they are"],
+)
 @pytest.mark.parametrize(
     ("case", "beam", "tolerance_db"),
     [
@@ -334,7 +342,7 @@ def test_edges_of_a_beam_with_few_channels(case, beam, tolerance_db, costs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance_db", [-25, -40])
+@pytest.mark.parametrize("tolerance_db", [-25, *also(-40)])
 def test_a_track_that_turns_back_within_a_few_channels(tolerance_db):
     """Channels at the turn are farther from the mean track than all others."""
     there, back = along_x(227, 0.1011), along_x(228, 0.1006)[::-1] + [0, -2.41, 0]
@@ -354,8 +362,9 @@ NORMALISED = dataclasses.replace(HANN, normalise=True)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance_db", [-30, -50])
-@pytest.mark.parametrize("case", [near, arc, bistatic_array, hills], ids=name_of)
+@pytest.mark.parametrize(
+    ("case", "tolerance_db"), thinned([near, arc, bistatic_array, hills], [-30, -50]), ids=name_of
+)
 def test_a_normalised_image(case, tolerance_db):
     check(case, tolerance_db, None, NORMALISED)
 
@@ -367,8 +376,9 @@ def test_a_normalised_image_on_every_platform(case, platform):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance_db", [-25, -55])
-@pytest.mark.parametrize("case", [hills, scattered, section], ids=name_of)
+@pytest.mark.parametrize(
+    ("case", "tolerance_db"), thinned([hills, scattered, section], [-25, -55]), ids=name_of
+)
 def test_off_a_plane_with_a_beam(case, tolerance_db):
     check(case, tolerance_db, None, HANN)
 
@@ -396,7 +406,7 @@ def off_track():
     ],
     ids=["below the track", "a strip below it", "off the track", "apart"],
 )
-@pytest.mark.parametrize("tolerance_db", [-30, -50])
+@pytest.mark.parametrize("tolerance_db", [-50, *also(-30)])
 def test_spikes_keep_the_tolerance(wild, tolerance_db):
     """The prediction includes a box whose relief exceeds its distance, or that of all others."""
     lines, grid = wild()
@@ -522,8 +532,7 @@ def test_a_line_of_pixels_needs_no_second_step(platform):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("spacing_m", [0.005, 0.2])
-@pytest.mark.parametrize("channels", [1, 2, 3, 5, 17])
+@pytest.mark.parametrize(("channels", "spacing_m"), thinned([1, 2, 3, 5, 17], [0.005, 0.2]))
 def test_any_number_of_channels(channels, spacing_m):
     grid = around(0, 40, shape=(70, 60))
     lines, _ = over(grid, along_x(channels, spacing_m))
@@ -597,8 +606,7 @@ def test_half_precision_adds_what_is_predicted(device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance_db", [-50, -56])
-@pytest.mark.parametrize("length_m", [1.0, 0.3])
+@pytest.mark.parametrize(("length_m", "tolerance_db"), thinned([0.3, 1.0], [-50, -56]))
 def test_dense_channels_keep_the_tolerance(length_m, tolerance_db):
     """Virtual channels are sums of hundreds of channels, which half precision rounds many times."""
     grid = around(0, 40, shape=(64, 64))
@@ -838,10 +846,9 @@ def test_steps_of_a_beam_beside_a_gap_keep_the_tolerance(x, beam, tolerance_db):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance_db", [-20, -40])
-@pytest.mark.parametrize("gap_m", [2, 3, 4])
 @pytest.mark.parametrize(
-    "beam", [BeamWindow(39, "hamming"), BeamWindow(20, "hann")], ids=["hamming", "hann"]
+    ("gap_m", "beam", "tolerance_db"),
+    thinned([2, 3, 4], [BeamWindow(39, "hamming"), BeamWindow(20, "hann")], [-20, -40]),
 )
 def test_pixels_opposite_the_ends_of_a_gap_keep_the_tolerance(beam, gap_m, tolerance_db):
     """Channels near the gap have small weights; the track's average does not describe them."""
@@ -878,11 +885,16 @@ def test_an_edge_of_the_beam_that_crosses_the_image(shape, squint_deg, tolerance
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [1.0, 0.7])
-@pytest.mark.parametrize("relief_m", [None, 0.0, 0.2])
-@pytest.mark.parametrize("beam", [None, BeamWindow(20, "hann"), BeamWindow(3, "hann")])
-@pytest.mark.parametrize("tolerance_db", [-20, -50])
-def test_device_memory_is_as_planned(monkeypatch, beam, tolerance_db, relief_m, share):
+@pytest.mark.parametrize(
+    ("kind", "share", "tolerance_db"),
+    thinned(
+        itertools.product([None, BeamWindow(20, "hann"), BeamWindow(3, "hann")], [None, 0.0, 0.2]),
+        [1.0, 0.7],
+        [-50, -20],
+    ),
+)
+def test_device_memory_is_as_planned(monkeypatch, kind, tolerance_db, share):
+    beam, relief_m = kind
     lines, grid = over(around(0, 25, shape=(600, 1400)), along_x(700, 0.02))
     if relief_m is not None:
         row, column = np.indices(grid.shape)
@@ -913,7 +925,7 @@ def test_little_memory_makes_small_roots_or_is_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("width_deg", [3, 8, 30])
+@pytest.mark.parametrize("width_deg", [3, *also(8), 30])
 def test_given_stages_with_a_beam(width_deg):
     """Leaves contain many tiles, which are visible from different channels."""
     lines, grid = over(around(0, 20, shape=(128, 256)), along_x(400, 0.015))
@@ -971,9 +983,11 @@ def wide_circle():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance_db", [-30, -50])
-@pytest.mark.parametrize("squint_deg", [0.0, 2.0])
-@pytest.mark.parametrize("case", [swinging, circle, wide_circle], ids=name_of)
+@pytest.mark.parametrize(
+    ("case", "squint_deg", "tolerance_db"),
+    thinned([swinging, circle, wide_circle], [0.0, 2.0], [-50, -30]),
+    ids=name_of,
+)
 def test_a_beam_that_swings_as_fast_as_it_passes_by(case, squint_deg, tolerance_db):
     """Weights of all channels are interpolated, from wherever the beam covers a pixel."""
     lines, grid = made(case)

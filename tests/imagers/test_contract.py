@@ -9,6 +9,7 @@ import pytest
 from cases import APERTURE, CARRIER, beside, noise
 from contract import IMAGERS, Scene, near, scene
 from factorizing import bistatic_array
+from tiers import also
 from variants import DEFAULT, OWN, variant
 
 import clsas
@@ -30,21 +31,29 @@ def pairs(cases=None, needs=None, but=()):
             continue
         ways = OWN if "device" in imager.options else {"host": None}
         for name, way in ways.items():
-            quick = imager.is_quick and name in (DEFAULT, "host")
+            often = name in (DEFAULT, "host")
             of = f"{imager.name}-{name}"
             if cases is None:
-                found.append(_param((imager, way), name=of, quick=quick))
+                found.append(_param((imager, way), name=of, often=often, quick=imager.is_quick))
             else:
                 # The first case is the smallest.
                 found += [
-                    _param((imager, way), case, name=f"{of}-{case.__name__}", quick=quick and not n)
+                    _param(
+                        (imager, way),
+                        case,
+                        name=f"{of}-{case.__name__}",
+                        often=often,
+                        quick=imager.is_quick and not n,
+                    )
                     for n, case in enumerate(cases(imager))
                 ]
     return found
 
 
-def _param(*values, name, quick):
-    return pytest.param(*values, id=name, marks=() if quick else pytest.mark.slow)
+def _param(*values, name, often, quick):
+    """Return a parameter with the mark of its tier; other platforms than the default are rare."""
+    mark = pytest.mark.exhaustive if not often else () if quick else pytest.mark.slow
+    return pytest.param(*values, id=name, marks=mark)
 
 
 every_imager = pytest.mark.parametrize("bound", pairs())
@@ -238,7 +247,7 @@ def test_the_order_of_channels_does_not_matter(bound):
 
 @pytest.mark.filterwarnings("ignore:lines are kept in single precision, not in half")
 @every_imager
-@pytest.mark.parametrize("scale", [1e-36, 1e-30, 1e-10, 1e10, 1e20, 1e30])
+@pytest.mark.parametrize("scale", [1e-36, *also(1e-30, 1e-10, 1e10, 1e20), 1e30])
 def test_the_unit_of_the_samples_does_not_matter(bound, scale):
     """Amplitudes whose squares leave the range of float32."""
     given = scene(bound[0].known)

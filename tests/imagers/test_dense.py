@@ -8,6 +8,7 @@ import pytest
 from cases import lines_over
 from dense import TRACKS, headings, scene, to_and_fro, turning
 from factorizing import EXACT_IS_SLOW, changed, peak_device_bytes
+from tiers import also, thinned
 
 from clsas.core.grid import Grid
 from clsas.core.image import Image
@@ -50,8 +51,10 @@ def assert_keeps(chosen, error_db):
     assert -5 <= error_db - chosen.predicted_error_db <= 1
 
 
-@pytest.mark.parametrize("tolerance_db", [-25, -40, -60])
-@pytest.mark.parametrize("name", TRACKS)
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "tolerance_db"), thinned(TRACKS, [-25, -40, -60], whole=("helix", "passes"))
+)
 def test_an_image_keeps_its_tolerance(name, tolerance_db):
     chosen = planned(name, tolerance_db)
     assert not chosen.is_exact
@@ -71,8 +74,7 @@ def test_errors_on_a_sheet_are_predicted_within_3_db(tolerance_db):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["jittered helix", "planar", "passes"])
+@pytest.mark.parametrize(("kind", "name"), thinned(KINDS, ["jittered helix", "planar", "passes"]))
 def test_so_it_does_off_the_plane_and_with_separate_or_moving_receivers(name, kind):
     chosen = planned(name, -40, kind)
     if not chosen.is_exact:
@@ -95,8 +97,7 @@ def on_carrier(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance_db", [-50, -60])
-@pytest.mark.parametrize("name", ["rings", "helix"])
+@pytest.mark.parametrize(("name", "tolerance_db"), thinned(["rings", "helix"], [-50, -60]))
 def test_rings_and_helices_keep_their_tolerance_on_their_carrier(name, tolerance_db):
     lines, grid = on_carrier(name)
     chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=EXACT_IS_SLOW)
@@ -107,7 +108,7 @@ def test_rings_and_helices_keep_their_tolerance_on_their_carrier(name, tolerance
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["helix", "passes"])
+@pytest.mark.parametrize("name", ["helix", *also("passes")])
 def test_the_oracle_agrees(name):
     """Random pixels against sums in float64 that share nothing with the imagers."""
     lines, grid = scene(name)
@@ -142,10 +143,12 @@ def exactly(lines, grid, beam):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "window"), CASES)
-@pytest.mark.parametrize("name", [name for name in TRACKS if name != "spiral"])
-def test_every_aperture_with_every_beam(name, kind, window):
+@pytest.mark.parametrize(
+    ("case", "name"), thinned(CASES, [name for name in TRACKS if name != "spiral"])
+)
+def test_every_aperture_with_every_beam(case, name):
     """On a plane and off it, with separate and with moving receivers."""
+    kind, window = case
     lines, grid = scene(name, kind, SIDE)
     beam = with_headings(name, WINDOWS[window])
     chosen = plan(lines, grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
@@ -156,7 +159,7 @@ def test_every_aperture_with_every_beam(name, kind, window):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("window", ["all", "hann", "squinted"])
+@pytest.mark.parametrize("window", ["squinted", *also("all", "hann")])
 def test_images_of_a_helix_pay_with_a_beam(window):
     """Costs are those of a CPU: an image of some size is factorized because that is faster."""
     lines, grid = scene("helix", side=224)
@@ -216,7 +219,7 @@ def test_turns_of_a_helix_that_lie_above_each_other_are_held_in_half_precision()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["helix", "planar", "passes"])
+@pytest.mark.parametrize("name", ["passes", *also("helix", "planar")])
 def test_channels_may_be_shuffled(name):
     lines, grid = scene(name)
     order = np.random.default_rng(5).permutation(lines.channels)
@@ -293,10 +296,11 @@ def test_samples_that_no_pixel_needs_are_not_upsampled():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("width", "permute"), [(1, False), (4, False), (8, True)])
-@pytest.mark.parametrize("name", ["helix", "passes"])
-def test_devices_of_any_width_agree(name, width, permute):
-    device = driven(open_device(), width, permute)
+@pytest.mark.parametrize(
+    ("way", "name"), thinned([(1, False), (4, False), (8, True)], ["helix", "passes"])
+)
+def test_devices_of_any_width_agree(way, name):
+    device = driven(open_device(), *way)
     chosen = planned(name, -60, device=device)
     assert chosen.factorization.aperture.shape == SHAPES.get(name, "sheet")
     image = factorize(*scene(name), chosen, device=device)

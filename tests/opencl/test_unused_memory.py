@@ -7,6 +7,7 @@ import pyopencl as cl
 import pytest
 from dense import scene
 from factorizing import EXACT_IS_SLOW, changed
+from tiers import thinned
 
 from clsas.opencl.device import Device
 from clsas.planning.factorize import factorize
@@ -50,9 +51,9 @@ def poison(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("imager", "asked_db"), REQUESTS)
-@pytest.mark.parametrize("name", SCENES)
-def test_what_unused_memory_holds_does_not_matter(name, imager, asked_db, device, poison):
+@pytest.mark.parametrize(("name", "request_"), thinned(SCENES, REQUESTS))
+def test_what_unused_memory_holds_does_not_matter(name, request_, device, poison):
+    imager, asked_db = request_
     known = made(name)
     wanted = selftest.form(imager, known, asked_db, device).pixels
     filled = poison()
