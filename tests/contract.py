@@ -9,6 +9,7 @@ from functools import cache
 
 from cases import along_x, bistatic, moving, oriented, points
 from factorizing import EXACT_IS_SLOW, bistatic_array, changed, swaying
+from scenes import kept
 
 from clsas import backproject, factorize, mosaic, plan, wavenumber
 from clsas.core.grid import Grid
@@ -21,7 +22,7 @@ from clsas.trials.extremes import Known
 FINE = {"taps": 8, "upsampling": 4}  # an interpolator whose own error is below -100 dB
 
 
-@cache
+@kept
 def narrow() -> Known:
     """A straight track and a beam without edges, which every imager can form."""
     return extremes.scene(
@@ -30,7 +31,7 @@ def narrow() -> Known:
     )  # fmt: skip
 
 
-@cache
+@kept
 def near() -> Known:
     """`narrow` at a shorter range: its wavenumber image takes a third of the time."""
     return extremes.scene(

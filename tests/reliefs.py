@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+from scenes import kept
 from scipy.spatial.transform import Rotation
 
 from clsas.core.grid import Grid
@@ -35,6 +36,7 @@ def track(
     return tx_m, tx_m + turned.apply(lower_m), tx_m + turned.apply(upper_m)
 
 
+@kept
 def banks(relief, *, snr_db, seed=1, extent_m=None, density_m2=2500.0, **of_track):
     """Range lines of both banks over speckle on a relief(x, y), with white noise.
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from reliefs import ALTITUDE_M, BAND_HZ, CARRIER_HZ, SOUND_M_S
+from scenes import kept
 
 from clsas.core.grid import Grid
 from clsas.simulation.scenes import Observer, PointTargets, Seabed
@@ -17,6 +18,7 @@ _BEYOND_M = 0.8  # seabed beyond the grid on either side
 _SNR_DB = 15.0  # of the samples
 
 
+@kept
 def banks(
     relief, seed, *, phase_rad=0.0, delay_s=0.0, roll_rad=0.0, track_y_m=0.0, heading=1, pings=126
 ):

@@ -10,6 +10,7 @@ import clsas
 MODULES = sorted(clsas._MODULES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_run(name):
     module = importlib.import_module(f"clsas.{name}")

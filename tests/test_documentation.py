@@ -23,8 +23,13 @@ FIGURES = [path for path in (DOCS / "figures").glob("*.py") if path.stem != "dra
 PROGRAMS = sorted([*(DOCS / "tutorials").glob("*.md"), *FIGURES])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "program",
+    [
+        pytest.param(path, id=path.stem, marks=pytest.mark.watches(str(path.relative_to(ROOT))))
+        for path in PROGRAMS
+    ],
+)
 def test_tutorials_and_figures_run(program):
     for package in {"mosaic": ["zarr"], "map": ["zarr", "rasterio"]}.get(program.stem, []):
         pytest.importorskip(package)

@@ -74,7 +74,7 @@ def wheel(tmp_path_factory):
     return folder / "installed"
 
 
-@pytest.mark.slow
+@pytest.mark.watches("pyproject.toml", "clsas/__init__.py")
 def test_kernels_scenes_and_types_travel_in_the_wheel(wheel):
     assert {path.name for path in (wheel / "clsas" / "cl").iterdir()} == {
         path.name for path in (ROOT / "cl").iterdir()
@@ -85,7 +85,7 @@ def test_kernels_scenes_and_types_travel_in_the_wheel(wheel):
     assert not (wheel / "tests").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.watches("pyproject.toml", "clsas/__init__.py")
 def test_the_wheel_images_on_its_own(wheel, tmp_path):
     program = """
 import sys, clsas
@@ -106,7 +106,7 @@ print(abs(image.pixels[0]))
     assert float(peak) == pytest.approx(1, abs=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.watches("pyproject.toml", "clsas/__init__.py")
 def test_a_bare_installation_forms_images(wheel, tmp_path):
     """Only a driver is added to it."""
     (archive,) = wheel.parent.glob("clsas-*.whl")

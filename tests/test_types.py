@@ -21,7 +21,7 @@ from clsas.sonar.track import Track
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.mark.slow
+@pytest.mark.watches("README.md", "docs/tour.md", "clsas/__init__.py")
 def test_the_readme_and_the_tour_pass_mypy(tmp_path, monkeypatch):
     api = pytest.importorskip("mypy.api")
     text = "".join(path.read_text() for path in (ROOT / "README.md", ROOT / "docs" / "tour.md"))

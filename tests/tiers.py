@@ -118,13 +118,13 @@ def _record(nodeid):
 
 @cache
 def _digest(file):
-    found = hashlib.sha256(_package_digest())
+    found = hashlib.sha256(package_digest())
     found.update((ROOT / file).read_bytes())
     return found.hexdigest()[:16]
 
 
 @cache
-def _package_digest():
+def package_digest():
     """Return a digest of the package, its kernels, and the modules that tests share."""
     paths = [ROOT / "pyproject.toml", *(ROOT / "tests").glob("*.py"), *(ROOT / "cl").iterdir()]
     paths += (ROOT / "clsas").rglob("*.py")
@@ -156,6 +156,17 @@ def thinned(*axes, whole=()):
 def name_of(value):
     """Return the name of a function, by which pytest calls a parameter, or None."""
     return getattr(value, "__name__", None)
+
+
+def few(values, often):
+    """Return parameters, of which only those in `often` run for every change."""
+    return [
+        pytest.param(
+            *(value if isinstance(value, tuple) else (value,)),
+            marks=[] if value in often else EXHAUSTIVE,
+        )
+        for value in values
+    ]
 
 
 def also(*values):

@@ -701,6 +701,7 @@ def test_errors_are_one_message_and_leave_nothing(made, monkeypatch, args, code,
     assert set(folder.iterdir()) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("args", "kept"),
     [
@@ -843,7 +844,7 @@ def test_demo_in_json(tmp_path, monkeypatch):
     assert max(point["azimuth"]["pslr_db"]) < -20
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_demo_writes_over_no_other_files(tmp_path, monkeypatch):
     small = built_in_scene("thesis_wide_beam").replace(b"count = 1024", b"count = 64")
     monkeypatch.setattr(demo, "built_in_scene", lambda name: small)
@@ -936,7 +937,7 @@ def test_progress_is_shown_on_a_terminal(made, tmp_path):
     assert (tmp_path / "l.h5").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.watches("docs/tour.md", "scripts/pages")
 def test_tour(tmp_path, monkeypatch):
     """Every command of the documentation's tour does what it says, in its order."""
     monkeypatch.chdir(tmp_path)

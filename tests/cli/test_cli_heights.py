@@ -27,6 +27,7 @@ def run(*args, code=0):
     return result
 
 
+@pytest.mark.slow
 def test_command_saves_what_the_library_finds(files, tmp_path):
     output = tmp_path / "heights.h5"
     given = (*files, *GRID, "--search-m", "-0.5:0.5", "--window-m", 0.2, "-o", output)
@@ -44,6 +45,7 @@ def test_command_saves_what_the_library_finds(files, tmp_path):
     assert "height of ambiguity 2.0" in text
 
 
+@pytest.mark.exhaustive
 def test_the_search_may_start_from_a_relief(files, tmp_path):
     output, relief = tmp_path / "heights.h5", tmp_path / "relief.npy"
     heights_m = np.full((51, 51), 0.3) + np.linspace(0, 0.1, 51)
@@ -74,6 +76,7 @@ def test_the_search_may_start_from_a_relief(files, tmp_path):
     assert "the grid of the scene has heights" in twice.stderr
 
 
+@pytest.mark.slow
 def test_a_store_is_measured_drawn_and_exported(files, tmp_path):
     pytest.importorskip("zarr")
     rasterio = pytest.importorskip("rasterio")
@@ -132,6 +135,7 @@ def test_mistakes_are_reported(files, tmp_path):
     assert not (tmp_path / "heights.h5").exists()
 
 
+@pytest.mark.slow
 def test_one_file_may_hold_both_banks(tmp_path):
     low, high = flat_banks()
     both = replace(
@@ -175,6 +179,7 @@ def test_one_file_may_hold_both_banks(tmp_path):
     assert np.array_equal(clsas.load(output).height_m, found.height_m, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_heights_and_interferograms_are_drawn(files, tmp_path):
     grid = clsas.Grid.plane((-0.5, 0.5, 51), (31.5, 32.5, 51))
     images = [clsas.backproject(lines, grid) for lines in flat_banks()]

@@ -72,6 +72,7 @@ def labels(figure):
     return axes.get_xlabel(), axes.get_ylabel()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kind", "axes", "bar"),
     [

@@ -86,6 +86,7 @@ def test_rays_through_layers_agree_with_an_ode_solver(angle_deg):
     assert found.slowness_s_m == pytest.approx(slowness, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [150.0, 250.0, 400.0])
 def test_a_ray_that_turns_above_arrives_where_an_ode_solver_says(distance):
     depths, speeds = np.array([0.0, 8, 40]), np.array([1510.0, 1504, 1490])

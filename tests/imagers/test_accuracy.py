@@ -1,8 +1,7 @@
 """Every imager compared with an independent oracle, at the extremes."""
 
-from functools import cache
-
 import pytest
+from scenes import kept
 from tiers import thinned
 
 from clsas import wavenumber as form_wavenumber
@@ -135,7 +134,7 @@ AT_EVERY_TOLERANCE = (
 """Cases that form images at every tolerance for every change; others do so at one of them."""
 
 
-@cache
+@kept
 def made(name):
     return CASES[name]()
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from cases import noise
 from click.testing import CliRunner
+from tiers import also
 
 import clsas
 from clsas.cli import main
@@ -446,7 +447,7 @@ def in_khz(lines, middle_hz, share=1.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("middle_hz", [0.0, 2.0, -40.0, 100.0, 300.0, -1000.0])
+@pytest.mark.parametrize("middle_hz", [-40.0, *also(0.0, 2.0, 100.0, 300.0, -1000.0)])
 def test_a_carrier_in_khz_is_found_wherever_the_band_is(lines, middle_hz):
     """The middle of a band about 0 Hz is chance, and so would be the wavelength there."""
     found = clsas.inspect(in_khz(lines, middle_hz))
@@ -527,7 +528,7 @@ CROSSINGS = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sides", CROSSINGS)
+@pytest.mark.parametrize("sides", [CROSSINGS[0], *also(*CROSSINGS[1:])])
 def test_crossing_arcs_of_points_do_not_turn_the_sign(five_points, sides):
     """The energy of arcs adds up at empty positions, where neither sign is in focus."""
     grid = clsas.Grid.plane(*sides)

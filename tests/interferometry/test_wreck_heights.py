@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from scenes import kept
 from scipy.ndimage import maximum_filter, minimum_filter
 
 import clsas
@@ -54,9 +55,9 @@ def truth(seabed, altitude_m, window_m):
     return Truth(height_m, lit, alone)
 
 
-@pytest.fixture(scope="module")
-def banks():
-    """Range lines of both banks, of the pings that see the middle of the wreck."""
+@kept
+def simulated_banks():
+    """Return range lines of both banks, of the pings that see the middle of the wreck."""
     scene = wreck.scene("wreck_two_banks")
     sonar, track = scene.need("sonar", "track")
     fields = ("positions_m", "time_s", "velocity_m_s", "yaw_rad", "pitch_rad", "roll_rad")
@@ -66,6 +67,11 @@ def banks():
     # The first receiver repeats the phase centre of the sixth. Counted twice, it would make ghosts
     # every 0.9 m along the track, 10 dB below the deck in all.
     return [clsas.density_compensated(lines.bank(number)) for number in (0, 1)]
+
+
+@pytest.fixture(scope="module")
+def banks():
+    return simulated_banks()
 
 
 def measured(banks):
@@ -106,7 +112,7 @@ def shares(found, chosen):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("low_m", "high_m"), [(4.3, 4.5), (1.9, 2.3), (-0.15, 0.15)], ids=["wheelhouse", "deck", "sand"]
 )
@@ -122,7 +128,7 @@ def test_level_parts(found, low_m, high_m):
     assert abs(part.median_m) < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_all_that_is_lit(found):
     """Bulwark, walls and edges too: at most a twentieth of the valid pixels is wrong."""
     _, true = found
@@ -134,7 +140,7 @@ def test_all_that_is_lit(found):
     assert shares(found, true.lit & (true.height_m < 0.15)).within_3_sd > 0.97
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_cannot_be_measured(found):
     result, true = found
     layover, mast = true.lit & ~true.alone, true.height_m > 5.5
@@ -146,7 +152,7 @@ def test_what_cannot_be_measured(found):
     assert result.mask[~true.lit].mean() < 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_echoes_from_elsewhere_are_masked_and_few_others(found, banks, monkeypatch):
     """Of the lit pixels that are right, at most a hundredth is lost."""
     result, true = found

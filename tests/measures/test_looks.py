@@ -127,6 +127,7 @@ def test_sub_bands_have_low_side_lobes():
         assert np.abs(range_m[level.argmax()] - 40) < 0.02
 
 
+@pytest.mark.slow
 def test_looks_of_a_survey_are_independent():
     """The speckle of N sub-bands, and of N parts of the beam, varies by 1/sqrt(N)."""
     beam, squares = clsas.BeamWindow(8.0), []

@@ -56,7 +56,7 @@ def borders(shape, patch_shape, width):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_patches_make_the_heights_of_a_single_measurement(tmp_path):
     def dunes(x, y):
         return 0.15 * np.sin(2 * np.pi * (y - 32) / 3) + 0.05 * x
@@ -84,6 +84,7 @@ def test_patches_make_the_heights_of_a_single_measurement(tmp_path):
     assert rms_m < 1.3 * predicted_m
 
 
+@pytest.mark.slow
 def test_a_store_has_what_heights_have(tmp_path):
     place = clsas.Georeference.local(60.39, 5.32, heading_deg=90)
     first, second = (replace(lines, georeference=place) for lines in flat_banks())
@@ -132,6 +133,7 @@ def halves_of(first, second):
     return [both.select(some) for some in np.split(order, 2)]
 
 
+@pytest.mark.exhaustive
 def test_files_and_folders_are_read_in_slices(tmp_path):
     first, second = flat_banks()
     (tmp_path / "both").mkdir()
@@ -156,6 +158,7 @@ def test_files_and_folders_are_read_in_slices(tmp_path):
         assert np.array_equal(found.image.pixels, expected.image.pixels)
 
 
+@pytest.mark.slow
 def test_patches_are_measured_again_if_files_were_added(tmp_path):
     early, late = halves_of(*flat_banks())
     (tmp_path / "lines").mkdir()
@@ -175,6 +178,7 @@ def test_patches_are_measured_again_if_files_were_added(tmp_path):
     assert files_of(store.path) == files
 
 
+@pytest.mark.slow
 def test_folders_of_both_banks_may_grow(tmp_path):
     names = "first", "second"
     halves = halves_of(*flat_banks())
@@ -207,6 +211,7 @@ def test_folders_of_both_banks_may_grow(tmp_path):
         measure("a.zarr")
 
 
+@pytest.mark.slow
 def test_beams_of_folders_do_not_change_as_they_grow(tmp_path):
     (tmp_path / "lines").mkdir()
     clsas.save(tmp_path / "lines" / "a.h5", halves_of(*flat_banks())[0])
@@ -222,6 +227,7 @@ def test_beams_of_folders_do_not_change_as_they_grow(tmp_path):
         )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_one_warning_names_all_patches_that_miss_the_seabed(tmp_path):
     request = REQUEST | {"search_m": (0.8, 2.0)}
 
@@ -241,6 +247,7 @@ def test_one_warning_names_all_patches_that_miss_the_seabed(tmp_path):
     assert measure() == text  # of patches that were measured before
 
 
+@pytest.mark.slow
 def test_the_search_may_start_from_a_relief(tmp_path):
     low = clsas.Grid.plane((-0.6, 0.6, 61), (31.2, 32.8, 81), z=-0.4)
     start = low.with_height(0.4 + np.linspace(-0.05, 0.05, 81)[:, None] + np.zeros(61))
@@ -254,6 +261,7 @@ def test_the_search_may_start_from_a_relief(tmp_path):
     assert store.grid.height_m is not None
 
 
+@pytest.mark.slow
 def test_the_default_window_is_kept(tmp_path):
     request = {name: REQUEST[name] for name in ("search_m", "patch_m")}
     store = clsas.mosaic_heights(*flat_banks(), GRID, tmp_path / "a.zarr", **request)
@@ -266,6 +274,7 @@ def test_the_default_window_is_kept(tmp_path):
         clsas.mosaic_heights(*flat_banks(), GRID, store.path, **request, window_m=0.2)
 
 
+@pytest.mark.slow
 def test_a_given_window_is_not_decided_on_again(tmp_path, monkeypatch):
     """Another device, or more lines, may lead to another margin."""
     store = clsas.mosaic_heights(*flat_banks(), GRID, tmp_path / "a.zarr", **REQUEST)
@@ -316,6 +325,7 @@ def test_a_killed_run_continues_bit_for_bit(tmp_path):
     assert not store.array_damage()
 
 
+@pytest.mark.slow
 def test_damaged_layers_are_found_and_measured_again(tmp_path):
     store = clsas.mosaic_heights(*flat_banks(), GRID, tmp_path / "a.zarr", **REQUEST)
     before = store.heights().height_m
@@ -447,7 +457,7 @@ def test_deviations_of_levels_are_those_of_means():
     assert levels[32]["sd_m"].max() < 0.3 * sd.max()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("small")
 @pytest.mark.parametrize("patch_shape", [OF_PATCHES, MIXED])
 def test_a_store_killed_at_any_step_ends_bit_identical(tmp_path, monkeypatch, patch_shape):
@@ -488,7 +498,7 @@ def test_a_store_killed_at_any_step_ends_bit_identical(tmp_path, monkeypatch, pa
     assert kills > 8
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux tells the most memory")
 def test_memory_is_that_of_a_patch(tmp_path):
     """Four times as many patches take little more memory than those around one in the middle."""
@@ -563,6 +573,7 @@ class TestBadInput:
         points = clsas.Grid.points(GRID.positions_m())
         self.refused(tmp_path, "grid must be a plane or height map", grid=points)
 
+    @pytest.mark.slow
     def test_other_inputs(self, tmp_path):
         path = tmp_path / "a.zarr"
         clsas.mosaic_heights(*flat_banks(), GRID, path, **REQUEST)

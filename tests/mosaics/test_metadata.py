@@ -119,6 +119,7 @@ def zeros(path):
     array[...] = other + 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["x", "y", "height"])
 @pytest.mark.parametrize("damage", [remove, empty, replace, zeros])
 def test_coordinates_and_heights_are_repaired(path, kept, name, damage):
@@ -127,6 +128,7 @@ def test_coordinates_and_heights_are_repaired(path, kept, name, damage):
     check_repaired(path, kept, name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DOCUMENTS)
 @pytest.mark.parametrize("content", [None, b"", b"{}", b"[1]", b"\xff", b"{" * 100_000])
 def test_metadata_are_repaired(path, kept, name, content):

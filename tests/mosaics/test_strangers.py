@@ -87,6 +87,7 @@ def test_pickles_of_zarr_format_2_do_not_run(path, tmp_path, name, has_digests):
     assert not mark.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_digests", [True, False])
 @pytest.mark.parametrize("name", ["height", "pixels"])
 @pytest.mark.parametrize(

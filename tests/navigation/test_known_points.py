@@ -122,7 +122,7 @@ def test_no_reflector_is_focused_at_the_expense_of_others(lines):
     assert np.ptp(found.residual_rms_m) < found.residual_rms_m.mean()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_deviations_match_the_scatter(lines):
     rng, runs = np.random.default_rng(3), 30
     found = [
@@ -158,7 +158,7 @@ def test_envelopes_suffice_where_phases_cannot_be_followed(lines):
     assert found.misfit_m == pytest.approx(6e-3, rel=0.3)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_deviations_include_an_error_that_persists_along_the_track(lines):
     """Residuals of a drifting navigation are fewer independent measurements than channels."""
     offsets = {name: TRUE[name] for name in ("time_offset", "sound_speed")}
@@ -173,7 +173,7 @@ def test_deviations_include_an_error_that_persists_along_the_track(lines):
     assert np.sqrt(np.mean(np.square(scaled))) > 0.2  # nor are they much too large
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_noise_is_no_reflector():
     """A few of many channels exceed any threshold by chance, and must not be used."""
     place_m = np.stack([0.01 * np.arange(640), np.zeros(640), np.zeros(640)], axis=1)

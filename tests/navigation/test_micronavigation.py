@@ -62,7 +62,7 @@ def test_errors_reach_the_bound(noisy, coherence):
         assert abs(bias) < 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_intervals_cover_the_errors(noisy):
     covers = [
         against_bound(runs, name, coherence)[2]
@@ -115,7 +115,7 @@ def test_an_image_is_focused(moving, platform):
     assert peaks["nominal"] < 0.5 * peaks["true"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_hundred_pings_of_unknown_motion():
     """The array of Sensotek sways by 0.2 m and yaws by 1 degree within every synthetic aperture.
 

@@ -8,6 +8,7 @@ import weakref
 import numpy as np
 import pytest
 from factorizing import BEAMS, EXACT_IS_SLOW, arc, around, hills, made, over, straight, swaying
+from tiers import thinned
 
 import clsas
 from clsas.core.image_error import relative_error_db
@@ -30,8 +31,10 @@ def with_other_samples(lines, seed=3):
     return dataclasses.replace(lines, samples=lines.samples * factor)
 
 
-@pytest.mark.parametrize("scene", [straight, swaying, arc, hills])
-@pytest.mark.parametrize("beam", [None, BEAMS[0]], ids=["all", "beam"])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "beam"), thinned([straight, swaying, arc, hills], [None, BEAMS[0]])
+)
 def test_later_images_are_those_of_new_imagers(scene, beam, platform):
     lines, grid = made(scene)
     chosen = planned(lines, grid, beam)

@@ -22,6 +22,7 @@ from factorizing import (
     swaying_while_moving,
     with_gap,
 )
+from tiers import also, thinned
 
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
@@ -92,7 +93,7 @@ def test_an_exact_plan_says_how_many_channels_receive_from_a_pixel():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bright_m", [1.0, 0.01])
+@pytest.mark.parametrize("bright_m", [1.0, *also(0.01)])
 def test_leaves_suit_most_pixels_of_a_grid_that_begins_close_to_the_track(bright_m):
     """An array of 20 mm images from 6 to 54 mm, of which all or only the nearest are bright."""
     grid = Grid.plane((-0.0315, 0.0315, 512), (0.006, 0.054, 512))
@@ -109,7 +110,7 @@ def test_leaves_suit_most_pixels_of_a_grid_that_begins_close_to_the_track(bright
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance_db", [-10, -50, -75])
+@pytest.mark.parametrize("tolerance_db", [-50, *also(-10, -75)])
 def test_a_large_image_is_factorized(tolerance_db):
     """A million pixels from 2000 channels."""
     grid = around(0, 40, shape=(1000, 1000))
@@ -362,8 +363,10 @@ def test_next_to_nothing_of_a_beam_is_left_out(beam_deg, share):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("costs", [EXACT_IS_SLOW, Costs(pixel_ns=1e-3, part_ns=0.0)])
-@pytest.mark.parametrize("beam", [None, BEAMS[0]], ids=["all", "beam"])
+@pytest.mark.parametrize(
+    ("costs", "beam"),
+    thinned([EXACT_IS_SLOW, Costs(pixel_ns=1e-3, part_ns=0.0)], [None, BEAMS[0]]),
+)
 def test_memory_decides_whatever_things_cost(costs, beam):
     """What fits is taken, also if it is slower; and else the least that does is named."""
     lines, grid = over(around(0, 40, shape=(600, 700)))

@@ -403,6 +403,7 @@ except OSError as error:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
 def test_a_file_that_cannot_grow_is_reported(suffix, tmp_path):
     path = tmp_path / f"a.{suffix}"

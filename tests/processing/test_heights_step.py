@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from reliefs import flat_banks
+from tiers import also
 
 import clsas
 from clsas.cli import main
@@ -135,7 +136,7 @@ def test_heights_are_measured_again_only_if_something_changed(scene):
         assert repeated(lines=louder, steps=("heights",)) == ("heights",)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_heights_are_of_the_corrected_lines(scene):
     """A range error of both banks displaces heights, until known points correct it."""
     marks = clsas.PointTargets(POINTS_M, np.full(len(POINTS_M), 8.0))
@@ -288,7 +289,7 @@ def test_files_of_others_are_never_replaced(scene, name):
     assert (folder / name).read_text() == "mine"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_heights_larger_than_memory_are_a_mosaic(scene):
     """Its patches are continued, and it is replaced if options have changed."""
     change(scene, '"image", "heights"', '"heights"')
@@ -321,7 +322,7 @@ def test_heights_larger_than_memory_are_a_mosaic(scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("patches", [False, True])
+@pytest.mark.parametrize("patches", [False, *also(True)])
 def test_errors_of_the_pair_are_corrected(scene, patches):
     """A phase of the second bank displaces heights, until a level seabed corrects it."""
     low, high = flat_banks()

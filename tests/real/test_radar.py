@@ -190,7 +190,7 @@ def test_cars_stand_out_of_the_tarmac(total):
     assert 10 * np.log10(cars / lane) > 10
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/real")
 def test_program_draws_every_image_and_says_what_is_in_it(recording, tmp_path):
     pytest.importorskip("matplotlib")
     path = recording(radar.RECORDINGS[0])
@@ -205,7 +205,7 @@ def test_program_draws_every_image_and_says_what_is_in_it(recording, tmp_path):
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/real")
 def test_program_refuses_a_recording_that_is_not_there(tmp_path):
     done = subprocess.run(
         [sys.executable, radar.__file__, tmp_path / "nowhere.mat"], capture_output=True, text=True

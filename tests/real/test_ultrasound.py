@@ -158,7 +158,7 @@ def test_a_pair_stands_for_its_reverse(lines, image):
     assert clsas.relative_error_db(full, weighted) < -75
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/real")
 def test_program_draws_the_section_and_says_what_is_in_it(recording, tmp_path):
     pytest.importorskip("matplotlib")
     path = recording(ultrasound.RECORDING)

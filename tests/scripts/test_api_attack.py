@@ -49,7 +49,7 @@ def test_every_public_function_and_argument_is_attacked(judge, folder):
     assert left_out == []
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("group", EVERY)
 def test_wrong_values_are_refused_by_name_and_equal_ones_accepted(group):
     """In a separate process with limited memory."""

@@ -9,7 +9,7 @@ from clsas.trials import wreck
 pytest.importorskip("matplotlib")
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/studies")
 def test_the_chain_restores_what_the_true_track_shows(tmp_path):
     recording = blurred_wreck.recorded()
     few = pytest.warns(ClsasWarning, match="navigate: .* fewer than 8 reflectors")

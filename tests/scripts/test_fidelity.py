@@ -17,7 +17,7 @@ def test_looks_of_noise_are_its_pixels():
     assert fidelity.looks(blocks) == pytest.approx(expected, rel=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/studies", "scripts/bench")
 def test_phases_of_factorized_images_err_less_than_their_pixels(monkeypatch):
     """On a raised plane of points, whose phase also shows the sensitivity of the case."""
     random, count = np.random.default_rng(1), 4000

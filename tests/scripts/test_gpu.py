@@ -19,7 +19,7 @@ def run(*arguments, **variables):
     )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/gpu", "scripts/gpu_report.py")
 @pytest.mark.parametrize("selection", [(), ("--quick",)])
 def test_a_report_holds_what_a_part_printed(tmp_path, selection):
     report = tmp_path / "report.md"
@@ -34,7 +34,7 @@ def test_a_report_holds_what_a_part_printed(tmp_path, selection):
     assert text.endswith("All parts succeeded.\n")
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/gpu", "scripts/gpu_report.py")
 def test_a_report_needs_no_git(tmp_path):
     report = tmp_path / "report.md"
     done = run("--device", "0", "--only", "Devices", "--out", report, PATH=str(tmp_path))

@@ -6,7 +6,7 @@ from studies import relief
 from clsas.trials import cases, dunes
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/studies", "scripts/bench")
 def test_heights_err_as_much_as_they_say(monkeypatch):
     monkeypatch.setattr(cases, "HEIGHTS_CASES", {"small": 128})
     monkeypatch.setattr(dunes, "SEARCH_M", (-1.0, 1.0))

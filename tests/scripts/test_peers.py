@@ -173,7 +173,7 @@ def test_a_program_that_fails_is_named(tmp_path):
         ask(image_file="a")
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/peers")
 def test_a_package_that_is_not_there_is_named(tmp_path, monkeypatch):
     monkeypatch.setenv("CLSAS_CACHE", str(tmp_path))
     monkeypatch.setenv("PIP_NO_INDEX", "1")
@@ -203,7 +203,7 @@ def test_rows_tell_what_was_measured_and_what_was_refused():
     assert compare.row(refused, 1)[3] == "refused: ValueError: no helix"
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/peers")
 def test_clsas_is_measured_by_its_own_program(platform):
     """Images of the program that is timed satisfy their requests, exact and factorized."""
     here = codes.Code(sys.executable, SCRIPTS / "peers" / "with_clsas.py")

@@ -12,7 +12,7 @@ pytest.importorskip("matplotlib")
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/pictures", "scripts/pages")
 def test_a_picture_of_the_documentation_is_drawn(tmp_path):
     command = [sys.executable, ROOT / "scripts" / "pictures", "demo", "--out", tmp_path]
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))

@@ -20,7 +20,7 @@ def small(monkeypatch):
     return case
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/studies", "scripts/bench")
 def test_every_request_has_a_row(small):
     device = open_device()
     rows = list(predictions.rows(device, repeats=1))

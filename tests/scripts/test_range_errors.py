@@ -10,7 +10,7 @@ SPACING_M, SIDE_M, NEAREST_M = 8.25e-3, 5.0, 40.0  # THESIS chapter 5
 STAGES = [[(2, 2)], [(3, 8)], [(8, 2)], [(2, 2)] * 3, [(4, 8), (2, 2)]]
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/thesis")
 @pytest.mark.parametrize("stages", STAGES)
 @pytest.mark.parametrize("bistatic", [False, True])
 def test_errors_of_a_plan(stages, bistatic):

@@ -24,7 +24,7 @@ def test_neighbours_are_half_and_twice_the_value_or_the_power():
     assert named("MARGIN_DB").neighbours == (-2.0, 4.0)
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/studies")
 def test_a_constant_is_changed_wherever_it_is_imported_and_then_restored():
     constant = named("LEAST_BATCH")
     before = constant.value

@@ -43,7 +43,7 @@ def test_every_script_is_known():
     assert sorted(COLUMNS) == SCRIPTS
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/thesis")
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_script_runs(script, tmp_path):
     # 16 pixels remain along each side after the divisions of the orders.

@@ -6,7 +6,7 @@ from clsas.opencl.device import open_device
 from clsas.trials import cases
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/studies")
 def test_every_constant_takes_turns_and_keeps_its_value(monkeypatch):
     monkeypatch.setattr(tuning, "FACTORS", (1.0, 2.0))
     monkeypatch.setattr(tuning, "_RUNS", 1)

@@ -4,7 +4,7 @@ from studies import wavenumbers
 import clsas
 
 
-@pytest.mark.slow
+@pytest.mark.watches("scripts/studies")
 def test_wavenumber_images_are_exact_on_a_straight_track_only():
     straight = wavenumbers.Scene(pixels=64)
     swaying = wavenumbers.Scene(sway_m=0.2, altitude_m=15.0, near_m=20.0, pixels=64)

@@ -53,6 +53,7 @@ def relative_variance(lines, grid, amplitude, rng, *, draws=600):
     return power.var() / power.mean() ** 2
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("channels", "length_m", "size_m"),
     [(1, 0.0, (1.0, 0.6)), (60, 4.0, (0.5, 0.2)), (60, 4.0, (2.0, 0.4)), (200, 6.0, (3.0, 0.8))],

@@ -89,6 +89,7 @@ def test_even_spacing_changes_nothing():
     np.testing.assert_array_equal(weighted.rx_m, lines.rx_m)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jitter_m", [0.0, 0.004, 0.02], ids=["even", "slight", "strong"])
 def test_against_integration(jitter_m):
     """Two of six phase centres overlap, which are then up to 2 jitters apart."""

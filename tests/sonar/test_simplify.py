@@ -372,7 +372,7 @@ def random_survey(seed):
     return lines, grid, beam, random.uniform(-85, -10)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_no_geometry_leaves_out_more_than_is_allowed(monkeypatch):
     """Check all pixels and their visible channels in unusual random surveys."""
     monkeypatch.setattr("clsas.sonar.simplify.LEAST_PIXELS", 1000)

@@ -57,7 +57,7 @@ def test_scaled_cases_keep_what_they_look_like_in_wavelengths():
     assert (base.x_m, base.y_m, base.beam) == (scaled.x_m, scaled.y_m, scaled.beam)
 
 
-@pytest.mark.slow
+@pytest.mark.watches("clsas/trials", "scripts/bench", "scripts/studies")
 @pytest.mark.parametrize("beam", [None, BeamWindow(1.5, "hann")])
 def test_factorized_against_exact(beam, monkeypatch):
     case = dataclasses.replace(SMALL, beam=beam)
@@ -86,7 +86,7 @@ def test_factorized_against_exact(beam, monkeypatch):
     assert json.loads(json.dumps(result)) == result
 
 
-@pytest.mark.slow
+@pytest.mark.watches("clsas/trials", "scripts/bench", "scripts/studies")
 def test_heights_against_one_image(monkeypatch):
     monkeypatch.setitem(cases.HEIGHTS_CASES, "small", 128)
     monkeypatch.setattr(dunes, "SEARCH_M", (-1.0, 1.0))
@@ -150,7 +150,7 @@ def test_intervals_of_exponents_contain_the_true_one_as_often_as_they_claim():
     assert tables.growth([256, 512], [1.0, 4.0]).cells == ["2.00", "", "2", "256 to 512"]
 
 
-@pytest.mark.slow
+@pytest.mark.watches("clsas/trials", "scripts/bench", "scripts/studies")
 def test_the_table_of_factorized_cases(monkeypatch, capsys):
     monkeypatch.setattr(cases, "FACTORIZED_CASES", {"small": SMALL})
     tables.factorized([None])

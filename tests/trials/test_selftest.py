@@ -20,7 +20,7 @@ def small(monkeypatch):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_every_image_is_within_its_bound(platform, monkeypatch):
     """With the default vectors and with one lane; other tests cover the other builds."""
     monkeypatch.setattr(selftest, "_BUILDS", ((1, False),))
@@ -32,7 +32,7 @@ def test_every_image_is_within_its_bound(platform, monkeypatch):
         assert any(result.case.endswith(f", {imager}") for result in results)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_other_builds_for_a_device_are_tested_too(platform, monkeypatch):
     """One lane forms every image whose imager runs kernels, other widths form two."""
     checks = (("bistatic", "exact", -60.0), ("flat", "wavenumber", None))
@@ -47,7 +47,7 @@ def test_other_builds_for_a_device_are_tested_too(platform, monkeypatch):
     assert all(result.passed for result in results)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_plans_of_the_scenes_are_factorized(platform):
     """Otherwise the factorized imager would not be tested."""
     for scene, imager, asked_db in selftest._CHECKS:

@@ -63,7 +63,7 @@ def test_lines_are_simulated_once(monkeypatch, tmp_path):
     assert asked == [1, 1]
 
 
-@pytest.mark.slow
+@pytest.mark.watches("clsas/trials")
 def test_benchmark(monkeypatch):
     monkeypatch.setattr(wreck, "lines", lambda progress=None: few_lines())
     monkeypatch.setitem(cases.MOSAIC_CASES, "small", (128, BeamWindow(5.0, "hann")))
