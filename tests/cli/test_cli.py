@@ -801,7 +801,7 @@ def test_help_shows_an_example_that_parses(monkeypatch):
     assert run("--version")[0] == f"clsas, version {clsas.__version__}\n"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_bench(monkeypatch):
     monkeypatch.setattr(cases, "EXACT_CASES", {"one": SMALL, "two": SMALL})
     monkeypatch.setattr(cases, "FACTORIZED_CASES", {"fast": SMALL})

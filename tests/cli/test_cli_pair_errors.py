@@ -55,6 +55,7 @@ def test_command_corrects_the_second_bank(files, tmp_path):
     assert "mm in heights at" in text
 
 
+@pytest.mark.exhaustive
 def test_heights_may_be_those_of_a_store(files, tmp_path):
     output, store = tmp_path / "corrected.h5", tmp_path / "heights.zarr"
     lines = clsas.load(files / "lines.h5")

@@ -9,6 +9,7 @@ import pytest
 from bent import travel_times
 from cases import along_x, lines_over
 from factorizing import EXACT_IS_SLOW
+from tiers import also, few
 
 import clsas
 from clsas import Grid, RangeLines, SoundSpeed
@@ -130,9 +131,8 @@ def scene_of(name):
     return Scene(lines, grid, echoes, pixels_m, slowness)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=() if n == QUICK else pytest.mark.slow) for n in CASES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", few(CASES, often=[QUICK, "far relief"]))
 def test_images_are_those_of_exact_rays(name):
     lines, grid, ideal = made(name)
     exact = clsas.backproject(lines, grid, accuracy_db=-62)
@@ -216,7 +216,7 @@ def relief_scene(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", list(RELIEFS))
+@pytest.mark.parametrize("name", few(RELIEFS, often=["gradient"]))
 def test_images_over_relief_are_those_of_exact_rays(name):
     """Two heights of equal delay focus differently, which apparent antennas alone cannot do."""
     lines, grid, pixels, ideal = relief_scene(name)
@@ -231,7 +231,7 @@ def test_images_over_relief_are_those_of_exact_rays(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("speed_m_s", [0.0, 1.8])
+@pytest.mark.parametrize("speed_m_s", [1.8, *also(0.0)])
 def test_arrays_that_move_see_along_exact_rays(speed_m_s):
     """Apparent antennas below a thermocline depend on the pixel if receivers are apart or move."""
     case = Case(300e3, 60, **THERMOCLINE, aperture_m=5)
@@ -288,11 +288,9 @@ BEAMS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beam", BEAMS, ids=lambda beam: beam.shape)
-@pytest.mark.parametrize(
-    "name",
-    [QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in ("low frequency", "far relief"))],
-)
+@pytest.mark.parametrize("name", [QUICK, *also("low frequency", "far relief")])
 def test_weights_are_those_of_the_rays_at_the_sonar(name, beam):
     """The sine of the angle at which a ray leaves the sonar is its slowness times the speed there.
 
@@ -314,11 +312,9 @@ def test_weights_are_those_of_the_rays_at_the_sonar(name, beam):
     assert clsas.relative_error_db(stored, image) < -90
 
 
-@pytest.mark.parametrize("shape", ["rectangular", "hamming", "taylor"])
-@pytest.mark.parametrize(
-    "name",
-    [QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in ("low frequency", "far relief"))],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", ["hamming", *also("rectangular", "taylor")])
+@pytest.mark.parametrize("name", [QUICK, *also("low frequency", "far relief")])
 def test_steps_of_a_beam_that_lie_elsewhere_are_predicted(name, shape):
     """A channel too many or too few at the edge costs -32 to -62 dB; predictions are bounds."""
     scene, case = scene_of(name), CASES[name]
@@ -387,6 +383,7 @@ def test_a_wavenumber_image_of_an_array_that_moves(recwarn):
     assert clsas.wavenumber(lines, grid).shape == grid.shape
 
 
+@pytest.mark.exhaustive
 def test_a_wavenumber_image_has_the_same_water():
     lines, grid, ideal = made(QUICK)
     straight = clsas.backproject(replace(lines, sound_speed=None), grid)
@@ -400,9 +397,8 @@ def test_a_wavenumber_image_has_the_same_water():
         clsas.wavenumber(lines, sloping)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=() if n == QUICK else pytest.mark.slow) for n in list(CASES)[:6]]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", few(list(CASES)[:6], often=[QUICK]))
 def test_points_are_where_they_are(name):
     """The phase of a pixel at a point is right to a thousandth of a cycle, and so is its range."""
     case = CASES[name]

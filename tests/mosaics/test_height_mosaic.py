@@ -211,7 +211,7 @@ def test_folders_of_both_banks_may_grow(tmp_path):
         measure("a.zarr")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_beams_of_folders_do_not_change_as_they_grow(tmp_path):
     (tmp_path / "lines").mkdir()
     clsas.save(tmp_path / "lines" / "a.h5", halves_of(*flat_banks())[0])
@@ -247,7 +247,7 @@ def test_one_warning_names_all_patches_that_miss_the_seabed(tmp_path):
     assert measure() == text  # of patches that were measured before
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_search_may_start_from_a_relief(tmp_path):
     low = clsas.Grid.plane((-0.6, 0.6, 61), (31.2, 32.8, 81), z=-0.4)
     start = low.with_height(0.4 + np.linspace(-0.05, 0.05, 81)[:, None] + np.zeros(61))
@@ -261,7 +261,7 @@ def test_the_search_may_start_from_a_relief(tmp_path):
     assert store.grid.height_m is not None
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_default_window_is_kept(tmp_path):
     request = {name: REQUEST[name] for name in ("search_m", "patch_m")}
     store = clsas.mosaic_heights(*flat_banks(), GRID, tmp_path / "a.zarr", **request)
@@ -274,7 +274,7 @@ def test_the_default_window_is_kept(tmp_path):
         clsas.mosaic_heights(*flat_banks(), GRID, store.path, **request, window_m=0.2)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_given_window_is_not_decided_on_again(tmp_path, monkeypatch):
     """Another device, or more lines, may lead to another margin."""
     store = clsas.mosaic_heights(*flat_banks(), GRID, tmp_path / "a.zarr", **REQUEST)
@@ -391,8 +391,11 @@ def write_patch(store, layers, window):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
-@pytest.mark.parametrize("patch_shape", [OF_PATCHES, MIXED])
+@pytest.mark.parametrize(
+    "patch_shape", [MIXED, pytest.param(OF_PATCHES, marks=pytest.mark.exhaustive)]
+)
 def test_levels_of_layers(tmp_path, patch_shape):
     store, layers = filled_store(tmp_path / "a.zarr", patch_shape)
     for window in patches_of(patch_shape):
@@ -573,7 +576,7 @@ class TestBadInput:
         points = clsas.Grid.points(GRID.positions_m())
         self.refused(tmp_path, "grid must be a plane or height map", grid=points)
 
-    @pytest.mark.slow
+    @pytest.mark.exhaustive
     def test_other_inputs(self, tmp_path):
         path = tmp_path / "a.zarr"
         clsas.mosaic_heights(*flat_banks(), GRID, path, **REQUEST)

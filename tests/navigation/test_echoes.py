@@ -76,7 +76,7 @@ def test_deviations_over_some_reflectors_match_the_errors(count):
     assert error_rad <= 2 * np.sqrt(np.mean(found.yaw_steps_sd_rad**2))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_one_window_shows_how_errors_persist():
     """One window is the default for a short swath."""
     error_m, reported_m = [], []

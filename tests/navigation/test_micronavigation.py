@@ -92,7 +92,7 @@ def moving():
     return lines, right, found, {name: f(np.arange(pings)) for name, f in motion.items()}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_unknown_motion_is_found(moving):
     _, _, found, motion = moving
     assert np.std(detrended(found.sway_m - motion["sway_m"])) <= WAVELENGTH_M / 16
@@ -102,7 +102,7 @@ def test_unknown_motion_is_found(moving):
     assert np.median(misses) < 3
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_image_is_focused(moving, platform):
     lines, right, found, _ = moving
     x = float(lines.phase_centres_m[:, 0].mean())

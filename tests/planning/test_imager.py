@@ -46,8 +46,7 @@ def test_later_images_are_those_of_new_imagers(scene, beam, platform):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", [straight, hills])
-@pytest.mark.parametrize("beam", [None, BEAMS[0]], ids=["all", "beam"])
+@pytest.mark.parametrize(("scene", "beam"), thinned([straight, hills], [None, BEAMS[0]]))
 def test_later_exact_images_are_those_of_backproject(scene, beam, platform):
     lines, grid = made(scene)
     imager = clsas.Imager(lines, grid, accuracy_db=-50, beam=beam, device=platform)

@@ -166,7 +166,7 @@ def late_with_marks(bank, marks, late_m):
     return replace(bank, samples=samples, first_range_m=bank.first_range_m + late_m)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_first_two_of_several_banks_are_used(scene):
     """Whatever their numbers."""
     low, high = flat_banks()
@@ -182,7 +182,7 @@ def test_the_first_two_of_several_banks_are_used(scene):
     np.testing.assert_array_equal(found.height_m, expected.height_m)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_without_a_valid_height_there_is_no_picture(scene):
     """Nor a span or a deviation: the banks contain noise alone."""
     random = np.random.default_rng(1)
@@ -266,7 +266,7 @@ def test_a_vertical_grid_is_refused_before_any_step(scene):
     assert not scene.with_suffix("").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_search_starts_from_the_relief_of_the_scene(scene):
     relief = 0.3 + np.linspace(0, 0.1, 51)[:, None] + np.zeros(51)
     np.savetxt(scene.parent / "relief.csv", relief, delimiter=",")
