@@ -170,5 +170,5 @@ def few(values, often):
 
 
 def also(*values):
-    """Return further values of parameters, which run only with all tests."""
-    return few(values, often=())
+    """Return further values of a parameter, which run only with all tests."""
+    return [pytest.param(value, marks=EXHAUSTIVE) for value in values]

@@ -93,6 +93,7 @@ def test_channels_beside_each_other_are_no_passes(name):
     assert sheet(lines_at(tx_m), WAVELENGTH).is_sheet
 
 
+@pytest.mark.slow
 def test_short_passes_have_no_strips():
     tx_m = TRACKS["passes"]().reshape(8, 200, 3)[:, :20].reshape(-1, 3)
     assert strips(lines_at(tx_m), WAVELENGTH) is None

@@ -136,6 +136,7 @@ def test_show_draws_the_marks_of_a_map(folder, figures):
     assert "--scale-bar cannot be used with range lines" in done.output
 
 
+@pytest.mark.slow
 def test_a_radar_image_becomes_sicd_by_its_lines_and_its_beam(folder):
     pytest.importorskip("sarkit", reason="sarkit (extra radar) is not installed")
     import sarkit.sicd

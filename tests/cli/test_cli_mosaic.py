@@ -271,6 +271,7 @@ def test_nothing_is_simulated_for_patches_that_cannot_be(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_not_there(made, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr("clsas.cli.mosaics._SCHEDULER_S", 0.5)

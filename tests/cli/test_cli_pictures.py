@@ -34,6 +34,7 @@ def run(*args, code=0):
     return result.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["--picture", "--png"])
 @pytest.mark.parametrize(("name", "start"), [("a.pdf", b"%PDF"), ("a.svg", b"<?xml")])
 def test_the_suffix_decides_the_format(folder, option, name, start):

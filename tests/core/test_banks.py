@@ -149,6 +149,7 @@ def test_one_image_of_two_banks_warns(lines, form):
     form(replace(lines, bank_numbers=None))
 
 
+@pytest.mark.slow
 def test_two_banks_cancel_in_one_image_off_the_grid():
     """What the warning says: half a cycle of height away from the grid, the echoes cancel."""
     sonar = clsas.Sonar(PULSE, [[0, 0, -0.1], [0, 0, 0.1]], bank_numbers=[0, 1])

@@ -18,6 +18,7 @@ def cast(noise_m_s, depth=DEPTH):
     return SoundSpeed(depth, 1500 - 8 / (1 + np.exp(-(depth - 14) / 1.5)) + noise)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise_m_s", "most"), [(0.0, 60), (0.001, 100)])
 def test_travel_times_stay(noise_m_s, most):
     """Against rays through all depths, by quadrature."""

@@ -201,6 +201,7 @@ def test_array_does_not_stretch_anything_else(given):
         validate.array("tx_m", given, np.float64, (4, 3), broadcast=True)
 
 
+@pytest.mark.slow
 def test_shown_is_short_and_escapes_what_a_terminal_obeys():
     assert validate.shown(1.5) == "1.5"
     assert validate.shown("a\x1b[31m\nb") == r"'a\x1b[31m\nb'"

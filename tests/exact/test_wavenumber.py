@@ -273,6 +273,7 @@ def test_a_grid_outside_the_beam_warns_and_is_zero():
 # Bad input
 
 
+@pytest.mark.slow
 def test_aspects_near_end_fire_are_refused():
     grid = Grid.plane((-2, 2, 16), (0.5, 60, 16))
     lines = echoes(grid=grid)
@@ -280,6 +281,7 @@ def test_aspects_near_end_fire_are_refused():
         wavenumber(lines, grid)
 
 
+@pytest.mark.slow
 def test_memory_is_refused_before_work_begins(monkeypatch):
     asked, lines = [], straight()
     monkeypatch.setattr(validate, "memory", lambda name, size: asked.append((name, size)))

@@ -33,6 +33,7 @@ def corrected_scene():
     return lines, grid, ideal.reshape(grid.shape)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["exact", "factorized", "normalised"])
 def test_corrections_on_every_device(device, method):
     lines, grid, ideal = corrected_scene()

@@ -328,6 +328,7 @@ def test_steps_of_a_beam_that_lie_elsewhere_are_predicted(name, shape):
     assert error_db < predicted_db < error_db + 10
 
 
+@pytest.mark.slow
 def test_a_constant_speed_would_not_do():
     lines, grid, ideal = made(QUICK)
     profile = lines.sound_speed
@@ -341,6 +342,7 @@ def test_a_constant_speed_would_not_do():
         assert oracle.error_db(image.pixels, ideal) > -20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-20, -30])
 def test_the_mean_speed_is_enough_where_rays_hardly_bend(tolerance_db):
     """Positions count as well: the error is that of the delays, not only of the focus."""
@@ -351,6 +353,7 @@ def test_the_mean_speed_is_enough_where_rays_hardly_bend(tolerance_db):
     assert plan.errors.left_out > 0
 
 
+@pytest.mark.slow
 def test_an_imager_takes_other_samples():
     lines, grid, ideal = made(QUICK)
     for request in ({"tolerance_db": -55}, {"accuracy_db": -62}):
@@ -361,6 +364,7 @@ def test_an_imager_takes_other_samples():
                 imager(replace(lines, sound_speed=None))
 
 
+@pytest.mark.slow
 def test_a_plan_belongs_to_the_profile():
     lines, grid, _ = made(QUICK)
     plan = clsas.plan(lines, grid, tolerance_db=-40)
@@ -372,6 +376,7 @@ def test_a_plan_belongs_to_the_profile():
     assert clsas.relative_error_db(image, clsas.factorize(lines, grid, plan)) < -90
 
 
+@pytest.mark.slow
 def test_a_wavenumber_image_of_an_array_that_moves(recwarn):
     """Its grid stays level, although other imagers would correct the ranges of points."""
     tx = np.repeat(along_x(40, 0.12, z=-10), 4, axis=0)
@@ -420,6 +425,7 @@ def test_points_are_where_they_are(name):
     assert abs(np.angle(peak)) < 2 * np.pi * 1e-3
 
 
+@pytest.mark.slow
 def test_the_imager_is_the_adjoint_of_the_simulator():
     """<A x, y> = <x, A^H y> for amplitudes x of points, lines y, and both along the same rays."""
     lines, grid, _ = made(QUICK)

@@ -74,6 +74,7 @@ def findings(path):
     return checker.failures()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_what_was_written_passes_the_checker_and_gives_the_same_image(name, tmp_path):
     make, grid = CASES[name]

@@ -183,6 +183,7 @@ for path in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path):
     (tmp_path / "old.h5").write_bytes(b"what was there")
     done = run_beside(FULL_DISK, str(tmp_path / "new.h5"), str(tmp_path / "old.h5"))

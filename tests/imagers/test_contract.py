@@ -245,6 +245,7 @@ def test_the_order_of_channels_does_not_matter(bound):
     assert relative_error_db(former(bound)(shuffled), wanted) <= bound[0].same_db
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:lines are kept in single precision, not in half")
 @every_imager
 @pytest.mark.parametrize("scale", [1e-36, *also(1e-30, 1e-10, 1e10, 1e20), 1e30])
@@ -256,6 +257,7 @@ def test_the_unit_of_the_samples_does_not_matter(bound, scale):
     assert relative_error_db(pixels, image_of(bound, bound[0].known)) <= max(bound[0].same_db, -80)
 
 
+@pytest.mark.slow
 @every_imager
 def test_it_gives_the_same_twice(bound):
     known = bound[0].known
@@ -276,6 +278,7 @@ def test_data_may_arrive_in_pieces(bound):
 # Progress and interruption
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("bound", "case"), pairs(lambda imager: imager.cases, "progress"))
 def test_progress_rises_to_its_end(bound, case):
     calls = []
@@ -299,6 +302,7 @@ def test_an_interrupted_run_leaves_the_device_usable(bound):
 # Nothing to see
 
 
+@pytest.mark.slow
 @every_imager
 def test_lines_of_zeros_give_zeros_without_a_warning(bound):
     given = scene(bound[0].known)

@@ -183,6 +183,7 @@ def test_the_oracle_agrees_with_a_beam_that_turns():
     assert found_db < -49
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "squint_deg", "along", "reason"),
     [
@@ -199,6 +200,7 @@ def test_a_plan_tells_why_an_image_is_exact(name, squint_deg, along, reason):
     assert Plan.from_json(chosen.to_json()).method == chosen.method
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["helix", "raster", "planar", "passes"])
 def test_virtual_channels_are_as_many_as_predicted(name):
     """Filters of each stage extend past the ends of those before: these count too."""

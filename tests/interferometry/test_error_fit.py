@@ -30,6 +30,7 @@ def fit(noise_m, every=3, unknowns=2, wrong=None):
     return fitted(equations_at, unknowns, Places(row, column, SHAPE, WINDOW))
 
 
+@pytest.mark.slow
 def test_deviations_match_the_scatter():
     random = np.random.default_rng(1)
     fits = [fit(heights(random)) for _ in range(300)]

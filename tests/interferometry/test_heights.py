@@ -247,6 +247,7 @@ def test_lit_slopes_of_a_known_relief_are_not_in_shadow():
     assert sloping.mask.mean() > 0.97 * level.mask.mean()
 
 
+@pytest.mark.slow
 def test_a_level_relief_is_a_plane_at_its_height():
     lines = flat_banks()
     low = clsas.Grid.plane((-0.8, 0.8, 81), (30.8, 33.2, 121), z=-0.4)
@@ -337,6 +338,7 @@ def test_searches_that_end_at_the_seabed_do_not_warn(name, snr_db):
         heights(*lines, GRID, search_m=search_m, window_m=WINDOW_M)  # warnings are errors
 
 
+@pytest.mark.slow
 def test_results_describe_themselves():
     result = heights(*flat_banks(), GRID, search_m=(-0.5, 0.5))
     assert 0.2 < result.window_m < 0.4
@@ -350,6 +352,7 @@ def test_results_describe_themselves():
     assert not result.mask.flags.writeable
 
 
+@pytest.mark.slow
 def test_banks_in_the_other_order_give_the_same_heights():
     first, second = flat_banks()
     one = heights(first, second, GRID, search_m=(-0.5, 0.5), window_m=WINDOW_M)
@@ -369,6 +372,7 @@ def test_slopes_without_noise_are_not_masked(slope):
     assert result.mask.mean() > 0.95
 
 
+@pytest.mark.slow
 def test_planes_and_georeferences_carry_over():
     first, second = flat_banks()
     place = clsas.Georeference.local(60.39, 5.32, heading_deg=90)
@@ -384,6 +388,7 @@ def test_planes_and_georeferences_carry_over():
     assert np.sqrt(np.mean((error_m[some] / result.sd_m[some]) ** 2)) < 1.3
 
 
+@pytest.mark.slow
 def test_progress_counts_to_its_total():
     calls = []
     heights(
@@ -471,6 +476,7 @@ class TestBadInput:
         self.refused("beam must be of type", beam=20, error=TypeError)
         self.refused("a must be of type RangeLines", a=3, error=TypeError)
 
+    @pytest.mark.slow
     def test_nothing_coherent(self):
         first, second = flat_banks()
         random = np.random.default_rng(4)

@@ -228,6 +228,7 @@ def test_points_without_a_height_are_reported():
         clsas.pair_errors(first, second, found, points_m=points_m, unknowns=("phase",))
 
 
+@pytest.mark.slow
 def test_control_points_and_heights_between_nan():
     first, second, found = narrow()
     x_m, y_m = (each.ravel() for each in np.meshgrid([-0.5, 0.0, 0.5], [31.2, 32.0, 32.8]))
@@ -364,6 +365,7 @@ class TestBadInput:
         with pytest.raises(error, match=match):
             clsas.pair_errors(**({"known_height_m": 0.0} | lines | given))
 
+    @pytest.mark.slow
     def test_what_is_known(self):
         shape = reliefs.GRID.shape
         self.refused(

@@ -105,6 +105,7 @@ def test_what_comes_back_is_what_went_in_to_one_quantum(place, tmp_path):
                 assert sum(table[1][:3]) < sum(table[128][:3]) < sum(table[255][:3])
 
 
+@pytest.mark.slow
 def test_overviews_are_means_of_power(tmp_path):
     shape = (1301, 1101)  # odd sides: two levels
     random = np.random.default_rng(4)
@@ -356,6 +357,7 @@ def test_an_image_of_zeros_is_a_map_of_nothing(tmp_path):
         assert not file.read().any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("crs", "shift_m", "message"),
     [

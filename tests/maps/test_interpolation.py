@@ -186,6 +186,7 @@ def test_pixels_of_which_nothing_was_received_stay_0(tmp_path):
     assert relative_error_db(found[away], whole[away]) < -55
 
 
+@pytest.mark.slow
 def test_the_carrier_follows_the_middle_of_the_band():
     """Its slope at a pixel is the mean of the frequencies there, far and near."""
     place = local(0.0)
@@ -277,6 +278,7 @@ def test_lines_agree_with_their_image(kind, step_m):
         assert 0.97 < found <= 1
 
 
+@pytest.mark.slow
 def test_what_cannot_be_resampled_is_refused(tmp_path):
     place = local(217.0)
     lines, grid = lines_of(place, "points"), grid_of(place, 0.05)

@@ -89,6 +89,7 @@ def test_netcdf_restores_the_image_and_its_place(place, tmp_path):
     assert data.spatial_ref.attrs["long_name"] == "Coordinate reference system"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [UTM_NORTH, local(217.0)], ids=str)
 def test_a_png_has_its_place_on_the_map(place, tmp_path):
     pytest.importorskip("matplotlib")
@@ -114,6 +115,7 @@ def test_a_png_has_its_place_on_the_map(place, tmp_path):
     np.testing.assert_allclose((c, f), at(placed, 0.5, 0.5))
 
 
+@pytest.mark.slow
 def test_files_beside_a_replaced_file_do_not_describe_the_new_one(tmp_path):
     pytest.importorskip("matplotlib")
     image, _ = scene(local(217.0))
@@ -135,6 +137,7 @@ def test_a_png_of_a_vertical_plane_has_no_place_on_a_map(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
 
 
+@pytest.mark.slow
 def test_pictures_without_a_place_stand_alone(tmp_path):
     pytest.importorskip("matplotlib")
     image, _ = scene(UTM_NORTH)

@@ -81,6 +81,7 @@ def test_bands_are_height_deviation_and_coherence(place, origin_m, tmp_path):
     assert tags.get("VERTICAL_DATUM") == place.vertical_datum
 
 
+@pytest.mark.slow
 def test_overviews_are_means_of_valid_pixels(tmp_path):
     heights = relief(UTM_NORTH, shape=(1101, 900))  # odd: the last row stands alone
     clsas.export(heights, tmp_path / "a.tif")

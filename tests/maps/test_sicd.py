@@ -86,6 +86,7 @@ def exported(source, path, remarks=(), **options):
         return reader.read_image(), tree, sarkit.sicd.ElementWrapper(tree.getroot())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", PLACES, ids=str)
 @pytest.mark.parametrize("turn", [None, "transposed", "reversed"])
 def test_pixels_and_places_come_back(place, turn, tmp_path):
@@ -180,6 +181,7 @@ def test_band_and_widths_are_those_of_the_pixels(tmp_path):
     assert band["Max"] == pytest.approx(CARRIER_HZ + BAND_HZ / 2, abs=0.03 * BAND_HZ)
 
 
+@pytest.mark.slow
 def test_a_beam_sets_time_and_band_along_the_track(tmp_path):
     place = local(0.0)
     image, lines = image_of(place), lines_of(place)
@@ -213,6 +215,7 @@ def test_a_tilted_plane_keeps_its_direction(tmp_path):
     assert row["SS"] == pytest.approx(np.hypot(1, 0.3), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_mosaic_is_read_patch_by_patch(tmp_path):
     place = local(217.0)
     lines, grid = lines_of(place), image_of(place).grid
@@ -361,6 +364,7 @@ def test_heights_above_another_surface_cause_a_warning(tmp_path):
         clsas.export(image_of(place), tmp_path / "a.nitf", lines=lines_of(place))
 
 
+@pytest.mark.slow
 def test_places_on_the_equator_and_the_prime_meridian_are_written(tmp_path):
     """sarkit's own format of latitudes has no sign for 0."""
     place = clsas.Georeference.local(0.0, 0.0, heading_deg=90.0)

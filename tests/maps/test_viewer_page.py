@@ -112,6 +112,7 @@ def test_wheel_and_drag_move_what_is_under_the_pointer(page):
     assert position(page) == pytest.approx(before, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_levels_and_colours_change_the_pixels(page):
     go(page, 0, 45)  # in the background
     assert colour(page, 300, 300) == gray(BACKGROUND_DB)
@@ -133,6 +134,7 @@ def test_levels_and_colours_change_the_pixels(page):
     assert page.text("#high-db") == "−29.0 dB"
 
 
+@pytest.mark.slow
 def test_distances_with_keys_and_mouse(page):
     page.press("d")
     for point in BRIGHT:
@@ -170,6 +172,7 @@ def test_two_images_swiped_and_blinked(page):
     page.wait_until("document.querySelector('#name-0').textContent !== 'tolerance'")
 
 
+@pytest.mark.slow
 def test_the_address_keeps_the_view(page, folder):
     go(page, *BRIGHT[0])
     page.press("[")
@@ -205,6 +208,7 @@ def test_an_address_far_away_ends_beside_the_image(page, folder):
     assert abs(v) < 100
 
 
+@pytest.mark.slow
 def test_fits_a_narrow_window(page, folder):
     page.open(folder / "index.html", width=400, height=700)
     assert page.js("document.querySelector('#panel').hidden")
@@ -221,6 +225,7 @@ def test_fits_a_narrow_window(page, folder):
     assert page.js(outside) == []
 
 
+@pytest.mark.slow
 def test_two_fingers_zoom_about_their_middle(page, folder):
     page.open(folder / "index.html", width=400, height=700)
     page.move(200, 300)
@@ -242,6 +247,7 @@ def test_the_scale_bar_has_the_scale_of_the_image(page):
     assert pixels_per_metre(page) == pytest.approx(50, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_slanted_grid_with_a_georeference_and_patches(browser, tmp_path, monkeypatch):
     """Steps of 3 and 2 cm, turned by 30 degrees; degrees as if Earth were flat."""
     turn = np.radians(30)
@@ -290,6 +296,7 @@ def test_a_slanted_grid_with_a_georeference_and_patches(browser, tmp_path, monke
     assert browser.errors == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["removed", "empty", "cut"])
 def test_missing_tiles_are_named(browser, folder, tmp_path, damage):
     shutil.copytree(folder, tmp_path / "web")
@@ -324,6 +331,7 @@ def test_an_incomplete_copy_says_what_is_missing(browser, folder, tmp_path):
     assert "copy the whole folder" in browser.text("#trouble")
 
 
+@pytest.mark.slow
 def test_rows_stay_apart_where_columns_are_far_closer(browser, tmp_path):
     """Rows of 1 m with columns of 1 mm: seen as a whole, pixels are 10 dots high."""
     rows, columns = 30, 20_000

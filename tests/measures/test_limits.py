@@ -229,6 +229,7 @@ def test_echoes_from_the_unambiguous_range_end_with_the_ping_interval(wide):
     assert wide["last_echo_s"].value * wide["ping_rate_hz"].limit == pytest.approx(1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sonar", "advance_m", "interval_s"),
     [
@@ -282,6 +283,7 @@ def test_coarse_pixels_miss_targets():
     assert clsas.limits(WIDE, TRACK, depth)["range_pixel_m"].value < 0.001
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "names", "reason"),
     [
@@ -334,6 +336,7 @@ def test_every_result_is_given_or_missing(wide):
         assert all(np.isfinite(each.value) for each in found.results)
 
 
+@pytest.mark.slow
 def test_heights_of_two_banks():
     sonar, pings = Sonar.hisas_1030(), 81
     track = Track.straight([-20, 0, 15], [2, 0, 0], pings, 0.25)

@@ -97,6 +97,7 @@ def test_a_beam_counts_in_every_image(lines):
     assert narrow.exact.azimuth.resolution_m > 1.5 * exact.azimuth.resolution_m
 
 
+@pytest.mark.slow
 def test_an_image_on_points_has_no_response(lines):
     grid = Grid.points(GRID.positions_m(slice(0, 2), slice(0, 3)).reshape(-1, 3))
     measured = clsas.tradeoff(lines, grid, tolerances_db=(-40,), repeats=1)
@@ -107,6 +108,7 @@ def test_an_image_on_points_has_no_response(lines):
     assert measured.describe().splitlines()[1].split()[-4:] == ["-"] * 4
 
 
+@pytest.mark.slow
 def test_default_stages_leave_a_line_and_a_pixel(lines):
     small = Grid.plane((-0.02, 0.06, 9), (40.2, 40.4, 30))
     measured = clsas.tradeoff(lines, small, tolerances_db=(), repeats=1)

@@ -14,6 +14,7 @@ import pytest
 from reliefs import banks, flat_banks, truth
 from scipy.ndimage import uniform_filter
 from stores import files_of, killed_at
+from tiers import also
 
 import clsas
 from clsas.core.digests import grid_digest
@@ -227,7 +228,7 @@ def test_beams_of_folders_do_not_change_as_they_grow(tmp_path):
         )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_one_warning_names_all_patches_that_miss_the_seabed(tmp_path):
     request = REQUEST | {"search_m": (0.8, 2.0)}
 
@@ -284,7 +285,7 @@ def test_a_given_window_is_not_decided_on_again(tmp_path, monkeypatch):
     assert files_of(store.path) == before
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_killed_run_continues_bit_for_bit(tmp_path):
     """Runs that are killed with SIGKILL after some patches."""
     program = f"""
@@ -341,6 +342,7 @@ def test_damaged_layers_are_found_and_measured_again(tmp_path):
     assert np.array_equal(again.heights().height_m, before, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_patches_without_heights_say_why(tmp_path):
     lines = [each.tapered_ends(1.0) for each in flat_banks()]
     grid = clsas.Grid.plane((-0.6, 0.6, 61), (41.2, 57.2, 801))
@@ -393,9 +395,7 @@ def write_patch(store, layers, window):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("small")
-@pytest.mark.parametrize(
-    "patch_shape", [MIXED, pytest.param(OF_PATCHES, marks=pytest.mark.exhaustive)]
-)
+@pytest.mark.parametrize("patch_shape", [MIXED, *also(OF_PATCHES)])
 def test_levels_of_layers(tmp_path, patch_shape):
     store, layers = filled_store(tmp_path / "a.zarr", patch_shape)
     for window in patches_of(patch_shape):
@@ -429,6 +429,7 @@ def test_levels_of_layers(tmp_path, patch_shape):
     np.testing.assert_allclose(part.sd_m[:-1], expected.sd_m[:-1], rtol=1e-6)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("small")
 @pytest.mark.parametrize("amplitude", [1e-30, 1e30])
 def test_overviews_have_amplitudes_of_any_size(tmp_path, amplitude):

@@ -96,6 +96,7 @@ def expected(factor, pixels=PIXELS):
     return np.array(amplitude), np.array([[block.mean() for block in row] for row in blocks])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("patch_shape", "levels"),
     [
@@ -165,6 +166,7 @@ def test_a_store_killed_at_any_step_ends_bit_identical(tmp_path, monkeypatch, pa
     assert kills > 8
 
 
+@pytest.mark.slow
 def test_patches_can_be_written_side_by_side(tmp_path):
     one = finished(tmp_path / "one.zarr", MIXED)
     store = begun(tmp_path / "many.zarr", MIXED)
@@ -221,6 +223,7 @@ def test_records_are_read_again_only_if_they_have_changed(tmp_path, monkeypatch)
     assert store.levels == (2, 4)
 
 
+@pytest.mark.slow
 def test_the_overview_reads_the_level_that_makes_up_its_pixels(tmp_path, monkeypatch):
     store = finished(tmp_path / "a.zarr", OF_PATCHES)
     plain = {}
@@ -260,6 +263,7 @@ def test_the_overview_reads_the_level_that_makes_up_its_pixels(tmp_path, monkeyp
     assert set(read) == {"pixels"}  # the part begins within a pixel of a level, or lacks pixels
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["2x/pixels/c/1/1", "4x/amplitude/c/1/1", "pixels/c/3/2"])
 def test_damaged_chunks_of_patches_are_found(tmp_path, name):
     store = finished(tmp_path / "a.zarr", OF_PATCHES)
@@ -375,6 +379,7 @@ class TestStoresOfVersion2:
         assert not store.complete_levels()
         np.testing.assert_array_equal(store.read(), PIXELS)
 
+    @pytest.mark.slow
     def test_levels_can_be_added(self, store, tmp_path):
         path = store.path
         write(store, patches_of(ODD)[-1])
@@ -393,6 +398,7 @@ class TestStoresOfVersion2:
         result = CliRunner().invoke(main, ["mosaic", "--add-levels", "--json", "-o", str(path)])
         assert json.loads(result.stdout)["added"] is False
 
+    @pytest.mark.slow
     def test_they_can_be_added_before_the_last_patch(self, store):
         assert store.add_levels()
         write(store, patches_of(ODD)[-1])
@@ -418,6 +424,7 @@ class TestStoresOfVersion2:
         assert step > 14
 
 
+@pytest.mark.slow
 def test_a_mosaic_forms_levels_and_continues_patches_of_other_sides(tmp_path, monkeypatch):
     """As those of early versions, which are not rounded for levels."""
     with monkeypatch.context() as patch:

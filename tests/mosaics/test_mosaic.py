@@ -108,6 +108,7 @@ def test_a_store_opens_in_xarray(file, tmp_path, exact):
     assert np.abs(data.pixels.values).max() == pytest.approx(np.abs(exact.pixels).max(), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_overview_keeps_power_and_place(file, tmp_path, exact):
     for _ in clsas.mosaic(file, GRID, tmp_path / "image.zarr", **REQUEST):
         pass
@@ -810,6 +811,7 @@ class TestFollowing:
         add([4])
         assert seen() == (900, [f"{n}.h5" for n in range(5)])
 
+    @pytest.mark.slow
     def test_a_folder_that_stays_empty(self, tmp_path):
         (tmp_path / "none").mkdir()
         with pytest.raises(ValueError, match="has no file"):

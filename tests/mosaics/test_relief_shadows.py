@@ -75,6 +75,7 @@ def expected_of(height_m):
     return in_shadow(GRID, height_m, sd_m, valid, tangents(), WINDOW)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_shadows_are_those_of_a_relief_in_memory(tmp_path, seed):
     """In any order of the patches, and whatever each of them took for shadow."""
@@ -106,6 +107,7 @@ def test_shadows_are_those_of_a_relief_in_memory(tmp_path, seed):
     assert mask_shadows(store) == 0
 
 
+@pytest.mark.slow
 def test_pixels_leave_the_shadow_if_its_patch_is_measured_again(tmp_path):
     height_m, store = seabed(), begun(tmp_path / "a.zarr")
     none = np.zeros(GRID.shape, bool)
@@ -124,6 +126,7 @@ def test_pixels_leave_the_shadow_if_its_patch_is_measured_again(tmp_path):
     assert expected_of(height_m).any()
 
 
+@pytest.mark.slow
 def test_patches_without_heights_hide_nothing(tmp_path):
     height_m, store = seabed(), begun(tmp_path / "a.zarr")
     of_wall = slice(0, PATCH[0])

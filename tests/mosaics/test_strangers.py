@@ -56,6 +56,7 @@ def trusting(monkeypatch):
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_digests", [True, False])
 @pytest.mark.parametrize("name", ["height", "pixels", "x"])
 @pytest.mark.usefixtures("trusting")
@@ -159,6 +160,7 @@ def test_zarr_is_given_what_was_checked(path, monkeypatch):
         np.testing.assert_array_equal(clsas.Store.opened(path).read(), expected)
 
 
+@pytest.mark.slow
 def test_a_store_that_claims_more_than_memory_is_refused(path, monkeypatch):
     """A few bytes can claim 50 000 x 50 000 heights of zero."""
     side = 50_000

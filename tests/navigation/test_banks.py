@@ -36,6 +36,7 @@ def check_alike(both, alone, lines):
     np.testing.assert_allclose(apart_m, np.tile([0, 0, BASELINE_M], (len(apart_m), 1)), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_micronavigation_corrects_both_banks():
     sonar = two_banks(16, 0.03)
     random = np.random.default_rng(0)

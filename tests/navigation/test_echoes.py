@@ -12,6 +12,7 @@ from studies.navigating import (
     seabed,
     with_noise,
 )
+from tiers import few
 
 import clsas
 from clsas.navigation.echoes import block_products, independent_echoes
@@ -47,7 +48,9 @@ def navigate(lines, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("count", "noise"), [(1, False), (1, True), (3, False)])
+@pytest.mark.parametrize(
+    ("count", "noise"), few([(1, False), (1, True), (3, False)], often=[(1, False)])
+)
 def test_few_reflectors_do_not_determine_yaw(count, noise):
     """Their directions look like a yaw."""
     lines = correct(reflectors(count, 3), 8)
@@ -67,7 +70,7 @@ def test_few_reflectors_determine_sway(count):
     assert np.std(detrended(found.sway_m)) <= 3 * found.shape_sd_m.max()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("count", [12, 30])
 def test_deviations_over_some_reflectors_match_the_errors(count):
     """All reflectors are near broadside, whereas the filters expect an even seabed."""
@@ -120,7 +123,7 @@ def test_blocks_add_up_to_the_correlation(lag):
     np.testing.assert_allclose(found.sum(axis=1), expected, rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_few_pairs_of_few_echoes_are_used_and_counted():
     """The first pings see speckle, and the last ones little more than one bright corner."""
     lines = correct(lambda track: seabed(track, NEAR_M, FAR_M, 5000, seed=3), 16)

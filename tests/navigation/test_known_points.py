@@ -204,6 +204,7 @@ def test_time_and_speed_cannot_be_distinguished_at_one_range():
     assert other.unknowns == ("sound_speed",)
 
 
+@pytest.mark.slow
 def test_lever_arm_out_of_a_plane_is_not_determined():
     track = clsas.Track.straight((0, 0, 0), (0.05, 0, 0), 120, 1.0)
     at = np.array([[2.0, 12.0, 0.0], [4.0, 18.0, 0.0]])
@@ -214,6 +215,7 @@ def test_lever_arm_out_of_a_plane_is_not_determined():
     assert found.lever_arm_m == pytest.approx([0.1, 0, 0], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_point_that_some_channels_do_not_see(lines):
     """One point is outside the beam in half of the pings, and another one does not exist."""
     samples = lines.samples.copy()
@@ -261,6 +263,7 @@ def test_reflectors_are_not_mistaken_for_each_other(lines):
         calibrate_track(lines, wrong)
 
 
+@pytest.mark.slow
 def test_bad_input(lines):
     with pytest.raises(TypeError, match="lines must be of type RangeLines"):
         calibrate_track(POINTS, POINTS)

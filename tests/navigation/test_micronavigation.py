@@ -24,6 +24,7 @@ from studies.navigating import (
     straight_lines,
     voyage,
 )
+from tiers import also
 
 import clsas
 from clsas.cli import main
@@ -250,7 +251,7 @@ def test_an_advance_that_differs_is_found():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("every", [2, 5])
+@pytest.mark.parametrize("every", [5, *also(2)])
 def test_sparse_arrays_do_not_take_side_lobes_for_an_advance(every):
     """Elements are shorter than their spacing, so that neighbours share no speckle."""
     sonar, advance_m = overlapping_array(48, 16)
@@ -313,7 +314,7 @@ def swaying():
     return small(sway_m=0.004 * np.sin(np.arange(8)))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_deviations_are_no_larger_than_those_of_the_navigation(swaying):
     for unknowns in (("sway",), ("sway", "yaw", "surge")):
         for correlation in (None, 2.0, 1e4):

@@ -78,6 +78,7 @@ def test_nor_does_it_for_a_sheet_of_channels(name, tolerance_db, poison):
     assert found.tobytes() == wanted.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance_db", [-40, -60])
 def test_lines_that_an_earlier_batch_left_do_not_matter(tolerance_db):
     """Stages of sheets add to lines that they set to zero, which roots formed before have used."""

@@ -80,6 +80,7 @@ def allocated(monkeypatch):
     return sizes
 
 
+@pytest.mark.slow
 def test_a_run_allocates_what_was_predicted(case, allocated):
     lines, grid, chosen, sizes = case
     factorize(lines, grid, chosen)
@@ -112,6 +113,7 @@ def test_memory_is_the_sum_of_all_buffers(case):
     assert chosen.memory_bytes == total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beam", [None, BEAMS[0], NORMALISING], ids=str)
 @pytest.mark.parametrize("make", [straight, hills, moving_array])
 def test_an_exact_run_allocates_what_was_predicted(make, beam, allocated, monkeypatch):

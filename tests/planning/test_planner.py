@@ -307,6 +307,7 @@ def test_a_beam_that_swings_past_within_few_channels_is_not_factorized(slope, is
     assert plan(lines, grid, **request).is_exact == is_exact
 
 
+@pytest.mark.slow
 def test_an_image_that_lies_in_a_gap_of_the_track_is_not_factorized():
     """Where hardly a pixel sees a channel, errors are as large as the image."""
     lines, grid = over(around(0.74, 18, shape=(200, 360)), with_gap(1000, 0.022, 7.2))

@@ -77,6 +77,7 @@ GRIDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())
 def test_labels_of_images_do_not_overlap(grid):
     check_labels(plot.image_db(speckle(grid), title="An image of speckle"))

@@ -47,6 +47,7 @@ def test_a_plan_of_an_exact_image_has_one_bar():
         plot.plan("a plan")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("extents_m", "labels"),
     [

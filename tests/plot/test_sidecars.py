@@ -8,6 +8,7 @@ import clsas
 pytest.importorskip("matplotlib")
 
 
+@pytest.mark.slow
 def test_a_picture_over_an_exported_one_is_not_taken_for_a_map(tmp_path):
     pytest.importorskip("pyproj")
     place = clsas.Georeference.local(60.39, 5.32, heading_deg=30.0)

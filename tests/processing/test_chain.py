@@ -617,6 +617,7 @@ def test_the_command_refuses_a_grid_that_no_line_reaches(plain):
     assert not clsas.load(plain.with_suffix("") / "image.h5").pixels.any()
 
 
+@pytest.mark.slow
 def test_one_of_two_banks_is_imaged(plain):
     """The first one, or the one that the scene names; corrections keep the lines of both."""
     path = plain.parent / "lines.h5"

@@ -8,6 +8,7 @@ import ultrasound
 import clsas
 
 
+@pytest.mark.slow
 def test_a_capture_of_an_ultrasonic_array(recording, platform):
     lines = clsas.load(recording(ultrasound.RECORDING))
     # About the notch: the back wall is a mirror, whose image hardly depends on the sign.
@@ -21,6 +22,7 @@ def test_a_capture_of_an_ultrasonic_array(recording, platform):
     assert found.sign.ratio < 1 / 3
 
 
+@pytest.mark.slow
 def test_a_pass_of_a_radar(recording, platform):
     lines = clsas.load(recording(radar.RECORDINGS[0]))
     grid = clsas.Grid.plane((-40, 40, 100), (-40, 40, 100))

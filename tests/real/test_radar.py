@@ -146,6 +146,7 @@ def test_degrees_add_up_coherently(images, total):
     assert clsas.relative_error_db(total, summed) < -120
 
 
+@pytest.mark.slow
 def test_accumulated_image_is_that_of_all_pulses_at_once(histories, total):
     antenna_m = np.concatenate([h.antenna_m for h in histories])
     frequency_hz = histories[0].frequency_hz
@@ -163,6 +164,7 @@ def test_accumulated_image_is_that_of_all_pulses_at_once(histories, total):
     assert clsas.relative_error_db(total, at_once) < -60
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rows", "columns"),
     [

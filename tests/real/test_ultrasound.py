@@ -118,6 +118,7 @@ def test_back_wall_is_flat_and_where_it_is(image):
     assert np.ptp(depth_m) <= 0.2e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [NOTCH_TIP_M, (0.0, 40.9e-3)], ids=["notch tip", "back wall"])
 def test_image_is_the_direct_sum_of_the_recorded_samples(echoes, image, place):
     rows, columns = pixels_about(image, *place)
@@ -126,6 +127,7 @@ def test_image_is_the_direct_sum_of_the_recorded_samples(echoes, image, place):
     assert clsas.relative_error_db(image.pixels[rows, columns], reference) < -60
 
 
+@pytest.mark.slow
 def test_lines_still_on_their_carrier_give_the_same_image(lines, image):
     """A p(r - rho) exp(-j 2 k rho) times exp(+j 2 k r) is a line of carrier 0."""
     range_m = lines.first_range_m[:, None] + np.arange(lines.length) * lines.range_step_m
@@ -142,6 +144,7 @@ def test_lines_still_on_their_carrier_give_the_same_image(lines, image):
     assert clsas.relative_error_db(again, image) < -60
 
 
+@pytest.mark.slow
 def test_a_pair_stands_for_its_reverse(lines, image):
     """The 4096 channels of the full matrix give the image of the 2080 weighted ones."""
     both = clsas.RangeLines(

@@ -42,6 +42,7 @@ def test_a_report_needs_no_git(tmp_path):
     assert "commit unknown (git is not installed)" in report.read_text()
 
 
+@pytest.mark.slow
 def test_a_device_that_is_missing_is_named_and_nothing_is_written(tmp_path):
     report = tmp_path / "report.md"
     done = run("--device", "abacus", "--out", report)

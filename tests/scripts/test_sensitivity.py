@@ -18,6 +18,7 @@ def test_tuned_constants_are_numbers_that_may_be_changed():
     assert not {"STACK", "CHUNK", "BEST_TOLERANCE_DB", "TAPS"} & found
 
 
+@pytest.mark.slow
 def test_neighbours_are_half_and_twice_the_value_or_the_power():
     assert named("_LEAF_SHARE").neighbours == (0.125, 0.5)
     assert named("MEASURED_CHANNELS").neighbours == (128, 512)

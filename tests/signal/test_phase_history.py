@@ -45,6 +45,7 @@ def lines_of(parts, sign=-1, **options):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own_steps", [False, True], ids=["one step", "own steps"])
 @pytest.mark.parametrize("bistatic", [False, True], ids=["monostatic", "bistatic"])
 def test_a_point_is_a_pulse_at_its_range_with_the_phase_of_the_carrier(bistatic, own_steps):

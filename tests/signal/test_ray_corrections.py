@@ -98,6 +98,7 @@ def test_a_beam_leaves_out_nodes_that_see_nothing(beam):
     assert np.std(error(found[near])) < 2e-3
 
 
+@pytest.mark.slow
 def test_the_error_is_that_of_groups_of_pixels():
     """Twice the distance to the pixel with the correction has twice the error."""
     errors = []

@@ -96,6 +96,7 @@ def test_delays_to_a_level_seabed_are_exact(name):
     assert error < bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("relief_m", [0.05, 0.5])
 @pytest.mark.parametrize("name", ["level", "heave", "bistatic", "moving"])
 def test_delays_to_a_relief(name, relief_m):
@@ -138,6 +139,7 @@ def test_a_rock_between_the_sample_pixels_is_seen(height_m):
     assert homogeneous(over(grid), grid, None, None).grid.points_m is not None
 
 
+@pytest.mark.slow
 def test_a_rock_in_a_shadow_zone_is_refused():
     profile = SoundSpeed([0, 80], [1500, 1420])
     grid = Grid.plane((-2, 2, 81), (343, 347, 81), SEABED)
@@ -149,6 +151,7 @@ def test_a_rock_in_a_shadow_zone_is_refused():
         homogeneous(lines, grid.with_height(rock), None, None)
 
 
+@pytest.mark.slow
 def test_a_beam_limits_what_has_to_be_right():
     """Without it, channels 200 m away would have no ray to the grid."""
     lines = over(tx=along_x(400, 1.0, z=-6.0))
@@ -227,6 +230,7 @@ def test_an_error_that_is_left_is_reported():
         homogeneous(lines, wide.with_height(heights), None, -60)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("request_db", [{"tolerance_db": -60}, {"accuracy_db": -60}])
 def test_an_exact_image_finds_its_water_once(request_db, monkeypatch):
     """One that was planned takes that of its plan, and the user is warned once."""

@@ -77,6 +77,7 @@ def test_a_loud_channel_leaves_only_its_own_cells_in_range():
     assert found < 0.3 * even
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width_deg", [0.4, 1.5, 4.0, 60.0])
 def test_beams_change_which_pixels_are_independent(width_deg):
     lines, image, beam = straight(60, 4.0), grid(1.0, 0.4), BeamWindow(width_deg, "hann")
@@ -88,6 +89,7 @@ def test_beams_change_which_pixels_are_independent(width_deg):
     assert found == pytest.approx(1 / measured, rel=0.35)
 
 
+@pytest.mark.slow
 def test_beams_that_normalise_change_which_pixels_count():
     lines, image = straight(60, 4.0), grid(6.0, 0.4)
     beam = BeamWindow(6.0, "hann", normalise=True)

@@ -82,6 +82,7 @@ def test_nothing_is_said_of_lines_of_zeros():
     assert heard(lambda: plan(silent, FAR, tolerance_db=-40, costs=Costs())) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [15.0, 450.0, 1350.0])
 def test_lines_of_fast_receivers_reach_the_pixels_in_their_range(speed):
     """Behind a moving receiver, range changes faster than distance."""

@@ -68,6 +68,7 @@ def test_a_track_across_the_date_line_lies_together():
     assert np.ptp(track.positions_m[:, 0]) == pytest.approx(1.5 * 19, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_the_place_of_a_track_reaches_the_image():
     """Through echoes, lines and grid."""
     track = clsas.Track.from_geographic(

@@ -62,6 +62,7 @@ def test_no_position_that_touches_a_box_is_missed(name, count, largest_m):
     assert not (between & ~within).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["narrow", "squinted", "wide"])
 def test_few_other_positions_are_found(name):
     beam, boxes = BEAMS[name], some_boxes(200, 0.5)

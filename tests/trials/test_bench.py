@@ -138,6 +138,7 @@ def test_scaling_fits_exponents_and_writes_them(monkeypatch, tmp_path, capsys):
     assert (tmp_path / "s.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_intervals_of_exponents_contain_the_true_one_as_often_as_they_claim():
     random, sizes = np.random.default_rng(1), np.array([64, 256, 384, 512, 768, 1024])
     found = [

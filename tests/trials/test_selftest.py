@@ -70,6 +70,7 @@ def test_the_command_prints_a_table(small):
     assert "2 of 2 within bounds" in result.stdout
 
 
+@pytest.mark.slow
 def test_a_miss_is_told_and_is_exit_code_1(small, monkeypatch):
     monkeypatch.setattr(selftest, "IMAGERS", selftest.IMAGERS | {"exact": _doubled})
     result = CliRunner().invoke(main, ["selftest", "--json"])

@@ -15,6 +15,7 @@ def shadow():
     return wreck.Shadow(wreck.scene())
 
 
+@pytest.mark.slow
 def test_shadow_lies_behind_the_wreck(shadow):
     ground, dark, light = shadow.masks
     assert not (dark & light).any()
@@ -83,6 +84,7 @@ def test_benchmark(monkeypatch):
         assert result[speedup] == pytest.approx(ratio)
 
 
+@pytest.mark.slow
 def test_the_scene_of_two_banks_keeps_every_limit():
     """Each bank alone, with the baseline that the scene states."""
     scene = wreck.scene("wreck_two_banks")
