@@ -41,7 +41,7 @@ def test_shared_generators_are_seen(code):
     assert list(generators(ast.parse(f"def f():\n    {code}"))) == []
 
 
-@pytest.mark.slow
+@pytest.mark.watches("tests/conftest.py")
 def test_the_seed_that_is_printed_repeats_the_order():
     """Files, and the tests of each, are shuffled; a file is run whole."""
 

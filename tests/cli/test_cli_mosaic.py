@@ -14,6 +14,7 @@ import pytest
 from click.testing import CliRunner
 from interrupt import interrupted
 from rich.console import Console
+from tiers import also
 
 import clsas
 from clsas.cli import main, mosaics
@@ -78,7 +79,7 @@ def test_the_same_command_goes_on(made):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [(), ("--workers", "2")], ids=["alone", "workers"])
+@pytest.mark.parametrize("workers", [(), *also(("--workers", "2"))], ids=["alone", "workers"])
 def test_ctrl_c_keeps_what_is_finished(made, tmp_path, workers):
     """It ends with 130, and the same command goes on."""
     command = ["mosaic", made[0] / "scene.toml", "--lines", lines_of(made)]

@@ -120,7 +120,7 @@ def test_the_carrier_is_that_of_moving_arrays_and_squinted_beams(tmp_path):
     assert error_db(found, expected) < 10 * np.log10(10 ** (stated_db / 10) + 4e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_beam_that_ends_abruptly_states_its_error_or_is_refused(tmp_path):
     place = local(217.0)
     lines, grid = lines_of(place, "speckle"), grid_of(place, 0.0125)
@@ -131,7 +131,7 @@ def test_a_beam_that_ends_abruptly_states_its_error_or_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_error_of_a_beam_with_kinks_is_stated(tmp_path):
     """The second derivative of these weights jumps, so that frequencies reach far."""
     place = local(217.0)
@@ -162,7 +162,7 @@ def test_a_mosaic_is_resampled_window_by_window(tmp_path, monkeypatch):
     assert max(stated_db, of_parts_db) < -60
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_pixels_of_which_nothing_was_received_stay_0(tmp_path):
     place = local(217.0)
     lines, grid = lines_of(place, "speckle"), grid_of(place, 0.008)
@@ -186,7 +186,7 @@ def test_pixels_of_which_nothing_was_received_stay_0(tmp_path):
     assert relative_error_db(found[away], whole[away]) < -55
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_carrier_follows_the_middle_of_the_band():
     """Its slope at a pixel is the mean of the frequencies there, far and near."""
     place = local(0.0)

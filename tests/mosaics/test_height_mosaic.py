@@ -326,7 +326,7 @@ def test_a_killed_run_continues_bit_for_bit(tmp_path):
     assert not store.array_damage()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_damaged_layers_are_found_and_measured_again(tmp_path):
     store = clsas.mosaic_heights(*flat_banks(), GRID, tmp_path / "a.zarr", **REQUEST)
     before = store.heights().height_m
@@ -342,7 +342,7 @@ def test_damaged_layers_are_found_and_measured_again(tmp_path):
     assert np.array_equal(again.heights().height_m, before, equal_nan=True)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_patches_without_heights_say_why(tmp_path):
     lines = [each.tapered_ends(1.0) for each in flat_banks()]
     grid = clsas.Grid.plane((-0.6, 0.6, 61), (41.2, 57.2, 801))

@@ -133,7 +133,7 @@ def test_powers_beyond_single_precision_are_kept(scale):
     np.testing.assert_allclose(coarser.amplitude, scale * expected(4)[0], rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("patch_shape", [MIXED, ODD])
 def test_a_store_killed_at_any_step_ends_bit_identical(tmp_path, monkeypatch, patch_shape):
     """While a patch is written anew with other pixels, or while levels are computed."""
@@ -406,7 +406,7 @@ class TestStoresOfVersion2:
         assert store.complete_levels()
         np.testing.assert_allclose(store.read_level(8), expected(8)[0], rtol=1e-6)
 
-    @pytest.mark.slow
+    @pytest.mark.exhaustive
     def test_adding_is_killed_at_any_step(self, store, tmp_path, monkeypatch):
         whole = tmp_path / "whole.zarr"
         shutil.copytree(store.path, whole)

@@ -100,7 +100,7 @@ def test_a_finished_mosaic_does_not_hand_out_damage(path):
         mosaic.image()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_any_bit_of_a_record_is_found_or_plays_no_part(path, kept):
     chance = np.random.default_rng(1)
     expected = read_attributes((path / RECORD).parent)

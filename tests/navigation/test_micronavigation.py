@@ -52,7 +52,7 @@ def noisy():
     return noisy_runs()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("coherence", COHERENCES)
 def test_errors_reach_the_bound(noisy, coherence):
     mean = np.mean([run.coherence.mean() for run in noisy[coherence]])
@@ -287,7 +287,7 @@ def test_the_command(straight, tmp_path):
     assert "NEAR:FAR" in refused.output
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_order_of_receivers_does_not_matter(straight):
     """Receivers may be numbered from the bow or from the stern."""
     order = np.concatenate([np.arange(48)[::-1] + start for start in straight.ping_starts])
