@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from cases import along_x, bright_where_coverage_ends, lines_over
 from factorizing import EXACT_IS_SLOW, around, over
+from tiers import also, few, thinned
 
 from clsas import plan
 from clsas.core.grid import Grid
@@ -29,24 +30,22 @@ def assert_kept(lines, grid, tolerance_db, beam=None, *, factorized=True):
     assert error_db <= chosen.predicted_error_db <= tolerance_db
 
 
-@pytest.mark.parametrize("tolerance_db", [-20, -40])
-@pytest.mark.parametrize("band", [0.005, 0.02, 0.2])
+@pytest.mark.parametrize(("band", "tolerance_db"), thinned([0.005, 0.02, 0.2], [-20, -40]))
 def test_narrow_bands_of_receivers_apart_from_the_transmitter(band, tolerance_db):
     """Ranges of such a receiver grow by another factor than those from the mean track."""
     lines, _ = over(GRID, TRACK, TRACK + [0, 0, 10.0], carrier_hz=100e3, band=band)
     assert_kept(lines, GRID, tolerance_db)
 
 
-@pytest.mark.parametrize("tolerance_db", [-20, -40])
-@pytest.mark.parametrize("band", [0.005, 0.1])
+@pytest.mark.parametrize(("band", "tolerance_db"), thinned([0.005, 0.1], [-20, -40]))
 def test_receivers_whose_velocity_changes(band, tolerance_db):
     velocity = np.random.default_rng(0).normal(0, 5 / np.sqrt(3), TRACK.shape)
     lines, _ = over(GRID, TRACK, carrier_hz=100e3, band=band, velocity=velocity)
     assert_kept(lines, GRID, tolerance_db)
 
 
-@pytest.mark.parametrize("tolerance_db", [-20, -40])
-@pytest.mark.parametrize("band", [0.005, 0.1])
+@pytest.mark.parametrize("tolerance_db", [-40, *also(-20)])
+@pytest.mark.parametrize("band", [0.005, *also(0.1)])
 def test_a_raster_of_receivers_above_the_transmitters(band, tolerance_db):
     row, column = np.mgrid[0:20, 0:40]
     tx_m = 0.1 * np.stack([column - 19.5, 0 * row, row], axis=-1).reshape(-1, 3)
@@ -65,9 +64,9 @@ def headings():
     return np.concatenate(tx_m), np.concatenate(along)
 
 
-@pytest.mark.parametrize("tolerance_db", [-30, -50])
-@pytest.mark.parametrize("beam", ["none", "hann"])
-@pytest.mark.parametrize("x_m", [0.0, 3.0])
+@pytest.mark.parametrize(
+    ("x_m", "beam", "tolerance_db"), thinned([0.0, 3.0], ["none", "hann"], [-30, -50])
+)
 def test_a_beam_that_sees_parts_of_passes(x_m, beam, tolerance_db):
     """At 3 m the first pass leads over the grid, and its beam sees nothing of it."""
     tx_m, along = headings()
@@ -77,8 +76,7 @@ def test_a_beam_that_sees_parts_of_passes(x_m, beam, tolerance_db):
     assert_kept(lines, grid, tolerance_db, window)
 
 
-@pytest.mark.parametrize("louder_db", [20, 40])
-@pytest.mark.parametrize("off_wavelengths", [0.5, 2.0])
+@pytest.mark.parametrize(("off_wavelengths", "louder_db"), thinned([0.5, 2.0], [40, 20]))
 def test_a_loud_channel_off_the_mean_track(off_wavelengths, louder_db):
     """The error of each channel counts with its power."""
     track = along_x(400, 0.035)
@@ -94,8 +92,17 @@ def test_a_loud_channel_off_the_mean_track(off_wavelengths, louder_db):
 BEAM = BeamWindow(20.0, "hann", along=[1, 0, 0])
 
 
-@pytest.mark.parametrize("tolerance_db", [-25, -50])
-@pytest.mark.parametrize(("x_m", "seabed"), [(4.0, 0), (4.4, 0), (4.8, 0), (4.4, 300)])
+@pytest.mark.parametrize(
+    ("x_m", "seabed", "tolerance_db"),
+    few(
+        [
+            (x_m, seabed, tolerance_db)
+            for x_m, seabed in ((4.0, 0), (4.4, 0), (4.8, 0), (4.4, 300))
+            for tolerance_db in (-25, -50)
+        ],
+        often=[(4.8, 0, -50), (4.4, 300, -25)],
+    ),
+)
 def test_bright_points_where_coverage_ends(x_m, seabed, tolerance_db):
     """Most of what the beam passes cancels, and errors do not."""
     lines, grid = bright_where_coverage_ends(x_m, seabed=seabed)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from reliefs import GRID, banks, flat_banks, truth
-from tiers import few
+from tiers import also, few
 
 import clsas
 from clsas.core.validate import ClsasWarning
@@ -490,7 +490,7 @@ class TestBadInput:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("height_m", [0.2, -1.5])
+@pytest.mark.parametrize("height_m", [-1.5, *also(0.2)])
 def test_refraction_does_not_displace_heights(height_m):
     """Through a thermocline, heights are right with the profile, and far off without it."""
     random = np.random.default_rng(3)

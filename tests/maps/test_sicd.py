@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from placed import UTM_NORTH, local
+from tiers import thinned
 
 import clsas
 
@@ -87,8 +88,9 @@ def exported(source, path, remarks=(), **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", PLACES, ids=str)
-@pytest.mark.parametrize("turn", [None, "transposed", "reversed"])
+@pytest.mark.parametrize(
+    ("place", "turn"), thinned(PLACES, [None, "transposed", "reversed"]), ids=str
+)
 def test_pixels_and_places_come_back(place, turn, tmp_path):
     image = image_of(place, turn)
     pixels, tree, root = exported(image, tmp_path / "a.nitf", lines=lines_of(place))

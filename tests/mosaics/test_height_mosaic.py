@@ -393,7 +393,7 @@ def write_patch(store, layers, window):
     )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("small")
 @pytest.mark.parametrize("patch_shape", [MIXED, *also(OF_PATCHES)])
 def test_levels_of_layers(tmp_path, patch_shape):

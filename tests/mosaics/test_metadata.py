@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from stores import GRID, LINES, REQUEST, change, change_metadata, files_of
+from tiers import name_of, thinned
 
 import clsas
 from clsas.cli import main
@@ -44,7 +45,7 @@ def test_a_whole_store_has_no_damage(path):
     assert (found["damaged_arrays"], found["has_digests"]) == ({}, True)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_any_bit_of_metadata_is_found_or_plays_no_part(path, kept, name):
     chance = np.random.default_rng(3)
@@ -62,7 +63,7 @@ def test_any_bit_of_metadata_is_found_or_plays_no_part(path, kept, name):
     assert found > 20
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", VALUES)
 def test_any_bit_of_coordinates_and_heights_is_found(path, kept, name):
     chance = np.random.default_rng(4)
@@ -120,8 +121,9 @@ def zeros(path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["x", "y", "height"])
-@pytest.mark.parametrize("damage", [remove, empty, replace, zeros])
+@pytest.mark.parametrize(
+    ("damage", "name"), thinned([remove, empty, replace, zeros], ["x", "y", "height"]), ids=name_of
+)
 def test_coordinates_and_heights_are_repaired(path, kept, name, damage):
     damage(path / name)
     assert list(clsas.Store.opened(path).array_damage()) == [name]
@@ -129,8 +131,9 @@ def test_coordinates_and_heights_are_repaired(path, kept, name, damage):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", DOCUMENTS)
-@pytest.mark.parametrize("content", [None, b"", b"{}", b"[1]", b"\xff", b"{" * 100_000])
+@pytest.mark.parametrize(
+    ("content", "name"), thinned([None, b"", b"{}", b"[1]", b"\xff", b"{" * 100_000], DOCUMENTS)
+)
 def test_metadata_are_repaired(path, kept, name, content):
     (path / name).unlink()
     if content is not None:

@@ -75,7 +75,7 @@ def expected_of(height_m):
     return in_shadow(GRID, height_m, sd_m, valid, tangents(), WINDOW)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("seed", [1, 2])
 def test_shadows_are_those_of_a_relief_in_memory(tmp_path, seed):
     """In any order of the patches, and whatever each of them took for shadow."""
@@ -107,7 +107,7 @@ def test_shadows_are_those_of_a_relief_in_memory(tmp_path, seed):
     assert mask_shadows(store) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_pixels_leave_the_shadow_if_its_patch_is_measured_again(tmp_path):
     height_m, store = seabed(), begun(tmp_path / "a.zarr")
     none = np.zeros(GRID.shape, bool)
@@ -164,7 +164,7 @@ def see_through_banks(wall_m):
     ]  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_shadow_of_a_wall_crosses_patches(tmp_path):
     lines = see_through_banks(0.9)
     grid = clsas.Grid.plane((-0.4, 0.4, 41), (29.9, 34, 206))

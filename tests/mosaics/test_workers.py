@@ -47,7 +47,7 @@ def test_workers_answer_only_their_own_run(attack):
         assert client.submit(sum, (1, 3)).result(timeout=60) == 4  # nor did asking harm
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_asks_finds_what_dask_leaves_open(attack):
     """The test above fails with an ordinary cluster of Dask, as it should."""
     before = attack.listening(os.getpid())

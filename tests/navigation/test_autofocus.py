@@ -32,6 +32,7 @@ from studies.focusing import (
     white_m,
 )
 from studies.navigating import detrended
+from tiers import also, few
 
 import clsas
 from clsas.cli import main
@@ -43,7 +44,7 @@ CASES = "points-smooth", "points-beyond-resolution", "speckle-smooth"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", few(CASES, often=CASES[2:]))
 def test_smooth_sway_is_found(name):
     scene = SCENES[name]
     sway_m = scene.sway_m
@@ -114,7 +115,9 @@ def seen_from_above(motion, unknowns):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("wavelengths", "most"), [(0.3, 1 / 100), (2.0, 1 / 20)])
+@pytest.mark.parametrize(
+    ("wavelengths", "most"), few([(0.3, 1 / 100), (2.0, 1 / 20)], often=[(0.3, 1 / 100)])
+)
 def test_sway_and_heave(wavelengths, most):
     """Both are found together, even if they exceed the range resolution."""
     motion = {
@@ -151,7 +154,7 @@ def test_surge():
     assert abs(peak) <= 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.skipif(not RECORDED.exists(), reason=f"no recorded data at {RECORDED}")
 @pytest.mark.parametrize(("smooth", "white"), RADAR_ERRORS)
 def test_displacements_of_a_recorded_pass_are_undone(smooth, white):
@@ -293,7 +296,7 @@ def test_the_level_of_samples_does_not_matter(scale):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [4, 5])
+@pytest.mark.parametrize("seed", [4, *also(5)])
 def test_two_bright_points_are_too_few(seed):
     """Either the scene is reported as having no responses, or the track is found."""
     sway_m = smooth_m(2 * WAVELENGTH_M, seed)

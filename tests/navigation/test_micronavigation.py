@@ -341,7 +341,7 @@ def test_dead_receivers_are_left_out(swaying):
     assert np.std(detrended(found.sway_m - whole.sway_m)) < WAVELENGTH_M / 100
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_implausible_corrections_are_reported():
     """They far exceed the accuracy given for the navigation."""
     lines = small(yaw_rad=np.radians(3) * np.sin(np.arange(8)))

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from studies.focusing import GRID, PINGS, SONAR, points, recorded, smooth_m, speckle
+from tiers import also
 
 import clsas
 from clsas.core.validate import ClsasWarning
@@ -37,8 +38,8 @@ def suggested_m_s(lines, grid):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("percent", [-1.0, 0.3, 1.0])
-@pytest.mark.parametrize("scene", [points(3), speckle(20, 3)], ids=["points", "speckle"])
+@pytest.mark.parametrize("percent", [-1.0, *also(0.3, 1.0)])
+@pytest.mark.parametrize("scene", [points(3), *also(speckle(20, 3))], ids=["points", "speckle"])
 def test_a_wrong_speed_is_reported(scene, percent):
     true, _ = recorded(scene, np.zeros(PINGS))
     assert true.sound_speed_m_s == SPEED_M_S

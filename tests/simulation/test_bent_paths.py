@@ -68,7 +68,7 @@ def test_an_echo_is_that_of_the_direction_and_distance_in_which_it_appears(per_s
     assert np.abs(spectrum(straight) - spectrum(expected)).max() > 3e-3 * loud
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("angle_deg", [-3.3, -2.0, 4.0, 8.0, 20.0, 60.0])
 def test_spreading_is_that_of_a_tube_of_rays(angle_deg):
     """L^2 = D |dz/d angle| for the height z at which rays of neighbouring angles arrive."""
