@@ -34,4 +34,4 @@ def test_what_is_likely_to_find_a_fault_runs_first(mutants):
     assert first == ("fast", ["tests/sonar/test_beam.py::test_x"])
     assert last == ("change", ["tests"])
     near = [tests for _, tests in mutants.runs(kernel, ROOT, None)]
-    assert "tests/opencl" in near[0]
+    assert near[0][0] == "tests/imagers"
