@@ -15,6 +15,7 @@ import json
 import math
 import os
 import warnings
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -317,14 +318,14 @@ def with_fields(plan: clsas.Plan, fields: Mapping[str, Any]) -> clsas.Plan:
 
 
 def _packed(values: ArrayLike) -> str:
-    """Return an array as text: its shape, and float32 numbers in base64."""
+    """Return an array as text: its shape, and float32 numbers, compressed, in base64."""
     array = np.asarray(values, "<f4")
     shape = "x".join(map(str, array.shape))
-    return f"{shape} {base64.b64encode(array.tobytes()).decode()}"
+    return f"{shape} {base64.b64encode(zlib.compress(array.tobytes(), 9)).decode()}"
 
 
 def _unpacked(text: str) -> Any:
     """Return the nested lists that `_packed` made into text."""
     shape, numbers = text.split()
-    array = np.frombuffer(base64.b64decode(numbers), "<f4")
+    array = np.frombuffer(zlib.decompress(base64.b64decode(numbers)), "<f4")
     return array.reshape([int(each) for each in shape.split("x")]).astype(np.float64).tolist()
