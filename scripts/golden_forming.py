@@ -1,7 +1,7 @@
 """Forms the scenes of `scripts/golden` and records what is compared.
 
 Two things that users cannot reach are needed here: costs that do not depend on the machine
-(`write_costs`), and plans that do not depend on its vectors (`standard`). `FIELDS` says where plans
+(`write_costs`), and plans that do not depend on its vectors (`STANDARD`). `FIELDS` says where plans
 have their fields. A change of the package that moves any of these changes these three, and nothing
 else of the script.
 """
@@ -28,8 +28,15 @@ from numpy.typing import ArrayLike, NDArray
 
 import clsas
 
-STANDARD = {"kind": "cpu", "width": 8, "stage_width": 8, "permute": True, "memory_bytes": 8 << 30}
-"""Device for which plans are made, whatever the device is: a CPU with AVX2."""
+STANDARD = {
+    "kind": "cpu",
+    "width": 8,
+    "stage_width": 8,
+    "permute": True,
+    "memory_bytes": 8 << 30,
+    "max_buffer_bytes": 2 << 30,
+}
+"""Properties of the device for which plans are made, whatever the device is: a CPU with AVX2."""
 
 COSTS_NS = {
     "call": 9e6, "upsampled_sample": 20.0, "filtered_sample": 1.8, "reference": 120.0,
@@ -92,7 +99,10 @@ FIELDS = {
     "phase_terms": "method.phase_terms",
     "stretch": "method.stretch",
 }
-"""Where a plan's JSON has the fields by which an image is formed, by names of this script."""
+"""Where a plan's JSON has the fields by which an image is formed, by names of this script.
+
+If a field moves, write "new.place|old.place", so that `--against` reads the plans of both versions.
+"""
 
 _CHOICES = (
     "kind", "reason", "accuracy_db", "left_out", "sides", "tile", "shape", "aperture_taps",
@@ -124,13 +134,14 @@ class Former:
     arrays : dict
         Images and other results, by "scene/image".
     plans : dict
-        Explicit plans by scene: those given, and others made of the scenes' own plans.
+        Explicit plans of the formed scenes: those given, or else the scenes' own plans.
     """
 
     def __init__(self, folder: Path, plans: Mapping[str, Any], *, standard: bool) -> None:
         self.values: dict[str, Any] = {}
         self.arrays: dict[str, NDArray] = {}
-        self.plans: dict[str, dict[str, Any]] = dict(plans)
+        self.plans: dict[str, dict[str, Any]] = {}
+        self._given = plans
         self._folder, self._scene = folder, ""
         one = golden_scenes.short(tx_m=golden_scenes.TRACK[:1])
         with clsas.Imager(one.lines, one.grid, accuracy_db=-40) as imager:
@@ -142,7 +153,7 @@ class Former:
     def form(self, name: str) -> None:
         """Form a scene."""
         self._scene = name
-        slow = 1.0 if name == "usual costs" else _SLOW
+        slow = 1.0 if name.startswith("usual costs") else _SLOW
         write_costs(self._folder, [*clsas.list_devices(), self._device.info], slow)
         if name in EXACT:
             self._form_exact(EXACT[name]())
@@ -173,14 +184,15 @@ class Former:
         with self._warnings("planned/"):
             plan = clsas.plan(lines, grid, beam=scene.beam, device=self._device, **arguments)
             image = clsas.factorize(lines, grid, plan)
-        self.image("planned", image, scene)
+        within_db = arguments["tolerance_db"] if plan.is_exact else None
+        self.image("planned", image, scene, within_db=within_db)
         self._add_plan(plan)
         if plan.is_exact or "stages" in arguments:
             return
-        if self._scene not in self.plans:
-            self.plans[self._scene] = fields_of(plan)
+        fields = self._given.get(self._scene) or fields_of(plan)
+        self.plans[self._scene] = fields
         with self._warnings("explicit plan/"):
-            image = clsas.factorize(lines, grid, with_fields(plan, self.plans[self._scene]))
+            image = clsas.factorize(lines, grid, with_fields(plan, fields))
         self.image("explicit plan", image, scene)
 
     def _add_plan(self, plan: clsas.Plan) -> None:
@@ -283,8 +295,8 @@ def write_costs(folder: Path, infos: list[Any], slow: float) -> None:
 def fields_of(plan: clsas.Plan) -> dict[str, Any]:
     """Return the fields of a plan by their names in `FIELDS`; coefficients as text."""
     values, found = json.loads(plan.to_json()), {}
-    for name, path in FIELDS.items():
-        *parents, last = path.split(".")
+    for name in FIELDS:
+        *parents, last = _path(name, values)
         place = values
         for each in parents:
             place = place.get(each) or {}
@@ -301,22 +313,32 @@ def with_fields(plan: clsas.Plan, fields: Mapping[str, Any]) -> clsas.Plan:
     geometry.
     """
     values = json.loads(plan.to_json())
-    for name, path in FIELDS.items():
-        *parents, last = path.split(".")
+    for name, value in fields.items():
+        *parents, last = _path(name, values)
         place = values
         for each in parents:
-            if name not in fields:
-                break
             if place.get(each) is None:
                 place[each] = {}
             place = place[each]
-        if name in fields:
-            value = fields[name]
-            place[last] = _unpacked(value) if name.endswith("_coefficients") else value
+        place[last] = _unpacked(value) if name.endswith("_coefficients") else value
     if values.pop("digest", None) is not None:
         digest = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
         values["digest"] = digest[:16]
     return clsas.Plan.from_json(json.dumps(values))
+
+
+def _path(name: str, values: Mapping[str, Any]) -> list[str]:
+    """Return the keys of a field: of its places, the one of which a plan has the most."""
+
+    def known(path: list[str]) -> int:
+        place: Any = values
+        for number, each in enumerate(path):
+            if not isinstance(place, Mapping) or each not in place:
+                return number
+            place = place[each]
+        return len(path)
+
+    return max((each.split(".") for each in FIELDS[name].split("|")), key=known)
 
 
 def _packed(values: ArrayLike) -> str:

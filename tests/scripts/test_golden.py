@@ -144,6 +144,14 @@ def test_a_plan_with_the_fields_of_another_forms_its_image():
     assert scene.error_db(images[0]) < -40
 
 
+def test_a_field_that_moved_is_found_in_both_places(monkeypatch):
+    import golden_forming
+
+    monkeypatch.setitem(golden_forming.FIELDS, "sides", "method.ladder|method.sides")
+    assert golden_forming._path("sides", {"method": {"sides": []}}) == ["method", "sides"]
+    assert golden_forming._path("sides", {"method": {"ladder": []}}) == ["method", "ladder"]
+
+
 @pytest.mark.slow
 def test_two_scenes_are_as_recorded():
     command = [sys.executable, str(ROOT / "scripts" / "golden"), "exact, plane", "helix"]
