@@ -216,7 +216,7 @@ def relief_scene(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", few(RELIEFS, often=["gradient"]))
+@pytest.mark.parametrize("name", few(RELIEFS, often=["thermocline"]))
 def test_images_over_relief_are_those_of_exact_rays(name):
     """Two heights of equal delay focus differently, which apparent antennas alone cannot do."""
     lines, grid, pixels, ideal = relief_scene(name)
@@ -227,7 +227,7 @@ def test_images_over_relief_are_those_of_exact_rays(name):
     plan = clsas.plan(lines, grid, tolerance_db=-55, costs=EXACT_IS_SLOW)
     assert not plan.is_exact
     image = clsas.factorize(lines, grid, plan)
-    assert oracle.error_db(image.pixels.ravel()[pixels], ideal) < -50
+    assert oracle.error_db(image.pixels.ravel()[pixels], ideal) < -54  # of 200 pixels; asked: -55
 
 
 @pytest.mark.slow

@@ -245,11 +245,11 @@ def test_track_file(tmp_path):
     (tmp_path / "track.csv").write_text(
         "time_s, x_m, y_m, z_m, yaw_deg\n"
         "0, 1e6, 5, 0, 0\n"
-        "1, 1000002, 5, 0, 90\n"
-        "2, 1000006, 5, 0, 0\n"
+        "0.5, 1000001, 5, 0, 90\n"
+        "1, 1000003, 5, 0, 0\n"
     )
     track = parse("[track]\nfile = 'track.csv'", tmp_path).track
-    np.testing.assert_array_equal(track.positions_m[:, 0], [1e6, 1e6 + 2, 1e6 + 6])
+    np.testing.assert_array_equal(track.positions_m[:, 0], [1e6, 1e6 + 1, 1e6 + 3])
     np.testing.assert_allclose(track.yaw_rad, [0, np.pi / 2, 0])
     np.testing.assert_allclose(track.velocity_m_s[:, 0], [2, 3, 4])
     (tmp_path / "track.csv").write_text("vx_m_s,vy_m_s,vz_m_s,time_s,x_m,y_m,z_m\n1,2,3,0,0,0,0\n")

@@ -443,6 +443,17 @@ class TestResuming:
             clsas.mosaic(change.pop("lines"), change.pop("grid"), tmp_path / "a.zarr", **change)
         assert len(Store.opened(tmp_path / "a.zarr").records()) == before
 
+    def test_a_folder_that_has_lost_a_file_is_refused(self, tmp_path):
+        """Its patches contain echoes of channels that are gone."""
+        folder = tmp_path / "survey"
+        folder.mkdir()
+        for number, channels in enumerate(np.array_split(np.arange(LINES.channels), 3)):
+            clsas.save(folder / f"{number}.h5", LINES.select(channels))
+        next(iter(clsas.mosaic(folder, GRID, tmp_path / "a.zarr", **REQUEST)))
+        (folder / "2.h5").unlink()
+        with pytest.raises(ValueError, match="the range lines differ"):
+            clsas.mosaic(folder, GRID, tmp_path / "a.zarr", **REQUEST)
+
     @pytest.mark.slow
     def test_a_store_without_a_finished_patch_may_be_deleted(self, tmp_path):
         """Only the user may delete it: another process may be about to write to it."""
