@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from reliefs import GRID, banks, flat_banks, truth
+from reliefs import BAND_HZ, CARRIER_HZ, GRID, banks, flat_banks, truth
 from tiers import also, few
 
 import clsas
@@ -284,6 +284,25 @@ def test_low_coherence_is_masked():
     assert np.isnan(result.height_m[~result.mask]).all()
     assert np.isnan(result.sd_m[~result.mask]).all()
     assert np.median(result.coherence) < 0.45
+
+
+@pytest.mark.slow
+def test_side_lobes_of_a_bright_point_are_masked():
+    """They are as coherent as the point, and show its height at other places.
+
+    Without the mask, a quarter of all pixels are valid and wrong, and with it a seventh.
+    """
+    bright = clsas.PointTargets([[0.0, 32.0, 0.6]], [200.0])
+    found = []
+    for lines in flat_banks():
+        point = clsas.simulate_lines(
+            lines.tx_m, lines.rx_m, bright, carrier_hz=CARRIER_HZ, bandwidth_hz=BAND_HZ,
+            window="hamming", first_range_m=lines.first_range_m[0], length=lines.length,
+        )  # fmt: skip
+        found.append(replace(lines, samples=lines.samples + point.samples))
+    result = heights(*found, GRID, search_m=(-1.0, 1.0), window_m=WINDOW_M)
+    assert np.mean(result.mask & (np.abs(result.height_m) > 0.1)) < 0.18
+    assert result.mask[:, np.abs(GRID.axes_m[0]) > 0.4].mean() > 0.7
 
 
 @pytest.mark.slow

@@ -41,6 +41,14 @@ def test_a_wall_hides_what_is_behind_it():
     assert not hidden[:, :5].any()
 
 
+def test_pixels_without_heights_do_not_light_their_neighbours():
+    valid = np.ones(GRID.shape, bool)
+    valid[30:60] = np.random.default_rng(1).random((30, GRID.shape[1])) < 0.5
+    behind = np.zeros(GRID.shape, bool)
+    behind[30:60, 8:22] = True
+    assert shadow(wall(), valid)[behind & valid].all()
+
+
 def test_sonars_on_the_other_side_see_the_other_shadow():
     hidden = shadow(wall(rows=slice(60, 70)), towards_rows=-1.0)
     assert hidden[35:60, 15].all()

@@ -429,6 +429,20 @@ def test_levels_of_layers(tmp_path, patch_shape):
     np.testing.assert_allclose(part.sd_m[:-1], expected.sd_m[:-1], rtol=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("small")
+def test_an_overview_of_a_part_contains_nothing_from_beyond_it(tmp_path):
+    def overview(name, beyond_m):
+        store, layers = filled_store(tmp_path / name, SMALL.shape)
+        layers["height_m"][66:] += beyond_m
+        (window,) = patches_of(SMALL.shape)
+        write_patch(store, layers, window)
+        store.complete_levels()
+        return store.overview_heights(20, slice(0, 66), slice(0, 80)).height_m
+
+    np.testing.assert_array_equal(overview("a.zarr", 0.0), overview("b.zarr", 5.0))
+
+
 @pytest.mark.exhaustive
 @pytest.mark.usefixtures("small")
 @pytest.mark.parametrize("amplitude", [1e-30, 1e30])
