@@ -3,7 +3,7 @@ import pytest
 
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.refinement import filled
-from clsas.interferometry.sweep import STEPS_PER_CYCLE, likeliest
+from clsas.interferometry.sweep import STEPS_PER_CYCLE, Sweep, likeliest
 
 
 def volume(cycles, magnitude_at, shape=(20, 24), heights=31, random=None, noise=0.0):
@@ -51,6 +51,29 @@ def test_steps_of_one_and_a_half_cycles():
     step = np.where(np.arange(24) < 12, -0.7, 0.8)
     found = found_cycles(volume(step, envelope), Window(9, 9))
     assert found == pytest.approx(np.broadcast_to(step, found.shape), abs=0.6 / STEPS_PER_CYCLE)
+
+
+class Straight:
+    """Curves along columns, which pass a row further on for every 0.1 m of height."""
+
+    corner = (0, 0)
+    z_m = np.zeros((20, 6))
+    offset_m = 0.1 * np.arange(-10, 11)
+
+    def through(self, index, rows, columns):
+        return np.array(np.meshgrid(rows + index - 10, columns, indexing="ij"))
+
+
+@pytest.mark.parametrize(("drop_m", "seen"), [(0.3, True), (0.75, False), (1.2, False)])
+def test_no_pixel_lies_between_surfaces_that_a_cycle_separates(drop_m, seen):
+    """The height of ambiguity is 1 m. Row 12 is below the edge in row 10, or on a steep slope."""
+    height_m = np.where(np.arange(20) < 10, 0.0, -drop_m)[:, None] + np.zeros(6)
+    swept = Sweep(Straight(), height_m, np.ones((20, 6)), np.ones(21))
+    rows, columns = np.array([5.0, 12.0]), np.arange(6.0)
+    relief = swept.relief(rows, columns, np.ones((20, 6), bool), ambiguity_m=1.0)
+    assert relief.offset_m[0] == pytest.approx(0.0, abs=1e-9)
+    assert (relief.surfaces[0] == 1).all()
+    assert (relief.surfaces[1] == seen).all()
 
 
 def test_unknown_pixels_take_the_nearest_value():
