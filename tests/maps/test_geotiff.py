@@ -174,6 +174,14 @@ def test_neighbouring_north_up_maps_share_their_pixels(tmp_path):
     assert received.sum() * 0.25 == pytest.approx(second.grid.size * 0.05, rel=0.02)  # m2
 
 
+def test_an_image_that_lies_north_up_may_have_larger_pixels(tmp_path):
+    image, where = scene(UTM_NORTH)
+    clsas.export(image, tmp_path / "a.tif", north_up=True, pixel_m=0.5)
+    with rasterio.open(tmp_path / "a.tif") as file:
+        assert (file.transform.a, file.transform.e) == (0.5, -0.5)
+    assert place_of_target(tmp_path / "a.tif", "db", where) < 0.5
+
+
 def test_tags_say_where_the_image_comes_from(tmp_path):
     place = clsas.Georeference.local(60.39, 5.32, heading_deg=90, vertical_datum="NN2000")
     lines, grid = replace(LINES, georeference=place), PLANE
