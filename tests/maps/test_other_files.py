@@ -116,6 +116,28 @@ def test_a_png_has_its_place_on_the_map(place, tmp_path):
 
 
 @pytest.mark.slow
+def test_the_centre_of_a_pixel_of_a_picture_is_where_the_image_has_it(tmp_path):
+    grid = clsas.Grid.oriented(
+        [10, 40, 0], [0, 2.0, 0], [2.0, 0, 0], (14, 18), georeference=local(90.0)
+    )
+    pixels = np.full(grid.shape, 1e-6 + 0j)
+    pixels[5, 8] = 1.0
+    image = clsas.Image(pixels, grid)
+    clsas.export(image, tmp_path / "a.png", colour_map="gray", north_arrow=False)
+    east, north, _ = grid.georeference.to_map(grid.positions_m()[5, 8])
+    with rasterio.open(tmp_path / "a.png") as file:
+        column, row = at(~file.transform, east, north)
+        side = round(2.0 / abs(file.transform.a))  # dots per pixel of the image
+        picture = file.read(1)
+    assert side > 10
+    near = np.indices((2 * side, 2 * side)) + np.array(
+        [[[int(row) - side]], [[int(column) - side]]]
+    )
+    found = near[:, picture[tuple(near)] > 100].mean(axis=1) + 0.5
+    np.testing.assert_allclose(found, (row, column), atol=0.1 * side)
+
+
+@pytest.mark.slow
 def test_files_beside_a_replaced_file_do_not_describe_the_new_one(tmp_path):
     pytest.importorskip("matplotlib")
     image, _ = scene(local(217.0))

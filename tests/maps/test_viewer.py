@@ -111,6 +111,14 @@ def test_tiles_do_not_depend_on_windows(tmp_path, shape, steps_m):
     assert whole
 
 
+def test_ends_of_odd_sides_are_means_of_the_pixels_that_exist():
+    power = np.arange(1.0, 16.0, dtype=np.float32).reshape(3, 5)
+    expected = [[4.0, 6.0, 7.5], [11.5, 13.5, 15.0]]
+    np.testing.assert_allclose(tiles.reduced(power, 2, 2), expected)
+    np.testing.assert_allclose(tiles.reduced(power, 1, 2)[:, -1], power[:, -1])
+    np.testing.assert_allclose(tiles.reduced(power, 2, 1)[-1], power[-1])
+
+
 @pytest.mark.parametrize(
     ("shape", "steps_m", "expected"),
     [
