@@ -731,6 +731,19 @@ def test_the_picture_has_units_and_marks(lines):
         clsas.plot.inspection(lines)
 
 
+@pytest.mark.slow
+def test_gaps_are_marked_at_their_steps(lines):
+    pytest.importorskip("matplotlib")
+    found = clsas.inspect(lines.select(np.r_[0:50, 51:120, 140:PINGS]))
+    (axes,) = [
+        axes for axes in clsas.plot.inspection(found).axes if axes.get_title().startswith("Advance")
+    ]
+    (marked,) = [line for line in axes.lines if line.get_label() == "Gaps (2)"]
+    np.testing.assert_array_equal(marked.get_xdata(), [50, 119])
+    usual = np.median(axes.lines[0].get_ydata())
+    np.testing.assert_allclose(marked.get_ydata() / usual, [2, 21], rtol=1e-6)
+
+
 def test_a_device_that_does_not_exist_is_refused_though_none_is_needed(lines):
     still = replace(lines, tx_m=lines.tx_m[0], rx_m=lines.rx_m[0])
     with pytest.raises(clsas.DeviceError, match="no such"):

@@ -21,6 +21,7 @@ from factorizing import (
 
 from clsas.core.digests import grid_digest, lines_digest
 from clsas.core.grid import Grid
+from clsas.core.sound_speed import SoundSpeed
 from clsas.exact.backprojection import form_exactly
 from clsas.opencl.device import open_device
 from clsas.planning import costs
@@ -386,6 +387,19 @@ def test_lines_of_another_geometry_are_other_lines():
     for field, value in changed_lines():
         other = dataclasses.replace(lines, **{field: value})
         assert lines_digest(other) != lines_digest(lines), field
+
+
+def test_lines_in_other_water_are_other_lines():
+    lines, _ = made(straight)
+    profiles = [
+        None,
+        SoundSpeed([0.0, 50.0], [1490.0, 1500.0]),
+        SoundSpeed([0.0, 50.0], [1490.0, 1500.1]),
+        SoundSpeed([0.0, 50.1], [1490.0, 1500.0]),
+        SoundSpeed([0.0, 50.0], [1490.0, 1500.0], surface_z_m=0.1),
+    ]
+    digests = {lines_digest(dataclasses.replace(lines, sound_speed=each)) for each in profiles}
+    assert len(digests) == len(profiles)
 
 
 def test_louder_lines_are_the_same_lines():
