@@ -40,12 +40,12 @@ def test_what_is_made_of_ends_that_do_not_fade_is_predicted(cut_off, tolerance_d
 
 
 @pytest.mark.parametrize("tolerance_db", [-40, -60])
-@pytest.mark.parametrize("inside_m", [0.005, 0.04])
-def test_a_grid_that_begins_within_five_samples_of_an_end_is_told_too(
-    cut_off, inside_m, tolerance_db
+@pytest.mark.parametrize("y_m", [(20.005, 20.5), (20.04, 20.5), (29.5, 29.96), (29.5, 29.995)])
+def test_a_grid_that_comes_within_five_samples_of_either_end_is_told_too(
+    cut_off, y_m, tolerance_db
 ):
     lines, _ = cut_off
-    grid = Grid.plane((-0.4, 0.4, 100), (20 + inside_m, 20.5, 100))
+    grid = Grid.plane((-0.4, 0.4, 100), (*y_m, 100))
     with pytest.warns(ClsasWarning, match="lines do not fade towards ends that the grid reaches"):
         clsas.plan(lines, grid, tolerance_db=tolerance_db)
 
