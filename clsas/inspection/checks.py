@@ -216,7 +216,9 @@ def _in_every_ping(defective: NDArray[np.bool_], receivers: int | None) -> str:
     if not receivers or receivers == 1 or len(defective) <= receivers:
         return ""
     always = np.flatnonzero(defective.reshape(-1, receivers).all(axis=0))
-    return f"; in every ping receivers {runs(always)} of {receivers} (from 0)" * bool(always.size)
+    if not always.size:
+        return ""
+    return f"; in every ping receivers {runs(always)} of {receivers} (from 0)"
 
 
 def check_offset(recording: Recording) -> Iterator[Finding]:

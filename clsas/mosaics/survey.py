@@ -1,14 +1,15 @@
 """Surveys: range lines in files, read in the parts that a patch needs.
 
-A survey is one file of range lines, or a folder of such files in the order of their names. Files
-may be added while the survey is recorded. Only the geometry is kept in memory; samples are read
-when a patch needs them.
+A survey is one file of range lines, or a folder of such files in the order of their names, where
+numbers count as numbers: "ping_9.h5" comes before "ping_10.h5". Files may be added while the survey
+is recorded. Only the geometry is kept in memory; samples are read when a patch needs them.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -236,11 +237,21 @@ def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
 
 
 def files_of(source: str | os.PathLike) -> tuple[Path, ...]:
-    """Return the files of a survey, sorted by name."""
+    """Return the files of a survey, sorted by name; numbers in names count as numbers."""
     path = validate.path("source", source)
     if not path.is_dir():
         return (path,)
-    return tuple(sorted(p for p in path.glob("*.h5") if not p.name.startswith(".")))
+    found = (each for each in path.glob("*.h5") if not each.name.startswith("."))
+    return tuple(sorted(found, key=lambda each: natural(each.stem)))
+
+
+def natural(name: str) -> tuple[list[int | str], str]:
+    """Return a key that sorts names as people do: "ping_9" comes before "ping_10".
+
+    Names that differ by leading zeros only are sorted by their characters.
+    """
+    parts = re.split(r"(\d+)", name)  # texts and digits in turn
+    return [int(part) if n % 2 else part.casefold() for n, part in enumerate(parts)], name
 
 
 def has_ended(source: str | os.PathLike) -> bool:

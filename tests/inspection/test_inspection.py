@@ -217,6 +217,32 @@ def test_a_receiver_that_is_dead_in_every_ping_is_named(lines):
     assert finding.value == pytest.approx(weakest_db, abs=0.01)
 
 
+def silent_once(samples):
+    samples[41] = 0
+
+
+def two_silent(samples):
+    samples[2:7] = 0
+
+
+def clipped_once(samples):
+    clipped(samples)
+
+
+def clipped_in_half(samples):
+    samples[1 : len(samples) // 2 : 4, 300:340] = 9 * abs(samples).max()
+
+
+@pytest.mark.parametrize("defect", [silent_once, two_silent, clipped_once, clipped_in_half])
+def test_a_defect_in_some_pings_names_no_receiver(lines, defect):
+    found = clsas.inspect(with_samples(in_an_array(lines, receivers=4), defect))
+    defects = [
+        each for each in found.findings if each.name in ("dead_channels", "clipped_channels")
+    ]
+    assert defects
+    assert not any("in every ping" in each.message for each in defects)
+
+
 def halting(position_m):
     """Eighty pings at the position of one."""
     position_m[60:140] = position_m[60]

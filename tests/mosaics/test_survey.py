@@ -141,6 +141,29 @@ def test_a_folder_ends_with_a_file_named_end(folder):
     assert [path.name for path in files_of(folder)] == ["0.h5", "1.h5", "2.h5"]
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["ping_1", "ping_2", "ping_9", "ping_10", "ping_100"],
+        ["line2-9", "line2-10", "line10-1"],
+        ["a", "A2", "a10", "b"],
+        ["007", "7", "08", "9"],
+        ["2026-01-02T03", "2026-01-02T10", "2026-01-11T00"],
+    ],
+)
+def test_numbers_in_names_count_as_numbers(names, tmp_path):
+    for name in np.random.default_rng(1).permutation(names):
+        (tmp_path / f"{name}.h5").touch()
+    assert [path.stem for path in files_of(tmp_path)] == names
+
+
+@pytest.mark.parametrize("name", ["ping_{}", "{}", "2026-line{}b"])
+def test_files_without_leading_zeros_are_in_the_order_of_their_pings(name, tmp_path):
+    for number, channels in enumerate(np.split(np.arange(120), 12)):
+        save(tmp_path / f"{name.format(number + 1)}.h5", LINES.select(channels))
+    np.testing.assert_array_equal(open_survey(tmp_path).geometry.tx_m, TRACK)
+
+
 def test_a_look_direction_is_known_if_every_file_states_it(folder):
     for path in files_of(folder)[:2]:
         save(path, replace(load(path), look_direction=[0, 1, 0]))
