@@ -230,7 +230,7 @@ def test_images_over_relief_are_those_of_exact_rays(name):
     assert oracle.error_db(image.pixels.ravel()[pixels], ideal) < -54  # of 200 pixels; asked: -55
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("speed_m_s", [1.8, *also(0.0)])
 def test_arrays_that_move_see_along_exact_rays(speed_m_s):
     """Apparent antennas below a thermocline depend on the pixel if receivers are apart or move."""

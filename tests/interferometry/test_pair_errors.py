@@ -106,7 +106,7 @@ def test_a_second_estimate_finds_inverted_polarity():
     assert found.mask.mean() > 0.95
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_tracks_show_the_errors_without_known_heights():
     true = ERRORS["all"]
     here, there = (swaths.banks(flat, 1, track_y_m=y_m, **true) for y_m in (0.0, -10.0))
@@ -270,7 +270,7 @@ def test_tilted_planes_and_other_axes():
     assert abs(few.phase_rad - 0.5) < 2 * few.sd[0]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lines_with_a_profile_of_the_sound_speed():
     random = np.random.default_rng(3)
     places_m = random.uniform([-0.6, 19.2, -10], [0.6, 21.4, -10], (8000, 3))

@@ -73,7 +73,7 @@ def test_every_method_is_measured_against_the_exact_image(lines):
     assert exact.azimuth.resolution_m == pytest.approx(0.443 * 1.5e-3 * 40.3 / 1.65, rel=0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_study_sweeps_the_choices_of_the_planner(lines):
     measured = clsas.tradeoff(lines, GRID, tolerances_db=(-40,), stages=(), repeats=1, study=True)
     studied = [row for row in measured.rows if row.method == "study"]
