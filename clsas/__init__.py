@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from clsas.maps.exporting import export
     from clsas.measures.assessment import assess, survey_lines
     from clsas.measures.assessment_result import Assessment, Effect
+    from clsas.measures.certificate import Certificate, certify
     from clsas.measures.limits_result import Limit, Limits
     from clsas.measures.looks import multilook
     from clsas.measures.quality import measure_point
@@ -74,6 +75,7 @@ __all__ = [
     "Autofocus",
     "BeamWindow",
     "Calibration",
+    "Certificate",
     "ClsasWarning",
     "DeviceError",
     "Echoes",
@@ -111,6 +113,7 @@ __all__ = [
     "autofocus",
     "backproject",
     "calibrate_track",
+    "certify",
     "channels",
     "check_sampling",
     "compress",
@@ -184,6 +187,7 @@ _MODULES = {
     "maps.exporting": "export",
     "measures.assessment": "assess survey_lines",
     "measures.assessment_result": "Assessment Effect",
+    "measures.certificate": "Certificate certify",
     "measures.limits_result": "Limit Limits",
     "measures.looks": "multilook",
     "measures.quality": "measure_point",

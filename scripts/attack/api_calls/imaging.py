@@ -171,6 +171,12 @@ def imaging(folder: Path) -> dict[str, Call]:
             skips={"repeats": LARGE},
             accepts=dict.fromkeys(("beam", "sonar", "track", "pointing", "costs"), optional),
         ),
+        "certify": Call(
+            clsas.certify,
+            {"image": s.image, "lines": lines, "beam": beam, "pixels": 40, "seed": 1},
+            names={"lines": scene_names["lines"]},
+            accepts=dict.fromkeys(("beam", "seed"), optional),
+        ),
         "inspect": Call(
             clsas.inspect,
             whole | {"device": 0, "beam": beam, "element_length_m": 0.1},

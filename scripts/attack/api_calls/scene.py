@@ -19,8 +19,8 @@ from clsas.core.extras import is_installed
 from clsas.planning.costs import Costs
 
 RESULTS = (
-    "Assessment", "Autofocus", "Calibration", "Effect", "Finding", "Inspection", "Limit", "Limits",
-    "Micronavigation",
+    "Assessment", "Autofocus", "Calibration", "Certificate", "Effect", "Finding", "Inspection",
+    "Limit", "Limits", "Micronavigation",
     "Mosaic", "PairErrors", "Patch", "PhaseSign", "Plan", "Processed", "Tradeoff",
 )  # fmt: skip
 """Classes whose constructors check nothing, since only clsas calls them."""
