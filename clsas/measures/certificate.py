@@ -403,7 +403,7 @@ def _middle_of_band(samples: NDArray[np.complex64]) -> float:
 
 
 def _twice_as_dense(samples: NDArray[np.complex64], middle: float) -> NDArray[np.complex128]:
-    """Return lines moved to 0 Hz, with twice as many samples, of which the first is at -_PADDING."""
+    """Return lines moved to 0 Hz and twice as dense, with `_PADDING` zeros around them."""
     length = samples.shape[1]
     bins = scipy.fft.next_fast_len(length + 2 * _PADDING)
     lines = np.zeros((len(samples), bins), np.complex128)

@@ -1,0 +1,248 @@
+"""The measured error of an image: it is that of the oracle, and faults are found."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from families import draw
+from judging import SLOW
+
+import clsas
+from clsas.trials import extremes
+
+ALL = 10**6  # more pixels than any image here has
+
+SCENES = {
+    "ultrasonic": extremes.ultrasonic,
+    "array that moves": lambda: extremes.array(moving=True, channels=64),
+    "bistatic": extremes.apart,
+    "on the carrier": lambda: extremes.raw(24, targets=10, offset=0.01),
+    "band of 190 %": extremes.widest,
+    "guard band of a twentieth": lambda: extremes.ultrasonic(64, oversampling=1.05, tilt_db=-20),
+    "noise": lambda: extremes.ultrasonic(48, noise=0.3),
+    "a start for each line": lambda: extremes.ultrasonic(64, own_starts=True),
+    "10 000 km away": lambda: extremes.ultrasonic(64, origin_m=(1e7, -5e6, 100)),
+    "height map": lambda: extremes.ultrasonic(64, relief_m=0.1),
+    "beam": extremes.headings,
+}
+
+
+def certified_db(pixels, known, **options):
+    """Return the error of an image of a known scene, measured at all pixels."""
+    image = clsas.Image(pixels, known.grid)
+    options = {"beam": known.beam, "pixels": ALL} | options
+    return clsas.certify(image, known.lines, **options).error_db
+
+
+@pytest.mark.parametrize("make", SCENES.values(), ids=SCENES)
+def test_the_oracle_s_image_has_no_error(make):
+    known = make()
+    assert certified_db(known.ideal, known) < -105
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("family", "seed"),
+    [
+        ("moving", 1),
+        ("reliefs and points", 1),
+        ("reliefs and points with beam", 2),
+        ("dense with beam", 7),
+        ("profiles", 1),
+        ("profiles with beam", 1),
+        ("profiles and reliefs", 2),
+    ],
+)
+def test_sums_of_random_scenes_have_no_error(family, seed):
+    scene = draw(family, seed)
+    grid = clsas.Grid.points(scene.grid.at(scene.pixels))
+    image = clsas.Image(scene.ideal, grid)
+    found = clsas.certify(image, scene.lines, beam=scene.beam, pixels=ALL)
+    assert found.error_db < -95
+
+
+@pytest.mark.parametrize("shift", [0.1, 0.37, -0.45])
+def test_bands_may_wrap_around_half_the_sample_rate(shift):
+    """Another carrier mixed out moves the band, and changes nothing else."""
+    known = extremes.ultrasonic(96)
+    lines = known.lines
+    range_m = lines.first_range_m[:, None] + lines.range_step_m * np.arange(lines.length)
+    cycles_per_m = shift / lines.range_step_m
+    moved = replace(
+        lines,
+        samples=lines.samples * np.exp(2j * np.pi * np.mod(cycles_per_m * range_m, 1)),
+        carrier_hz=lines.carrier_hz - cycles_per_m * lines.sound_speed_m_s / 2,
+    )
+    assert certified_db(known.ideal, replace(known, lines=moved)) < -100
+
+
+def test_normalised_beams_divide_by_the_sum_of_weights():
+    known = extremes.headings()
+    to_channels = known.grid.positions_m()[..., None, :] - known.lines.phase_centres_m
+    sine = np.einsum("rcni,ni->rcn", to_channels, known.beam.along)
+    sine /= np.linalg.norm(to_channels, axis=-1)
+    angle = np.degrees(np.arcsin(sine))
+    weights = np.where(np.abs(angle) < 20, np.cos(np.pi * angle / 40) ** 2, 0).sum(axis=-1)
+    beam = replace(known.beam, normalise=True)
+    normalised = known.ideal * known.lines.channels / np.maximum(weights, 0.01)
+    assert certified_db(normalised, known, beam=beam) < -105
+    assert certified_db(known.ideal, known, beam=beam) > -20
+
+
+@pytest.fixture(scope="module")
+def speckle():
+    """A scene of 48 x 48 pixels, and its ideal image."""
+    return extremes.ultrasonic(targets=20)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tolerance_db", [-20, -50])
+def test_factorized_images_have_the_error_that_the_oracle_says(speckle, tolerance_db):
+    lines, grid = speckle.lines, speckle.grid
+    plan = clsas.plan(lines, grid, tolerance_db=tolerance_db, costs=SLOW)
+    image = clsas.factorize(lines, grid, plan)
+    true_db = speckle.error_db(image.pixels)
+    assert certified_db(image.pixels, speckle) == pytest.approx(true_db, abs=0.01)
+    few = [clsas.certify(image, lines, pixels=256, seed=seed) for seed in range(8)]
+    assert all(abs(each.error_db - true_db) < 1.5 for each in few)
+    assert np.mean([each.error_db for each in few]) == pytest.approx(true_db, abs=0.5)
+    many = clsas.certify(image, lines, pixels=1500, seed=1)
+    assert many.error_db == pytest.approx(true_db, abs=0.3)
+
+
+@pytest.mark.slow
+def test_the_best_exact_images_are_found_to_be_so(speckle):
+    image = clsas.backproject(speckle.lines, speckle.grid, accuracy_db=-85)
+    assert clsas.certify(image, speckle.lines, seed=1).upper_db < -80
+
+
+def test_known_errors_are_measured(speckle):
+    """An error of 1 % in amplitude everywhere."""
+    assert certified_db(1.01 * speckle.ideal, speckle) == pytest.approx(-40, abs=1e-3)
+    assert certified_db(0 * speckle.ideal, speckle) == pytest.approx(0, abs=1e-6)
+    assert certified_db(101 * speckle.ideal, speckle) == pytest.approx(40, abs=1e-3)
+
+
+@pytest.mark.parametrize("targets", [20, 1])
+def test_faults_are_found(targets):
+    known = extremes.ultrasonic(64, targets=targets)
+    tile = known.ideal.copy()
+    brightest = np.unravel_index(np.abs(tile).argmax(), tile.shape)
+    rows, columns = (slice(at // 12 * 12, at // 12 * 12 + 12) for at in brightest)
+    tile[rows, columns] = tile[rows, columns].conj()  # the sign of the phase, in one of 16 tiles
+    half_m = known.lines.range_step_m / 2
+    late = replace(known.lines, first_range_m=known.lines.first_range_m + half_m)
+    narrow = clsas.BeamWindow(2.0, "hann", along=[1, 0, 0])
+    for pixels, lines, beam in (
+        (tile, known.lines, None),
+        (known.ideal, late, None),
+        (known.ideal, known.lines, narrow),
+    ):
+        image = clsas.Image(pixels, known.grid)
+        assert clsas.certify(image, lines, beam=beam, seed=1).error_db > -12
+    worst = clsas.certify(clsas.Image(tile, known.grid), known.lines, pixels=ALL).worst
+    assert worst.shape == (5, 2)
+    assert all(rows.start <= row < rows.stop for row in worst[:, 0])
+    assert all(columns.start <= column < columns.stop for column in worst[:, 1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("targets", [20, 1])
+def test_estimates_are_unbiased_and_bounds_hold(targets):
+    """Of 200 draws; the error is larger where the image is brighter, as those of imagers are."""
+    known = extremes.scene(
+        extremes.along_x(8, 0.1), (0.3, 20, 0), carrier_hz=1e5, bandwidth_hz=2e4,
+        pixel_m=(0.05, 0.02), shape=(64, 64), targets=targets,
+    )  # fmt: skip
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=(2, *known.ideal.shape, 2)) @ [1, 1j]
+    rms = np.sqrt(np.mean(np.abs(known.ideal) ** 2))
+    pixels = known.ideal * (1 + 0.01 * noise[0]) + 0.01 * rms * noise[1]
+    image, true_db = clsas.Image(pixels, known.grid), known.error_db(pixels)
+    found = [clsas.certify(image, known.lines, pixels=128, seed=seed) for seed in range(200)]
+    power = 10 ** (np.array([[each.error_db, each.upper_db] for each in found]) / 10)
+    power /= 10 ** (true_db / 10)
+    assert power[:, 0].mean() == pytest.approx(1, abs=3 * power[:, 0].std() / np.sqrt(200))
+    assert power[:, 0].std() < 0.2
+    assert np.mean(power[:, 1] > 1) >= 0.93
+    assert np.median(power[:, 1]) < 10**0.15
+
+
+def test_all_pixels_leave_nothing_to_chance(speckle):
+    image = clsas.Image(1.01 * speckle.ideal, speckle.grid)
+    found = clsas.certify(image, speckle.lines, pixels=ALL)
+    assert found.pixels == image.pixels.size
+    assert found.upper_db == found.error_db
+    assert (np.diff(found.worst_db) <= 0).all()
+    assert np.abs(image.pixels[tuple(found.worst[0])]) == pytest.approx(np.abs(image.pixels).max())
+
+
+def test_seeds_repeat_draws(speckle):
+    image = clsas.Image(speckle.ideal.round(-1), speckle.grid)
+    one, same, other = (
+        clsas.certify(image, speckle.lines, pixels=32, seed=seed) for seed in (1, 1, 2)
+    )
+    assert (one.error_db, one.upper_db) == (same.error_db, same.upper_db)
+    assert one.error_db != other.error_db
+    assert one.error_db < one.upper_db < np.inf
+    assert clsas.certify(image, speckle.lines, pixels=1, seed=1).upper_db == np.inf
+
+
+def test_bright_pixels_are_drawn_wherever_they_are():
+    """In images of many blocks too; the uniform half alone would find one in 800."""
+    pixels = np.full((400, 500), 1e-3 + 0j)
+    pixels[399, 499] = 100
+    pixels[200, 3] = 50j
+    tx_m = np.zeros((2, 3))
+    lines = clsas.RangeLines(np.ones((2, 9), complex), 1.0, 1.0, tx_m, tx_m, 0.0, 1500.0)
+    grid = clsas.Grid.plane((100, 200, 500), (100, 200, 400))  # beyond the lines
+    found = clsas.certify(clsas.Image(pixels, grid), lines, seed=0)
+    assert found.worst[:2].tolist() == [[399, 499], [200, 3]]
+    assert found.error_db == np.inf
+
+
+def test_images_of_no_echo_are_right_if_they_are_zero(speckle):
+    grid, silent = speckle.grid, speckle.lines.weighted(np.zeros(speckle.lines.channels))
+    zero = clsas.certify(clsas.Image(np.zeros(grid.shape, complex), grid), silent)
+    assert zero.error_db == zero.upper_db == -np.inf
+    other = clsas.certify(clsas.Image(np.ones(grid.shape, complex), grid), silent)
+    assert other.error_db == other.upper_db == np.inf
+
+
+def test_a_certificate_describes_itself():
+    found = clsas.Certificate(-52.31, -51.7, 256, 0.21, np.zeros((5, 2), int), np.zeros(5))
+    assert repr(found) == "Certificate(error -52.3 dB, at most -51.7 dB, 256 pixels in 210 ms)"
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"image": np.ones((2, 2), complex)}, TypeError, "image must be of type Image"),
+        ({"lines": None}, TypeError, "lines must be of type RangeLines"),
+        ({"beam": 20.0}, TypeError, "beam must be of type BeamWindow"),
+        ({"pixels": 0}, ValueError, "pixels must be"),
+        ({"pixels": 2.5}, TypeError, "pixels must be"),
+        ({"seed": -1}, ValueError, "seed must be"),
+        (
+            {"beam": clsas.BeamWindow(20, along=np.eye(3))},
+            ValueError,
+            "along must have one direction, or one for each of 160 channels, got 3",
+        ),
+    ],
+)
+def test_wrong_arguments_are_refused(speckle, changes, error, message):
+    given = {"image": clsas.Image(speckle.ideal, speckle.grid), "lines": speckle.lines}
+    given |= {"beam": None, "pixels": 16, "seed": 0} | changes
+    with pytest.raises(error, match=message):
+        clsas.certify(given.pop("image"), given.pop("lines"), **given)
+
+
+def test_what_does_not_suit_the_lines_is_refused(speckle):
+    lines, image = speckle.lines, clsas.Image(speckle.ideal, speckle.grid)
+    inverse = clsas.BeamWindow(10, "inverse", element_length_m=0.02, along=[1, 0, 0])
+    with pytest.raises(ValueError, match="carrier_hz must be above 0"):
+        clsas.certify(image, replace(lines, carrier_hz=0), beam=inverse)
+    water = replace(lines, sound_speed=clsas.SoundSpeed([0, 5], [1500, 1490], surface_z_m=2))
+    deep = clsas.Image(image.pixels, clsas.Grid.plane((0, 1, 48), (42, 43, 48), -20))
+    with pytest.raises(ValueError, match="sound_speed must include the depths of pixels, 22"):
+        clsas.certify(deep, water)
