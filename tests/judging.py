@@ -1,4 +1,7 @@
-"""Images of a scene of `families`, and whether they err by more than was asked and predicted."""
+"""Images of a scene of `families`, and whether they err by more than was asked and predicted.
+
+The error of every image is measured by `clsas.certify` too, which has to agree.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,20 @@ from dataclasses import dataclass
 import numpy as np
 from families import Scene
 
+from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.exact.backprojection import prepare
 from clsas.exact.run import execute
+from clsas.measures.certificate import Certificate, certify
 from clsas.planning.costs import Costs
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
 
 REFERENCE_DB = -85.0  # of the exact image with which others are compared everywhere
+FLOOR_DB = -90.0  # below which sums of these large phases do not agree
+REFERENCE_SLACK_DB = 5.0  # by which errors must exceed that of a reference to be known to 1.2 dB
+APART_DB = 1.5  # by which measured errors may disagree beyond the bound of the certificate
 SLACK_DB = 1.0  # by which an error may exceed a prediction, where that is above what was asked
 _DEFAULT = Costs()
 SLOW = dataclasses.replace(
@@ -31,12 +39,17 @@ SLOW = dataclasses.replace(
 
 @dataclass(frozen=True)
 class Formed:
-    """One image: what was asked, predicted and measured, dB, or the exception it raised."""
+    """One image: what was asked, predicted and measured, dB, or the exception it raised.
+
+    Below `floor_db` the measured error is not known.
+    """
 
     kind: str
     asked_db: float
     predicted_db: float = 0.0
     measured_db: float = 0.0
+    certificate: Certificate | None = None
+    floor_db: float = FLOOR_DB
     warned: bool = False
     failure: str = ""
 
@@ -51,12 +64,22 @@ class Formed:
         bound_db = max(self.asked_db, self.predicted_db + SLACK_DB)
         return bool(self.failure) or not self.measured_db <= bound_db
 
+    @property
+    def disagrees(self) -> bool:
+        """True if the certificate measures another error than the sums do."""
+        if self.certificate is None or self.failure:
+            return False
+        found_db, upper_db = self.certificate.error_db, self.certificate.upper_db
+        apart_db = abs(max(found_db, self.floor_db) - max(self.measured_db, self.floor_db))
+        return not apart_db <= upper_db - found_db + APART_DB
+
     def __str__(self) -> str:
         if self.failure:
             return f"{self.kind}: asked {self.asked_db:g}: {self.failure}"
         return (
             f"{self.kind}: asked {self.asked_db:g} predicted {self.predicted_db:.1f} "
             f"measured {self.measured_db:.1f}{' (warned)' if self.warned else ''}"
+            f"{f', by {self.certificate}' if self.disagrees else ''}"
         )
 
 
@@ -80,9 +103,10 @@ def _exactly(
                 scene.lines, scene.grid, accuracy_db=asked_db, beam=scene.beam, device=device
             )
             image = execute(prepared)
-        measured_db = _measured_db(scene, image, reference, asked_db)
+        measured = _measured(scene, image, reference, asked_db)
         warned = _says_an_error(caught)
-        return Formed("exact", asked_db, prepared.predicted_error_db, measured_db, warned), image
+        predicted_db = prepared.predicted_error_db
+        return Formed("exact", asked_db, predicted_db, *measured, warned), image
     except Exception as error:  # which is a miss
         return Formed("exact", asked_db, failure=_described(error)), None
 
@@ -98,26 +122,34 @@ def _factorized(scene: Scene, asked_db: float, reference: Image | None, device) 
             if chosen.is_exact:
                 return None
             image = factorize(scene.lines, scene.grid, chosen, device=device)
-        measured_db = _measured_db(scene, image, reference, asked_db)
+        measured = _measured(scene, image, reference, asked_db)
         warned = _says_an_error(caught)
-        return Formed("factorized", asked_db, chosen.predicted_error_db, measured_db, warned)
+        return Formed("factorized", asked_db, chosen.predicted_error_db, *measured, warned)
     except Exception as error:  # which is a miss
         return Formed("factorized", asked_db, failure=_described(error))
 
 
-def _measured_db(scene: Scene, image: Image, reference: Image | None, asked_db: float) -> float:
-    """Return the error of an image.
+def _measured(
+    scene: Scene, image: Image, reference: Image | None, asked_db: float
+) -> tuple[float, Certificate | None, float]:
+    """Return the error of an image, a certificate of the same pixels, and the floor of the error.
 
     The sums judge the reference, and the reference judges other images at all pixels: at few of
     them one bright point may decide. The sums judge these too where the reference is no better.
     """
     if not np.isfinite(image.pixels).all():
-        return np.nan
+        return np.nan, None, FLOOR_DB
     if scene.is_dark:  # at all known pixels; elsewhere it may be anything
-        return asked_db
-    if reference is not None and scene.error_db(reference.pixels) < asked_db - 10:
-        return relative_error_db(image, reference)
-    return scene.error_db(image.pixels)
+        return asked_db, None, FLOOR_DB
+    of_reference_db = np.inf if reference is None else scene.error_db(reference.pixels)
+    if reference is not None and of_reference_db < asked_db - 10:
+        certificate = certify(image, scene.lines, beam=scene.beam, seed=0)
+        floor_db = max(of_reference_db + REFERENCE_SLACK_DB, FLOOR_DB)
+        return relative_error_db(image, reference), certificate, floor_db
+    known = Grid.points(scene.grid.at(scene.pixels))
+    part = Image(image.pixels.ravel()[scene.pixels], known)
+    certificate = certify(part, scene.lines, beam=scene.beam, pixels=known.size)
+    return scene.error_db(image.pixels), certificate, FLOOR_DB
 
 
 def _says_an_error(caught: list[warnings.WarningMessage]) -> bool:
