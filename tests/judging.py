@@ -24,7 +24,9 @@ from clsas.planning.planner import plan
 
 REFERENCE_DB = -85.0  # of the exact image with which others are compared everywhere
 FLOOR_DB = -90.0  # below which sums of these large phases do not agree
-REFERENCE_SLACK_DB = 5.0  # by which errors must exceed that of a reference to be known to 1.2 dB
+REFERENCE_SLACK_DB = (
+    15.0  # above the error of a reference, with which errors of images may correlate
+)
 APART_DB = 1.5  # by which measured errors may disagree beyond the bound of the certificate
 SLACK_DB = 1.0  # by which an error may exceed a prediction, where that is above what was asked
 _DEFAULT = Costs()

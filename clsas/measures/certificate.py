@@ -386,7 +386,7 @@ def _middle_of_band(samples: NDArray[np.complex64]) -> float:
     some = samples[some_channels(len(samples), _SPECTRA)]
     window = np.sin(np.pi * (np.arange(some.shape[1]) + 0.5) / some.shape[1]) ** 2
     bins = scipy.fft.next_fast_len(max(some.shape[1], _SPECTRA))
-    power = _power(scipy.fft.fft(some.astype(np.complex128) * window, bins, axis=1)).sum(axis=0)
+    power = sum((_power(scipy.fft.fft(line * window, bins)) for line in some), np.zeros(bins))
     if not power.any():
         return 0.0
     width = max(bins // 16, 1)
