@@ -24,10 +24,10 @@ from clsas.planning.planner import plan
 
 REFERENCE_DB = -85.0  # of the exact image with which others are compared everywhere
 FLOOR_DB = -90.0  # below which sums of these large phases do not agree
-REFERENCE_SLACK_DB = (
-    15.0  # above the error of a reference, with which errors of images may correlate
-)
 APART_DB = 1.5  # by which measured errors may disagree beyond the bound of the certificate
+# Errors that correlate with those of a reference 15 dB lower look up to 1.7 dB smaller against it.
+# Closer to the reference than that, its own error decides.
+REFERENCE_SLACK_DB = 15.0
 SLACK_DB = 1.0  # by which an error may exceed a prediction, where that is above what was asked
 _DEFAULT = Costs()
 SLOW = dataclasses.replace(

@@ -40,9 +40,8 @@ _PADDING = 64  # zeros at either end of a line, beyond the reach of the taps
 _SPECTRA = 64  # lines whose spectra show where the band lies
 _OUTSIDE = (1e-6, 1e-4, 1e-3, 1e-2, 5e-2)  # shares of the power that may lie outside the band
 _WIDEST = 0.95  # width of a band beside which there is a guard band, cycles per sample
-# Of a normal distribution, 97.5 %. The bound then held in 94.8, 96.8 and 98.8 % of draws of 64, 256
-# and 1024 pixels, in the mean over 63 factorized images of random scenes; with 1.645 (95 %) in 92,
-# 95 and 97 %.
+# Of a normal distribution, 97.5 %. With 1.645 (95 %) the bound held in fewer than 95 % of draws of
+# 64 pixels from factorized images of random scenes, whose errors have longer tails.
 _QUANTILE = 1.96
 
 
@@ -55,8 +54,8 @@ class Certificate:
     error_db : float
         Estimate of the relative rms error of the whole image, dB.
     upper_db : float
-        Upper bound of that error, dB: the error exceeds it in about one of 20 draws of pixels. It
-        equals `error_db` if all pixels were formed again.
+        Upper bound of that error, dB, meant to hold in 95 of 100 draws of pixels; less often where
+        a few pixels have most of the error. It equals `error_db` if all pixels were formed again.
     pixels : int
         Number of pixels drawn. A pixel that was drawn several times counts as often.
     seconds : float
@@ -145,9 +144,8 @@ def certify(
     mean of the two probabilities and N the number of pixels, |error|^2/(N q) is an unbiased
     estimate of the mean error power, whether a few pixels are bright or all are speckle.
 
-    A fault in one of 64 parts of an image is found in nine of ten cases if it raises the error of
-    the image by 10 dB. A fault in a single pixel of a large image is usually not found. An image
-    without any echo has an error of minus infinity if its pixels are 0, and of infinity otherwise.
+    A fault in a single pixel of a large image is usually not found. An image without any echo has
+    an error of minus infinity if its pixels are 0, and of infinity otherwise.
 
     Examples
     --------
