@@ -909,7 +909,7 @@ run()
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("module", ["click", "clsas.cli", "numpy", "pyopencl", "clsas.cli.machine"])
 def test_ctrl_c_while_modules_are_imported_ends_with_130(module):
     command = [sys.executable, "-c", INTERRUPTED_IMPORT.replace("sys.argv[1]", repr(module))]

@@ -135,7 +135,7 @@ def test_mistakes_are_reported(files, tmp_path):
     assert not (tmp_path / "heights.h5").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_one_file_may_hold_both_banks(tmp_path):
     low, high = flat_banks()
     both = replace(
@@ -179,7 +179,7 @@ def test_one_file_may_hold_both_banks(tmp_path):
     assert np.array_equal(clsas.load(output).height_m, found.height_m, equal_nan=True)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_heights_and_interferograms_are_drawn(files, tmp_path):
     grid = clsas.Grid.plane((-0.5, 0.5, 51), (31.5, 32.5, 51))
     images = [clsas.backproject(lines, grid) for lines in flat_banks()]

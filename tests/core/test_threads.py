@@ -49,7 +49,7 @@ print(number)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_ctrl_c_never_leaves_a_lock_taken():
     done = subprocess.run(
         [sys.executable, "-c", EVERYWHERE], capture_output=True, text=True, check=False

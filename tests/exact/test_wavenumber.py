@@ -108,7 +108,7 @@ def test_inverse_beams():
     assert error_db(straight(), beam=beam) <= -7
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_error_falls_with_range_and_beamwidth_as_a_hann_windows_edges():
     """It falls as (K R width^2)^(-5/4), which is 7.5 dB per doubling."""
     errors = []
@@ -181,7 +181,7 @@ def test_lines_may_start_anywhere():
     assert error_db(echoes(first_range_m=first, length=600)) <= -52
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lines_may_carry_their_carrier():
     lines = echoes(oversampling=30.0)
     n = np.arange(lines.length) * lines.range_step_m
@@ -217,7 +217,7 @@ def test_motion_compensation_restores_a_small_sway_that_destroys_the_image_other
         assert error_db(lines) <= -40
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_motion_compensation_fails_for_wide_beams_and_wide_swaths():
     with pytest.warns(ClsasWarning, match="not controlled"):
         narrow = error_db(swaying(0.2))
@@ -242,7 +242,7 @@ def test_it_warns_of_the_errors_that_remain():
     assert said == pytest.approx(0.2 * tilt, rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_track_turned_a_little_is_compensated():
     track = TRACK @ np.array([[1, 0.001, 0], [-0.001, 1, 0], [0, 0, 1]])
     with pytest.warns(ClsasWarning, match="off a line"):

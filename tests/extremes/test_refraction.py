@@ -215,7 +215,7 @@ def relief_scene(name):
     return lines, grid, pixels, oracle.image(echoes, pixels_m)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", few(RELIEFS, often=["thermocline"]))
 def test_images_over_relief_are_those_of_exact_rays(name):
     """Two heights of equal delay focus differently, which apparent antennas alone cannot do."""
@@ -376,7 +376,7 @@ def test_a_plan_belongs_to_the_profile():
     assert clsas.relative_error_db(image, clsas.factorize(lines, grid, plan)) < -90
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_wavenumber_image_of_an_array_that_moves(recwarn):
     """Its grid stays level, although other imagers would correct the ranges of points."""
     tx = np.repeat(along_x(40, 0.12, z=-10), 4, axis=0)

@@ -80,7 +80,7 @@ def test_virtual_channels_without_contributions_are_not_formed(wide):
         assert (need.last <= counts[:, None]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_subimages_use_what_their_parents_have(any_track):
     wide = any_track
     sector = sector_of(wide, wide.division.roots)

@@ -603,7 +603,7 @@ def test_half_precision_adds_what_is_predicted(device):
     assert expected_db - 3 <= relative_error_db(image, better) <= expected_db
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("length_m", "tolerance_db"), thinned([0.3, 1.0], [-50, -56]))
 def test_dense_channels_keep_the_tolerance(length_m, tolerance_db):
     """Virtual channels are sums of hundreds of channels, which half precision rounds many times."""

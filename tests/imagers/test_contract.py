@@ -9,7 +9,7 @@ import pytest
 from cases import APERTURE, CARRIER, beside, noise
 from contract import IMAGERS, Scene, near, scene
 from factorizing import bistatic_array
-from tiers import also
+from tiers import also, few
 from variants import DEFAULT, OWN, variant
 
 import clsas
@@ -228,7 +228,7 @@ MOTIONS = {
 
 
 @every_scene
-@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("motion", few(MOTIONS, often=["far", "rotation"]))
 def test_where_the_scene_lies_does_not_matter(bound, case, motion):
     here = scene(case)
     there = moved(here, *MOTIONS[motion])

@@ -107,7 +107,7 @@ def test_rings_and_helices_keep_their_tolerance_on_their_carrier(name, tolerance
     assert error_db <= chosen.predicted_error_db
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", ["helix", *also("passes")])
 def test_the_oracle_agrees(name):
     """Random pixels against sums in float64 that share nothing with the imagers."""
@@ -158,7 +158,7 @@ def test_every_aperture_with_every_beam(case, name):
     assert -4 <= error_db - chosen.predicted_error_db <= 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("window", ["squinted", *also("all", "hann")])
 def test_images_of_a_helix_pay_with_a_beam(window):
     """Costs are those of a CPU: an image of some size is factorized because that is faster."""
@@ -172,7 +172,7 @@ def test_images_of_a_helix_pay_with_a_beam(window):
     assert -4 <= error_db - chosen.predicted_error_db <= 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_oracle_agrees_with_a_beam_that_turns():
     lines, grid = scene("helix")
     beam = with_headings("helix", WINDOWS["squinted"])

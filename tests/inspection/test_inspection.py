@@ -150,7 +150,7 @@ def test_defects_of_samples_are_found(lines, defect):
         assert word in found.describe()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_remedy_of_a_background_leaves_nothing_to_find(lines):
     found = clsas.inspect(with_samples(lines, common).without_background("median"))
     assert names(found) == []
@@ -233,7 +233,7 @@ def clipped_in_half(samples):
     samples[1 : len(samples) // 2 : 4, 300:340] = 9 * abs(samples).max()
 
 
-@pytest.mark.parametrize("defect", [silent_once, two_silent, clipped_once, clipped_in_half])
+@pytest.mark.parametrize("defect", [silent_once, clipped_in_half, *also(two_silent, clipped_once)])
 def test_a_defect_in_some_pings_names_no_receiver(lines, defect):
     found = clsas.inspect(with_samples(in_an_array(lines, receivers=4), defect))
     defects = [
@@ -553,7 +553,7 @@ CROSSINGS = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("sides", [CROSSINGS[0], *also(*CROSSINGS[1:])])
 def test_crossing_arcs_of_points_do_not_turn_the_sign(five_points, sides):
     """The energy of arcs adds up at empty positions, where neither sign is in focus."""

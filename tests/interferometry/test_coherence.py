@@ -71,7 +71,7 @@ def test_looks_of_images_smaller_than_a_resolution_cell(seed):
     assert effective_looks(alike, Window(21, 21)) < 2.5
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_looks_of_a_window_as_large_as_the_images():
     random = np.random.default_rng(7)
     images = speckle(random, 2, 1600, 1600, 0.05)

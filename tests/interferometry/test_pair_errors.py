@@ -193,6 +193,7 @@ def test_phase_and_delay_are_told_apart_by_the_band():
     assert errors.correlation[0, 1] > 0.9
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("known_m", "held"), [(0.0, "delay"), (1.3, "phase")])
 def test_a_band_too_narrow_leaves_phase_or_delay_alone(monkeypatch, known_m, held):
     first, second, found = narrow()
@@ -257,7 +258,7 @@ def test_control_points_and_heights_between_nan():
     assert uncertain.sd[0] == pytest.approx(0.1 / 0.327, rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_tilted_planes_and_other_axes():
     first, second, _ = narrow()
     plane = clsas.Grid.oriented([-0.6, 31.0, -0.3], [0, 0.02, 0.002], [0.02, 0, -0.002], (81, 61))

@@ -76,7 +76,7 @@ def echoes_of(sonar, track, seabed, **options):
     return clsas.compress(echoes, window="hamming", equalize=True)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("repeated", [1, *also(0)])
 @pytest.mark.parametrize("width_deg", [6.0, *also(4.0)])
 def test_responses_are_those_of_simulated_points(width_deg, repeated):

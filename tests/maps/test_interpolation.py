@@ -86,7 +86,7 @@ CASES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", few(CASES, often=["speckle", "UTM"]))
+@pytest.mark.parametrize("name", few(CASES, often=["UTM"]))
 def test_it_is_the_image_formed_on_the_axes_of_the_map(name, tmp_path):
     place, kind, step_m, pixel_m, turn = CASES[name]
     lines, grid = lines_of(place, kind), grid_of(place, step_m, turn)
@@ -105,7 +105,7 @@ def test_it_is_the_image_formed_on_the_axes_of_the_map(name, tmp_path):
     assert np.abs(difference_rad).max() < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_carrier_is_that_of_moving_arrays_and_squinted_beams(tmp_path):
     place = local(217.0)
     lines, grid = lines_of(place, "points"), grid_of(place, 0.0125)
@@ -143,7 +143,7 @@ def test_the_error_of_a_beam_with_kinks_is_stated(tmp_path):
     assert stated_db - 12 < error_db(found, expected) < stated_db < MOST_ERROR_DB
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_mosaic_is_resampled_window_by_window(tmp_path, monkeypatch):
     """Windows and patches leave no seams, and edges of what was received stay where they are."""
     place = local(217.0)
@@ -262,7 +262,7 @@ def test_lines_of_another_recording_are_recognized(kind, step_m, carrier_hz, tmp
         resampled(image, tmp_path / "a.tif", lines=other, beam=BEAM)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", ["speckle", *also("points")])
 @pytest.mark.parametrize("step_m", [0.0125, *also(0.008, 0.016, 0.03)])
 def test_lines_agree_with_their_image(kind, step_m):

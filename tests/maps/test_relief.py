@@ -133,7 +133,7 @@ def test_a_slope_turned_north_up_stays_a_slope(tmp_path):
     np.testing.assert_allclose(bands[0][inside], at_m[inside], atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_corners_far_from_a_narrow_swath_have_no_data(tmp_path):
     """Tiles of the north-up raster that the swath does not reach are not read at all."""
     heights = relief(local(217.0), shape=(9, 2000))

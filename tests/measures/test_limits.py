@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tiers import few
 
 import clsas
 from clsas.core.geometry import bistatic_range_m
@@ -103,7 +104,8 @@ def test_widths_are_those_that_the_demo_calls_theory(wide):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("beam", "window"), [(None, "none"), (BeamWindow(6.0, "hann", squint_deg=1.0), "hamming")]
+    ("beam", "window"),
+    [(BeamWindow(6.0, "hann", squint_deg=1.0), "hamming"), *few([(None, "none")], often=())],
 )
 def test_an_image_has_the_predicted_widths(beam, window):
     sonar, track = monostatic(0.02, 301, length_m=0.1)
@@ -196,7 +198,7 @@ def test_phase_centres_err_as_the_exact_geometry_does(wide):
     assert found["shift"].limit is None
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_motion_and_squint_enlarge_the_error_of_phase_centres(wide):
     error_m = wide["phase_centre_error_m"].value
     moving = clsas.limits(WIDE, TRACK, GRID, motion_in_flight=True)
@@ -336,7 +338,7 @@ def test_every_result_is_given_or_missing(wide):
         assert all(np.isfinite(each.value) for each in found.results)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_heights_of_two_banks():
     sonar, pings = Sonar.hisas_1030(), 81
     track = Track.straight([-20, 0, 15], [2, 0, 0], pings, 0.25)

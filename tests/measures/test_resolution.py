@@ -18,7 +18,7 @@ def test_a_plain_aperture():
     assert range_width_m(sonar, "hamming") == pytest.approx(1.3 * 1500 / (2 * 5e3), rel=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_many_channels_have_the_width_of_few():
     """More channels than are added up one by one, over the same aperture."""
     sonar = clsas.Sonar(clsas.Pulse(1e5, 5e3, 1e-3), [[0.0, 0, 0]], tx_length_m=0.2)
@@ -32,7 +32,7 @@ def test_many_channels_have_the_width_of_few():
     assert many == pytest.approx(few, rel=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_long_tracks_do_not_shorten_the_width():
     """Side lobes of the elements extend the spectrum far beyond the main lobe."""
     sonar, point_m = clsas.Sonar.edgetech(), np.array([0, 60.0, 0])

@@ -179,7 +179,7 @@ def test_patches_are_measured_again_if_files_were_added(tmp_path):
     assert files_of(store.path) == files
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_folders_of_both_banks_may_grow(tmp_path):
     names = "first", "second"
     halves = halves_of(*flat_banks())

@@ -126,7 +126,7 @@ def test_pixels_leave_the_shadow_if_its_patch_is_measured_again(tmp_path):
     assert expected_of(height_m).any()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_patches_without_heights_hide_nothing(tmp_path):
     height_m, store = seabed(), begun(tmp_path / "a.zarr")
     of_wall = slice(0, PATCH[0])

@@ -66,7 +66,7 @@ def test_smooth_sway_and_jitter():
     assert smooth_residual_m(found.correction_m[:, 1] - sway_m) <= WAVELENGTH_M / 100
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_jitter_alone():
     true, nominal = recorded(points(), white_m(0.1 * WAVELENGTH_M))
     assert peak_db(nominal, true) < -3
@@ -131,7 +131,7 @@ def test_sway_and_heave(wavelengths, most):
     assert abs(peak) <= 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_sway_and_heave_of_single_pings():
     motion = {
         "sway_m": white_m(0.05 * WAVELENGTH_M, 12),
@@ -146,7 +146,7 @@ def test_sway_and_heave_of_single_pings():
     assert np.std(residual_m) <= 0.6 * np.std(true_m)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_surge():
     """Displacements along the track move responses between images of subapertures."""
     found, peak = seen_from_above({"surge_m": smooth_m(WAVELENGTH_M, 2)}, ("surge",))
@@ -177,7 +177,7 @@ def with_carrier(lines):
     return replace(lines, samples=samples, range_step_m=step_m, carrier_hz=0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lines_with_their_carrier_are_focused_alike():
     sway_m = smooth_m(2 * WAVELENGTH_M)
     _, nominal = recorded(points(), sway_m)
@@ -295,7 +295,7 @@ def test_the_level_of_samples_does_not_matter(scale):
     assert smooth_residual_m(found.correction_m[:, 1] - scene.sway_m) <= WAVELENGTH_M / 100
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("seed", [4, *also(5)])
 def test_two_bright_points_are_too_few(seed):
     """Either the scene is reported as having no responses, or the track is found."""

@@ -47,7 +47,7 @@ def navigate(lines, **options):
     return micronavigate(lines, range_m=(NEAR_M, FAR_M), **options)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("count", "noise"), few([(1, False), (1, True), (3, False)], often=[(1, False)])
 )

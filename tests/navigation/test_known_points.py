@@ -107,7 +107,7 @@ def test_every_reflector_is_focused_at_its_position(lines):
     assert np.abs(peaks_db(found.lines, lines)).max() < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_no_reflector_is_focused_at_the_expense_of_others(lines):
     """The navigation drifts by 2 mm. The strongest point must not determine all corrections."""
     drift = 2e-3 * np.sin(np.arange(160) / 12)[:, None] * np.array([0, 1, 0])

@@ -238,7 +238,7 @@ def test_phase_centres_pair_up(straight):
     assert np.ptp(pairs.along_m) == pytest.approx(23 * SPACING_M)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_advance_that_differs_is_found():
     """The navigated advance is 2 % too small, which is a fraction of the spacing of the array."""
     sonar, advance_m = overlapping_array(56, 24)
@@ -250,7 +250,7 @@ def test_an_advance_that_differs_is_found():
     assert np.abs(advanced_m - advance_m).max() <= 0.05 * SPACING_M
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("every", [5, *also(2)])
 def test_sparse_arrays_do_not_take_side_lobes_for_an_advance(every):
     """Elements are shorter than their spacing, so that neighbours share no speckle."""

@@ -54,7 +54,7 @@ def test_a_correct_speed_is_not_reported():
     assert suggested_m_s(true, GRID) is None
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_arc_about_the_scene():
     """Ranges curve less along an arc, and so does the correction."""
     angle = np.linspace(-0.2, 0.2, 400)

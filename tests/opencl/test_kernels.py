@@ -177,6 +177,7 @@ def test_the_table_of_bands_has_the_columns_that_kernels_read():
 
 
 @pytest.mark.slow
+@pytest.mark.watches("cl", "clsas/opencl")
 @pytest.mark.filterwarnings("ignore::pyopencl.CompilerWarning")
 @pytest.mark.parametrize("name", OPTIONS)
 def test_parameters_are_those_that_the_compiler_finds(name, platform):

@@ -10,6 +10,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from cases import along_x, lines_over
+from tiers import also
 
 import clsas
 from clsas import plot
@@ -83,6 +84,7 @@ def test_labels_of_images_do_not_overlap(grid):
     check_labels(plot.image_db(speckle(grid), title="An image of speckle"))
 
 
+@pytest.mark.exhaustive
 def test_labels_of_resized_figures_do_not_overlap():
     figure = plot.image_db(speckle(GRIDS["utm"]))
     for inches in ((3, 3), (4, 2), (12, 9)):
@@ -99,7 +101,7 @@ def test_labels_of_curves_and_geometry_do_not_overlap():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("apart", [1.0, 0.1, 0.0])
+@pytest.mark.parametrize("apart", [0.1, *also(1.0, 0.0)])
 def test_labels_of_a_tradeoff_do_not_overlap(apart):
     rows = [
         Row(f"{label} {k}", method, "", 0.0, 0.1 * 2 ** (apart * k), 0.1, -30 - 8 * apart * k, -25)
@@ -127,7 +129,7 @@ def test_the_suffix_decides_the_format(tmp_path):
     assert b"/Type3" not in pdf  # publishers refuse these fonts
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_same_picture_is_the_same_file(tmp_path):
     for suffix in ("png", "pdf", "svg"):
         files = [tmp_path / f"{k}.{suffix}" for k in range(2)]
@@ -405,7 +407,7 @@ except OSError as error:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
+@pytest.mark.parametrize("suffix", ["png", *also("pdf", "svg")])
 def test_a_file_that_cannot_grow_is_reported(suffix, tmp_path):
     path = tmp_path / f"a.{suffix}"
     path.write_bytes(b"old")

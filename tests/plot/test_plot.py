@@ -196,7 +196,7 @@ def test_every_figure_is_drawn_without_a_warning(tmp_path, recwarn):
     assert not recwarn.list
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_no_global_state_is_touched():
     code = (
         "import sys, numpy as np; from clsas import plot; from clsas.core.grid import Grid; "

@@ -321,7 +321,7 @@ def test_heights_larger_than_memory_are_a_mosaic(scene):
         clsas.process(scene)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("patches", [False, *also(True)])
 def test_errors_of_the_pair_are_corrected(scene, patches):
     """A phase of the second bank displaces heights, until a level seabed corrects it."""

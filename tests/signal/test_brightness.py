@@ -32,7 +32,7 @@ def coherent_ratio_db(lines, grid):
     return 10 * np.log10(np.vdot(image, image).real / np.vdot(passed, passed).real)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("x_m", [4.8, *also(4.4)])
 def test_points_that_the_beam_hardly_covers_make_dark_images(x_m):
     lines, grid = bright_where_coverage_ends(x_m)

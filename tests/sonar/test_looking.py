@@ -312,7 +312,7 @@ def test_on_another_heading_the_elements_look_elsewhere():
     assert looking.side_of(lines, lines.look_direction) == "port"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("shape", [(20_000, 20_000), (1, 10**6), (10**6,), (200, 200, 200)])
 def test_pixels_are_sampled_however_many_there_are(shape):
     """The middles of equal parts, so that shares are those of all pixels."""
