@@ -69,8 +69,8 @@ def read_cphd(
     channel : str, optional
         Identifier of the channel; by default the file's reference channel.
     window : str, float or tuple
-        Window over the frequencies of FX data, as for `from_phase_history`. It has no effect on TOA
-        data, which are compressed already.
+        Window over the band of FX data (FX1 to FX2 of every vector), as for `from_phase_history`.
+        It has no effect on TOA data, which are compressed already.
     oversampling : float
         Sample rate of lines from FX data over the bandwidth, at least 1.
 
@@ -403,6 +403,7 @@ def _lines_of_fx(
         frequency_step_hz=scale * vectors["SCSS"].astype(np.float64),
         **_geometry(vectors, collection),
         sound_speed_m_s=collection.speed_m_s,
+        band_hz=scale * np.stack([vectors["FX1"], vectors["FX2"]], axis=1).astype(np.float64),
         window=window,
         oversampling=max(1.0, oversampling * min(1.0, occupied)),
     )

@@ -31,6 +31,7 @@ def from_phase_history(
     tx_m: ArrayLike,
     rx_m: ArrayLike,
     sound_speed_m_s: float,
+    band_hz: ArrayLike | None = None,
     window: Window = "none",
     oversampling: float = 2.0,
     sign: int = -1,
@@ -54,8 +55,11 @@ def from_phase_history(
         Transmitter and receiver positions, metres.
     sound_speed_m_s : float
         Speed of the waves, metres per second; 299 792 458 m/s for radar.
+    band_hz : array_like, [2] or [channels, 2], optional
+        Lowest and highest frequency of the pulse, hertz. Samples outside contain only noise, and
+        are left out. By default the pulse has all frequencies.
     window : str, float or tuple
-        Window over the frequencies: "none", or a window of `scipy.signal.get_window`.
+        Window over the band: "none", or a window of `scipy.signal.get_window`.
     oversampling : float
         Number of samples per line over number of frequencies, 1 to 10 000. The spectrum is padded
         with zeros.
@@ -66,7 +70,7 @@ def from_phase_history(
     -------
     RangeLines
         Lines of one period c/(2 step), centred on the reference range. Their carrier is the mean
-        frequency. Amplitudes are those of the samples. With a sign of +1 the samples are
+        of the bands' centres. Amplitudes are those of the samples. With a sign of +1 the samples are
         conjugated, so that A becomes its conjugate.
 
     Raises
@@ -83,7 +87,7 @@ def from_phase_history(
 
     Notes
     -----
-    With the centre frequency fc, and weights w with the sum 1, the lines are
+    With the carrier fc, and weights w of each channel with the sum 1, the lines are
 
         s(r) = exp(-j 4 pi fc r0/c) sum_m w_m S_m exp(j 4 pi (f_m - fc)(r - r0)/c),
 
@@ -122,24 +126,25 @@ def from_phase_history(
     reference_m = validate.array(
         "reference_range_m", reference_range_m, np.float64, (channels,), broadcast=True
     )
-    weights = _weights(window, count)
+    band_hz = _bands(band_hz, first_hz, step_hz, count)
     validate.memory("oversampling", 8 * channels * oversampling * count)
     length = fft.next_fast_len(math.ceil(oversampling * count))
     equal = np.ptp(step_hz) * count <= _EQUAL_STEPS * step_hz.min()
     # The longest line that is not longer than the period of any channel.
     range_step_m = float(speed / (2 * length * step_hz.max()))
     offset_m = (np.arange(length) - length // 2) * range_step_m
-    carrier_hz = float(np.mean(first_hz + (count - 1) / 2 * step_hz))
+    carrier_hz = float(np.mean(band_hz))
     farthest_m = float(np.abs(reference_m).max() - offset_m[0])
     validate.phase(carrier_hz, speed, farthest_m)
     _warn_of_slips(first_hz, step_hz * (count - 1), reference_m)
+    weights = _weights(window, band_hz, first_hz, step_hz, count)
 
     lines = np.empty((channels, length), np.complex64)
     rows = max(1, _BLOCK // length)
     for first in range(0, channels, rows):
         block = slice(first, first + rows)
         spectrum = samples[block].astype(np.complex128)
-        spectrum = (spectrum if sign == -1 else spectrum.conj()) * weights
+        spectrum = (spectrum if sign == -1 else spectrum.conj()) * weights[block]
         if equal:
             part = fft.fftshift(length * fft.ifft(spectrum, length, workers=-1), axes=1)
         else:
@@ -176,12 +181,46 @@ def _warn_of_slips(
         )
 
 
-def _weights(window: Window, count: int) -> NDArray[np.float64]:
-    """Return weights of the frequencies, with the sum 1."""
-    weights = band_window(window, 1.0)(np.linspace(-0.5, 0.5, count))
-    if not abs(weights.sum()) > 0:
+def _bands(
+    band_hz: ArrayLike | None,
+    first_hz: NDArray[np.float64],
+    step_hz: NDArray[np.float64],
+    count: int,
+) -> NDArray[np.float64]:
+    """Return the lowest and highest frequency of every channel's pulse among the samples."""
+    sampled_hz = np.stack([first_hz, first_hz + (count - 1) * step_hz], axis=1)
+    if band_hz is None:
+        return sampled_hz
+    given = validate.array("band_hz", band_hz, np.float64, (len(first_hz), 2), broadcast=True)
+    band = np.clip(given, sampled_hz[:, :1], sampled_hz[:, 1:])
+    narrow = np.flatnonzero(~(np.diff(band)[:, 0] >= step_hz))
+    if narrow.size:
+        low, high = given[narrow[0]]
+        raise ValueError(
+            "band_hz must ascend and contain at least 2 sampled frequencies of every channel, got "
+            f"{low:g} to {high:g} Hz for channel {narrow[0]}, sampled from "
+            f"{sampled_hz[narrow[0], 0]:g} to {sampled_hz[narrow[0], 1]:g} Hz"
+        )
+    return band
+
+
+def _weights(
+    window: Window,
+    band_hz: NDArray[np.float64],
+    first_hz: NDArray[np.float64],
+    step_hz: NDArray[np.float64],
+    count: int,
+) -> NDArray[np.float64]:
+    """Return weights of the frequencies of every channel, 0 outside its band, with the sum 1."""
+    weigh = band_window(window, 1.0)
+    low_hz, high_hz = band_hz.T
+    centre, width = ((low_hz + high_hz) / 2 - first_hz) / step_hz, (high_hz - low_hz) / step_hz
+    place = (np.arange(count) - centre[:, None]) / width[:, None]
+    weights = np.where(np.abs(place) <= 0.5 + 1e-9, weigh(np.clip(place, -0.5, 0.5)), 0.0)
+    total = weights.sum(axis=1, keepdims=True)
+    if not np.abs(total).min() > 0:
         raise ValueError(f"window must have a sum other than 0, got {validate.shown(window)}")
-    return weights / weights.sum()
+    return weights / total
 
 
 def _frequencies(name: str, value: ArrayLike, channels: int) -> NDArray[np.float64]:

@@ -171,10 +171,13 @@ def test_a_radar_sees_the_wavelengths_of_the_sonar(tmp_path):
     assert clsas.relative_error_db(*images) < -80
 
 
-def foreign(path, *, sign=-1, bistatic=True, kind="CF8", domain="FX", hae=False, pulses=48):
+def foreign(
+    path, *, sign=-1, bistatic=True, kind="CF8", domain="FX", hae=False, pulses=48, margin=0.0
+):
     """Write a file in the FX or TOA domain with the analytic signal of a point.
 
     Bands, frequency steps and scale factors differ from vector to vector; one vector is not normal.
+    Samples beyond the band, by a share of it on either side, are strong noise.
     """
     count = 200
     angle = np.linspace(-0.02, 0.02, pulses)
@@ -196,9 +199,13 @@ def foreign(path, *, sign=-1, bistatic=True, kind="CF8", domain="FX", hae=False,
     vectors["FX1"], vectors["FX2"] = 9.8e9 * vary, 10.2e9 * vary
     number = np.arange(count)
     if domain == "FX":
-        vectors["SC0"], vectors["SCSS"] = vectors["FX1"], (vectors["FX2"] - vectors["FX1"]) / count
+        band = vectors["FX2"] - vectors["FX1"]
+        vectors["SC0"] = vectors["FX1"] - margin * band
+        vectors["SCSS"] = (1 + 2 * margin) * band / count
         frequency = vectors["SC0"][:, None] + number * vectors["SCSS"][:, None]
         signal = np.exp(sign * 2j * np.pi * frequency * excess_s)
+        outside = (frequency < vectors["FX1"][:, None]) | (frequency > vectors["FX2"][:, None])
+        signal[outside] = 30 * np.exp(1j * np.random.default_rng(1).uniform(0, 9, outside.sum()))
         vectors["TOA1"], vectors["TOA2"] = -0.4 / vectors["SCSS"], 0.4 / vectors["SCSS"]
     else:
         vectors["SCSS"] = 0.5e-9
@@ -233,6 +240,7 @@ def foreign(path, *, sign=-1, bistatic=True, kind="CF8", domain="FX", hae=False,
 
 FOREIGN = {
     "FX": {},
+    "FX with more than the band": {"margin": 0.3},
     "FX of the other sign": {"sign": 1},
     "FX monostatic": {"bistatic": False},
     "FX of 16-bit numbers": {"kind": "CI4"},

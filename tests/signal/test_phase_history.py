@@ -45,6 +45,40 @@ def lines_of(parts, sign=-1, **options):
     )
 
 
+@pytest.mark.parametrize("own_steps", [False, True], ids=["one step", "own steps"])
+@pytest.mark.parametrize("window", ["none", "hamming", ("kaiser", 6.0)], ids=str)
+def test_the_window_spans_the_band_and_what_is_outside_is_left_out(window, own_steps):
+    """The same lines come from the samples of the band alone."""
+    parts = tx_m, rx_m, first_hz, step_hz, reference_m = collection(own_steps=own_steps, pulses=4)
+    below, inside = 60, 201  # the band is not in the middle of the samples
+    noisy = history(*parts)[0]
+    noise = np.random.default_rng(1).normal(size=(*noisy.shape, 2)) @ [1, 1j]
+    outside = np.ones(COUNT, bool)
+    outside[below : below + inside] = False
+    noisy[:, outside] += 10 * noise[:, outside]
+    low_hz = first_hz + below * step_hz
+    band_hz = np.stack([low_hz, low_hz + (inside - 1) * step_hz], axis=1)
+    common = dict(
+        frequency_step_hz=step_hz, reference_range_m=reference_m, tx_m=tx_m, rx_m=rx_m,
+        sound_speed_m_s=speed_of_light, window=window,
+    )  # fmt: skip
+    found = from_phase_history(noisy, first_frequency_hz=first_hz, band_hz=band_hz, **common)
+    wanted = from_phase_history(
+        noisy[:, ~outside], first_frequency_hz=low_hz, oversampling=2 * COUNT / inside, **common
+    )
+    assert found.carrier_hz == pytest.approx(wanted.carrier_hz, rel=1e-12)
+    assert found.samples.shape == wanted.samples.shape
+    np.testing.assert_allclose(found.samples, wanted.samples, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    "band_hz", [(9.9e9, 9.4e9), (9.4e9, 9.4005e9), (8e9, 8.5e9), (9.4, 9.6), (np.nan, 9.5e9)]
+)
+def test_a_band_must_contain_frequencies_of_the_samples(band_hz):
+    with pytest.raises(ValueError, match="band_hz"):
+        lines_of(collection(), band_hz=band_hz)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("own_steps", [False, True], ids=["one step", "own steps"])
 @pytest.mark.parametrize("bistatic", [False, True], ids=["monostatic", "bistatic"])
