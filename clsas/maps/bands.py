@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.grid import Grid
+from clsas.core.means import block_sums
 from clsas.maps.sources import Source
 
 
@@ -67,15 +68,7 @@ class Band:
     def halved(self, values: NDArray) -> NDArray[np.float32]:
         """Return the means of 2 x 2 pixels, of those that have data."""
         summands, known = self.summands(values)
-        return self.mean(_summed(summands), _summed(known.astype(np.uint8)), 1)
-
-
-def _summed(values: NDArray) -> NDArray:
-    """Return the sums of 2 x 2 values; fewer at the last row and column of odd shapes."""
-    odd = [n % 2 for n in values.shape]
-    even = np.pad(values, [(0, n) for n in odd]) if any(odd) else values
-    rows = even[::2] + even[1::2]
-    return rows[:, ::2] + rows[:, 1::2]
+        return self.mean(block_sums(summands), block_sums(known.astype(np.uint8)), 1)
 
 
 def bands_of(source: Source, kind: str) -> tuple[Band, ...]:

@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.core.means import block_means
+
 SIDE = 512
 """Pixels along a side of a tile. Half as many would make four times as many files; twice as many
 would take four times as long to appear."""
@@ -187,21 +189,7 @@ class Pyramid:
             coarser, own = self.factors[scale - 1], self.factors[scale]
             down, across = coarser[0] // own[0], coarser[1] // own[1]
             top, left = row * SIDE // down, column * SIDE // across
-            self._add(scale - 1, top, left, reduced(power, down, across))
-
-
-def reduced(power: NDArray[np.float32], down: int, across: int) -> NDArray[np.float32]:
-    """Return the means of `down` x `across` pixels, which are 1 or 2.
-
-    At the end of odd sides they are the means of those that exist.
-    """
-    rows, columns = (-n % by for n, by in zip(power.shape, (down, across), strict=True))
-    even = np.pad(power, ((0, rows), (0, columns)), mode="edge") if rows or columns else power
-    parts = [even[i::down, j::across] for j in range(across) for i in range(down)]
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return np.multiply(total, np.float32(1 / len(parts)))
+            self._add(scale - 1, top, left, block_means(power, power > 0, down, across))
 
 
 def _packed(levels: NDArray[np.uint8]) -> bytes:

@@ -18,6 +18,8 @@ from clsas.core.image import Image
 def multilook(images: Image | Sequence[Image], *, window_m: float | None = None) -> Image:
     """Return an image whose power is the mean over several looks, over a window, or over both.
 
+    Means are those of the pixels that received something, whose amplitude is not 0.
+
     Speckle has as much variation as its mean. The mean of N independent looks varies by 1/sqrt(N)
     of it, at the price of resolution: each look uses a part of the band or of the beam, or the
     pixels of a look are those of a window. The looks of one survey are images of its sub-bands
@@ -69,15 +71,16 @@ def multilook(images: Image | Sequence[Image], *, window_m: float | None = None)
     if len(looks) == 1 and window_m is None:
         raise ValueError("window_m must be given for a single image, or images be several looks")
     size = None if window_m is None else window_pixels(grid, window_m)
-    validate.memory("images", 24 * grid.size)
+    validate.memory("images", 32 * grid.size)
     largest = max(float(np.abs(look.pixels).max()) for look in looks) or 1.0
-    power = np.zeros(grid.shape)
+    power, received = np.zeros(grid.shape), np.zeros(grid.shape)
     for look in looks:
         # Squares of large and of small pixels stay within floating point.
         power += np.abs(look.pixels / np.float32(largest)).astype(np.float64) ** 2
-    power /= len(looks)
+        received += look.pixels != 0
     if size is not None:
-        power = _windowed_mean(power, size)
+        power, received = _windowed(power, size), np.rint(_windowed(received, size))
+    power = np.divide(power, received, out=np.zeros(grid.shape), where=received > 0)
     return Image((largest * np.sqrt(power)).astype(np.complex64), grid)
 
 
@@ -120,8 +123,7 @@ def window_pixels(grid: Grid, window_m: float) -> tuple[int, int]:
     return counts[0], counts[1]
 
 
-def _windowed_mean(power: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the mean over the pixels of a window around each pixel that lie in the image."""
-    total = uniform_filter(power, size, mode="constant")
-    # Running sums leave rounding errors behind bright pixels, which must not become negative.
-    return np.maximum(total, 0.0) / uniform_filter(np.ones_like(power), size, mode="constant")
+def _windowed(values: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the sum over the pixels of a window around each pixel that lie in the image."""
+    # Running sums leave rounding errors behind large values, which must not become negative.
+    return math.prod(size) * np.maximum(uniform_filter(values, size, mode="constant"), 0.0)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from clsas.core.grid import Grid
 from clsas.core.image import Image
+from clsas.core.means import block_means
 
 _FINEST = 5  # pixels of a level along each side of an overview pixel, before a larger step is tried
 _LARGER = 4 / 3  # largest step over the smallest, so that a coarser level can be read
@@ -69,6 +70,8 @@ def step_of(shape: tuple[int, ...], most: int, factors: Sequence[int]) -> tuple[
 def reduced(grid: Grid, reading: Reading, step: int) -> Image:
     """Return an image at fewer pixels, each with the mean power of those that it covers.
 
+    Pixels that nothing reached do not count.
+
     Parameters
     ----------
     grid : Grid
@@ -93,10 +96,10 @@ def reduced(grid: Grid, reading: Reading, step: int) -> Image:
         for start in range(0, shape[1], run):
             stop = min(start + run, shape[1])
             pixels = read(slice(first * down, last * down), slice(start * across, stop * across))
-            blocks = (np.abs(pixels) ** 2).reshape(
-                last - first, down // factor, stop - start, across // factor
+            block = np.abs(pixels).astype(np.float64) ** 2
+            power[first:last, start:stop] = block_means(
+                block, block != 0, down // factor, across // factor
             )
-            power[first:last, start:stop] = blocks.mean(axis=1).mean(axis=2)
     origin_m, row_step_m, column_step_m = grid.vectors_m
     middle_m = (down - 1) / 2 * row_step_m + (across - 1) / 2 * column_step_m
     coarse = Grid.oriented(

@@ -1,8 +1,9 @@
 """Arithmetic of levels: means of power, of complex pixels and of layers over blocks of pixels.
 
-Sums are in double precision, so that neither the power of small amplitudes nor that of large ones
-leaves the range of numbers. Stored is the root of the mean power, which has the range of the
-pixels.
+A pixel of a level is the mean of the 2 x 2 pixels of the level before that received something, each
+weighed by the number of pixels of the mosaic that it covers. Sums are in double precision, so that
+neither the power of small amplitudes nor that of large ones leaves the range of numbers. Stored is
+the root of the mean power, which has the range of the pixels.
 
 Layers are means of the pixels that have a value, level by level. A deviation is that of the mean of
 the heights. Heights of neighbouring pixels share most of their windows: those that are d pixels
@@ -21,6 +22,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.core.means import block_means
 from clsas.mosaics.levels import IN_DB, PixelArray
 
 Real = TypeVar("Real", np.float32, np.float64)
@@ -47,30 +49,6 @@ class Level(NamedTuple):
         return self.pixels if array.kind == "pixels" else self.amplitude
 
 
-class _Sums(NamedTuple):
-    """Sums over blocks of pixels, and the number of pixels in the blocks along both axes."""
-
-    power: NDArray[np.float64]
-    pixels: NDArray[np.complex128]
-    rows: NDArray[np.float64]
-    columns: NDArray[np.float64]
-
-    def halved(self) -> _Sums:
-        """Return the sums over blocks of twice the side."""
-        return _Sums(
-            _pairs_of_columns(_pairs(self.power)),
-            _pairs_of_columns(_pairs(self.pixels)),
-            _pairs(self.rows),
-            _pairs(self.columns),
-        )
-
-    def level(self) -> Level:
-        """Return the means."""
-        count = np.multiply.outer(self.rows, self.columns)
-        amplitude = np.sqrt(self.power / count).astype(np.float32)
-        return Level(amplitude, (self.pixels / count).astype(np.complex64))
-
-
 def levels(pixels: NDArray[np.complex64], factors: tuple[int, ...]) -> dict[int, Level]:
     """Return the levels of a patch.
 
@@ -86,12 +64,18 @@ def levels(pixels: NDArray[np.complex64], factors: tuple[int, ...]) -> dict[int,
     bands: dict[int, list[Level]] = {factor: [] for factor in factors}
     height = factors[-1] * max(_BAND // factors[-1], 1)
     for first in range(0, len(pixels), height):
-        sums, factor = _sums_of(pixels[first : first + height]), 1
-        while factor < factors[-1]:
+        band = pixels[first : first + height]
+        level, factor = Level(np.abs(band), band), 1
+        while True:
             if factor in bands:
-                bands[factor].append(sums.level())
-            sums, factor = sums.halved(), 2 * factor
-        bands[factor].append(sums.level())
+                bands[factor].append(level)
+            if factor == factors[-1]:
+                break
+            weights = [
+                covered(0, of_level, factor, of_band)
+                for of_level, of_band in zip(level.amplitude.shape, band.shape, strict=True)
+            ]
+            level, factor = coarser(level, weights[0], weights[1]), 2 * factor
     return {
         factor: Level(
             np.concatenate([each.amplitude for each in found]),
@@ -153,13 +137,7 @@ def _mean_correlation(count: int, window: int) -> float:
 
 def mean_of_four(values: NDArray[Real]) -> NDArray[Real]:
     """Return means of 2 x 2 pixels, of those that are not NaN; NaN if all are."""
-    known = ~np.isnan(values)
-    sums, counts = (
-        _pairs_of_columns(_pairs(each.astype(np.float64)))
-        for each in (np.where(known, values, 0), known)
-    )
-    mean = np.full(sums.shape, np.nan)
-    np.divide(sums, counts, out=mean, where=counts > 0)
+    mean = block_means(values.astype(np.float64), ~np.isnan(values), empty=np.nan)
     return mean.astype(values.dtype)
 
 
@@ -173,9 +151,10 @@ def coarser(level: Level, rows: NDArray[np.float64], columns: NDArray[np.float64
     rows, columns : float64
         Number of pixels of the mosaic that its pixels cover, along both axes.
     """
-    count = np.multiply.outer(rows, columns)
-    power = count * np.square(level.amplitude, dtype=np.float64)
-    return _Sums(power, count * level.pixels, rows, columns).halved().level()
+    weights = np.multiply.outer(rows, columns) * (level.amplitude != 0)
+    power = block_means(np.square(level.amplitude, dtype=np.float64), weights)
+    pixels = block_means(level.pixels.astype(np.complex128), weights)
+    return Level(np.sqrt(power).astype(np.float32), pixels.astype(np.complex64))
 
 
 def _in_db(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -200,22 +179,3 @@ def covered(first: int, count: int, factor: int, pixels: int) -> NDArray[np.floa
     """
     starts = factor * np.arange(first, first + count)
     return np.minimum(factor, pixels - starts).astype(np.float64)
-
-
-def _sums_of(pixels: NDArray[np.complex64]) -> _Sums:
-    exact = pixels.astype(np.complex128)
-    power = np.square(exact.real) + np.square(exact.imag)
-    return _Sums(power, exact, *(np.ones(count) for count in pixels.shape))
-
-
-def _pairs(values: NDArray) -> NDArray:
-    """Return the sums of pairs along the first axis; the last value may lack a partner."""
-    sums = values[::2].copy()
-    sums[: len(values) // 2] += values[1::2]
-    return sums
-
-
-def _pairs_of_columns(values: NDArray) -> NDArray:
-    sums = values[:, ::2].copy()
-    sums[:, : values.shape[1] // 2] += values[:, 1::2]
-    return sums

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from clsas.core import validate
 from clsas.core.grid import Grid, without_heights
 from clsas.core.image import Image
+from clsas.core.means import block_means
 from clsas.interferometry.refinement import filled
 from clsas.interferometry.result import Heights
 from clsas.mosaics.documents import read_document
 from clsas.mosaics.levels import LAYERS, WINDOW, level_shape
-from clsas.mosaics.pyramid import coarser_layers, mean_of_four
+from clsas.mosaics.pyramid import coarser_layers
 
 if TYPE_CHECKING:
     from clsas.mosaics.store import Store
@@ -107,7 +108,7 @@ def _reduced(
     window = read_document(store.path)[WINDOW]
     while finest < factor:
         finest *= 2
-        layers, power = coarser_layers(layers, finest, window), mean_of_four(power)
+        layers, power = coarser_layers(layers, finest, window), block_means(power, power != 0)
     return layers | {_AMPLITUDE: np.sqrt(power).astype(np.float32)}
 
 

@@ -70,8 +70,8 @@ def from_phase_history(
     -------
     RangeLines
         Lines of one period c/(2 step), centred on the reference range. Their carrier is the mean
-        of the bands' centres. Amplitudes are those of the samples. With a sign of +1 the samples are
-        conjugated, so that A becomes its conjugate.
+        of the bands' centres. Amplitudes are those of the samples. With a sign of +1 the samples
+        are conjugated, so that A becomes its conjugate.
 
     Raises
     ------

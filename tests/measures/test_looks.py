@@ -44,6 +44,22 @@ def test_looks_average_power_and_reduce_speckle():
     assert clsas.contrast(clsas.multilook(images, window_m=0.06)) == pytest.approx(1 / 6, abs=0.02)
 
 
+def test_only_what_was_received_counts():
+    """Edges, seams and single pixels that nothing reached leave the power of 1 beside them."""
+    looks = []
+    for seam in (30, 60, 61):
+        pixels = np.exp(1j * np.random.default_rng(seam).uniform(0, 9, GRID.shape))
+        pixels[:, seam] = pixels[:, :7] = pixels[50, 100] = 0
+        looks.append(clsas.Image(pixels, GRID))
+    found = np.abs(clsas.multilook(looks).pixels)
+    np.testing.assert_allclose(found[found > 0], 1, rtol=1e-6)
+    assert np.count_nonzero(found == 0) == 7 * len(found) + 1
+    for images in (looks, looks[0]):
+        found = np.abs(clsas.multilook(images, window_m=0.1).pixels)
+        np.testing.assert_allclose(found[:, 5:], 1, rtol=1e-6)
+        assert not found[:, :5].any()  # no pixel of these windows received anything
+
+
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
 def test_levels_of_any_unit(scale):
     image = speckle(1)

@@ -87,13 +87,15 @@ def files_of_finished(patch_shape):
 
 
 def expected(factor, pixels=PIXELS):
-    """Return amplitude and mean of blocks, one by one."""
-    rows, columns = (range(0, count, factor) for count in pixels.shape)
-    blocks = [
-        [pixels[i : i + factor, j : j + factor].astype(complex) for j in columns] for i in rows
-    ]
-    amplitude = [[np.sqrt(np.mean(np.abs(block) ** 2)) for block in row] for row in blocks]
-    return np.array(amplitude), np.array([[block.mean() for block in row] for row in blocks])
+    """Return amplitude and mean of blocks, one by one, of the pixels that received something."""
+    shape = [-(-count // factor) for count in pixels.shape]
+    amplitude, mean = np.zeros(shape), np.zeros(shape, complex)
+    for i, j in np.ndindex(*shape):
+        block = pixels[i * factor : (i + 1) * factor, j * factor : (j + 1) * factor].astype(complex)
+        if block.any():
+            amplitude[i, j] = np.sqrt(np.mean(np.abs(block[block != 0]) ** 2))
+            mean[i, j] = block[block != 0].mean()
+    return amplitude, mean
 
 
 @pytest.mark.slow
@@ -121,6 +123,21 @@ def test_levels_are_means_of_power_and_of_pixels(tmp_path, patch_shape, levels):
     np.testing.assert_array_equal(store.read_level(4, *part), store.read_level(4)[part])
     assert not store.damage()
     assert not store.array_damage()
+
+
+@pytest.mark.parametrize("patch_shape", [OF_PATCHES, ODD])
+def test_pixels_that_nothing_reached_leave_seams_as_bright_as_the_rest(tmp_path, patch_shape):
+    """A seam within blocks, and an edge of whole blocks of level 2; the rest has the power 1."""
+    pixels = np.exp(1j * np.random.default_rng(1).uniform(0, 9, GRID.shape)).astype(np.complex64)
+    pixels[:, 29] = pixels[:2] = 0
+    store = formed(tmp_path / "a.zarr", patch_shape, pixels)
+    for factor in store.levels:
+        level = store.read_level(factor)
+        np.testing.assert_allclose(level[1 if factor == 2 else 0 :], 1.0, rtol=1e-6)
+    assert not store.read_level(2)[0].any()
+    for most in (30, 28):
+        shown = np.abs(store.overview(most).pixels)
+        np.testing.assert_allclose(shown, 1.0, rtol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
