@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from clsas.core import validate
 from clsas.core.lines import RangeLines
 from clsas.exact.backprojection import BEST_ACCURACY_DB
-from clsas.mosaics.provenance import REQUESTS
+from clsas.mosaics.documents import is_there, read_document
+from clsas.mosaics.provenance import REQUESTS, beam_json
 from clsas.mosaics.scheduling import Growth
+from clsas.mosaics.survey import END, has_ended
 from clsas.planning.request import TOLERANCE_DB, checked_pairs, tolerance_in_db
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.directions import MOST_TRACK_PINGS
+from clsas.sonar.simplify import shift_error
 
 
 def checked_request(
@@ -53,16 +59,63 @@ def checked_growth(source: RangeLines | Path, follow_s: float | None) -> Growth 
     return Growth(source.resolve(), idle_s)
 
 
+def beam_of_mosaic(
+    beam: BeamWindow | None, source: RangeLines | Path, store: Path | None, *, grows: bool
+) -> BeamWindow | None:
+    """Return a beam whose weights later pings do not change, if there may be any.
+
+    Files may be added to a folder that is followed, and to one without a file `end` whose mosaic is
+    stored. The mosaic of such a folder keeps its beam when the folder is complete.
+
+    Raises
+    ------
+    ValueError
+        If there may be later pings, and the weights depend on them.
+    """
+    if beam is None or isinstance(source, RangeLines) or not source.is_dir():
+        return beam
+    if grows or (store is not None and not has_ended(source)):
+        if beam.normalise:
+            raise ValueError(
+                "beam must not normalise for a folder that may grow, since the scale depends on "
+                f"the number of all channels: put an empty file '{END}' into a complete folder"
+            )
+        return beam_of_growing(beam)
+    if store is not None and is_there(store):
+        growing = beam_of_growing(beam)
+        if read_document(store)["inputs"].get("beam") == json.loads(beam_json(growing)):
+            return growing
+    return beam
+
+
 def beam_of_growing(beam: BeamWindow) -> BeamWindow:
-    """Return a beam whose weights later pings do not change; raise ValueError if there is none."""
-    if beam.normalise:
-        raise ValueError(
-            "beam must not normalise for a folder, which may grow: the scale depends on the number "
-            "of all channels"
-        )
+    """Return a beam whose direction follows the track over a fixed number of pings."""
     if beam.along is None and beam.track_pings is None:
         return replace(beam, track_pings=MOST_TRACK_PINGS)
     return beam
+
+
+def warn_of_window(beam: BeamWindow, geometry: RangeLines, request: dict[str, Any]) -> None:
+    """Warn if a growing survey's image differs from that of the same pings in one file.
+
+    The direction of the track is smoothed over another number of pings. The difference is the rms
+    of that of the weights, relative to their own.
+    """
+    growing = beam_of_growing(beam)
+    if growing is beam or len(geometry.ping_starts) < 2:
+        return
+    sine = np.linalg.norm(np.cross(beam.directions(geometry), growing.directions(geometry)), axis=1)
+    power = shift_error(beam, float(np.sqrt(np.mean(sine**2))), geometry)
+    ways = request.get("tolerance_db"), request.get("tolerance_wavelengths")
+    asked_db = request.get("accuracy_db") or tolerance_in_db(*ways) or TOLERANCE_DB
+    if power > 10 ** (asked_db / 10):
+        validate.warn(
+            "source may grow, or did when the mosaic began: the direction of the track is smoothed "
+            f"over {MOST_TRACK_PINGS} pings, whatever their number. The image may differ by "
+            f"{10 * np.log10(power):.0f} dB from that of the {len(geometry.ping_starts)} pings in "
+            "one file. Give track_pings for both, or put an empty file "
+            f"'{END}' into a complete folder before its mosaic begins"
+        )
 
 
 def check_client(client: object, source: object, store: object, device: object) -> None:

@@ -30,7 +30,7 @@ from clsas.interferometry.coherence import Window
 from clsas.interferometry.doubts import BEYOND
 from clsas.interferometry.heights import LEAST_COHERENCE
 from clsas.interferometry.request import Request
-from clsas.mosaics.arguments import beam_of_growing
+from clsas.mosaics.arguments import beam_of_mosaic, warn_of_window
 from clsas.mosaics.banks import Bank
 from clsas.mosaics.devices import open_devices
 from clsas.mosaics.documents import PARTS_OF_B, read_document
@@ -173,12 +173,16 @@ def mosaic_heights(
     if patch_m is not None:
         patch_m = validate.positive("patch_m", patch_m, "m")
     validate.progress(progress)
-    if request.beam is not None and any(_is_folder(each) for each in (a, b)):
-        request = replace(request, beam=beam_of_growing(request.beam))
+    opened = Store.at(validate.path("store", store))
+    beam = request.beam
+    for name, source in (("a", a), *(() if b is None else [("b", b)])):
+        beam = beam_of_mosaic(beam, _source(name, source), opened.path, grows=False)
+    given, request = request.beam, replace(request, beam=beam)
     banks = _banks(a, b, request.beam)
     check_pair(*(bank.geometry for bank in banks))
     grid = placed(banks[1].geometry, placed(banks[0].geometry, grid))
-    opened = Store.at(validate.path("store", store))
+    if given is not None and given is not beam:
+        warn_of_window(given, banks[0].geometry, {"tolerance_db": request.tolerance_db})
     devices = open_devices(device)
     patch_shape = _patch_shape(grid, patch_m)
     decided = _decided(opened)
@@ -277,10 +281,6 @@ def _banks(a: Lines, b: Lines | None, beam: BeamWindow | None) -> tuple[Bank, Ba
     except ValueError as error:
         raise ValueError(f"a {error}: give the other one as b") from None
     return Bank.of(survey, both[0], beam), Bank.of(survey, both[1], beam)
-
-
-def _is_folder(lines: Any) -> bool:
-    return isinstance(lines, (str, os.PathLike)) and Path(lines).is_dir()
 
 
 def _source(name: str, lines: Any) -> RangeLines | Path:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,13 @@ from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.mosaics.arguments import beam_of_growing, check_client, checked_growth, checked_request
+from clsas.mosaics.arguments import (
+    beam_of_mosaic,
+    check_client,
+    checked_growth,
+    checked_request,
+    warn_of_window,
+)
 from clsas.mosaics.devices import open_devices
 from clsas.mosaics.forming import Job
 from clsas.mosaics.patches import Layout, choose_patch_shape, patch_shape_of
@@ -266,8 +273,8 @@ def mosaic(
         Accuracy of exact backprojection of every patch, see `clsas.backproject`.
     beam : BeamWindow, optional
         Weights of the channels. If the beam's direction follows the track, it is computed from the
-        whole track, not only from the part near a patch. For a folder, which may grow,
-        `track_pings` is 101 by default.
+        whole track, not only from the part near a patch. In a store that may grow, since its
+        folder contains no file named `end`, `track_pings` is 101 by default.
     patches : (rows, columns), optional
         Number of patches along both axes; the last ones may be smaller. By default patches are as
         large as memory allows, up to 4096 x 4096 pixels.
@@ -308,7 +315,8 @@ def mosaic(
     -----
     ClsasWarning
         If no channel receives from the grid, or pixels lie behind the elements, where they can only
-        show mirror images. A source that grows is not checked.
+        show mirror images. A source that grows is not checked. If the image of a folder that may
+        grow differs by more than was asked from that of the same pings in one file.
 
     See Also
     --------
@@ -352,8 +360,9 @@ def mosaic(
     if client is not None:
         check_client(client, source, store, device)
     growth = checked_growth(source, follow_s)
-    if beam is not None and not isinstance(source, RangeLines) and source.is_dir():
-        beam = beam_of_growing(beam)
+    opened = None if store is None else Store.at(validate.path("store", store))
+    given, place = beam, None if opened is None else opened.path
+    beam = beam_of_mosaic(beam, source, place, grows=growth is not None)
     devices = () if client is not None else open_devices(device)
     if growth is not None:
         wait_for_first_file(growth)
@@ -364,7 +373,12 @@ def mosaic(
         warn_before_imaging(survey.geometry, grid, survey.last_range_m)
     if growth is None and not visibility.channels(grid).any():
         warn_unreached(survey.geometry, grid, beam, visibility.along, survey.span_m)
-    opened = None if store is None else Store.at(validate.path("store", store))
+    if given is not None and given is not beam:
+        warn = partial(warn_of_window, given, request=request)
+        if growth is None:
+            warn(survey.geometry)
+        else:
+            growth = replace(growth, at_end=warn)
     inputs = {} if opened is None else inputs_of(survey, grid, request, beam)
     stored = None if opened is None else opened.patch_shape
     if patch_shape is None:

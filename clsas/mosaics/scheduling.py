@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from clsas.core.image import Image
+from clsas.core.lines import RangeLines
 from clsas.core.threads import uninterrupted, wait
 from clsas.mosaics.devices import device_threads
 from clsas.mosaics.patches import Layout, PatchWindow
@@ -38,10 +39,13 @@ class Growth:
     folder : Path
     idle_s : float
         Seconds without a new file after which the survey has ended.
+    at_end : callable, optional
+        Called with the geometry of the survey when it has ended.
     """
 
     folder: Path
     idle_s: float
+    at_end: Callable[[RangeLines], object] | None = None
 
 
 class PatchJob(Protocol):
@@ -163,6 +167,8 @@ class _GrowingSurvey:
                 self._inputs = self._inputs | {"parts": parts}
                 store.grow(self._inputs)
         self.has_ended = ended or time.monotonic() - self._latest_s > growth.idle_s
+        if self.has_ended and growth.at_end is not None:
+            growth.at_end(self.visibility.survey.geometry)
         return grown or self.has_ended
 
     def ready(self, todo: Sequence[PatchIndex]) -> list[PatchIndex]:

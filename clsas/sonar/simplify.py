@@ -262,7 +262,7 @@ def _fitted(
         fullness = beam.fullness(sine, wavelength_m(lines), len(some) / lines.channels)
 
     def amplitude(range_m: float, sine: float) -> float:
-        weights = 0.0 if beam is None else math.sqrt(_shift_error(beam, sine, lines)) / fullness
+        weights = 0.0 if beam is None else math.sqrt(shift_error(beam, sine, lines)) / fullness
         return 2 * np.pi * highest * range_m + weights
 
     def sampled(some: NDArray[np.int64] | slice, at_m: NDArray[np.float64]) -> _SampledRanges:
@@ -325,7 +325,7 @@ def _fit_positions(
     return np.ascontiguousarray(position_m.T)
 
 
-def _shift_error(beam: BeamWindow, shift: float, lines: RangeLines) -> float:
+def shift_error(beam: BeamWindow, shift: float, lines: RangeLines) -> float:
     """Return the relative error power of beam weights whose sines are shifted."""
     low, high = np.clip(beam.limits, -1, 1)
     sine = np.linspace(low, high, _WEIGHTS + 2)[1:-1]

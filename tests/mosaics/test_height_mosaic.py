@@ -221,7 +221,7 @@ def test_beams_of_folders_do_not_change_as_they_grow(tmp_path):
         tmp_path / "lines", None, GRID, tmp_path / "a.zarr", **REQUEST | {"patch_m": 5.0}, beam=beam
     )
     assert read_document(store.path)["inputs"]["beam"]["track_pings"] == 101
-    with pytest.raises(ValueError, match="beam must not normalise for a folder"):
+    with pytest.raises(ValueError, match="beam must not normalise for a folder that"):
         clsas.mosaic_heights(
             tmp_path / "lines", None, GRID, tmp_path / "b.zarr", **REQUEST,
             beam=replace(beam, normalise=True),

@@ -197,9 +197,72 @@ def test_a_normalising_beam(tmp_path):
     exact = clsas.backproject(LINES, GRID, beam=beam, accuracy_db=-80)
     image = clsas.mosaic(LINES, GRID, **(REQUEST | {"beam": beam})).image()
     assert relative_error_db(image, exact) < -65
-    clsas.save(tmp_path / "lines.h5", LINES)
-    with pytest.raises(ValueError, match="beam must not normalise for a folder"):
-        clsas.mosaic(tmp_path, GRID, **(REQUEST | {"beam": beam}))
+    request = REQUEST | {"beam": beam}
+    (tmp_path / "lines").mkdir()
+    clsas.save(tmp_path / "lines" / "a.h5", LINES)
+    with pytest.raises(ValueError, match="beam must not normalise for a folder that may grow"):
+        clsas.mosaic(tmp_path / "lines", GRID, tmp_path / "a.zarr", **request)
+    (tmp_path / "lines" / END).touch()
+    clsas.mosaic(tmp_path / "lines", GRID, tmp_path / "a.zarr", **request)
+
+
+class TestTheWindowOfTheTracksDirection:
+    """Sways of a few pings, which the directions follow in one file but not in a growing folder."""
+
+    TRACK = along_x(60, 0.1) + np.outer(0.02 * np.sin(np.arange(60)), [0, 1, 0])
+    LINES = lines_over(GRID, TRACK, carrier_hz=100e3, step_m=0.03)
+    BEAM = BeamWindow(8.0, "hann")
+    REQUEST = MappingProxyType({"accuracy_db": -60, "patches": (1, 2), "beam": BEAM})
+
+    @pytest.fixture
+    def folder(self, tmp_path):
+        (tmp_path / "lines").mkdir()
+        for part in range(3):
+            path = tmp_path / "lines" / f"{part}.h5"
+            clsas.save(path, self.LINES.select(slice(20 * part, 20 * part + 20)))
+        return tmp_path / "lines"
+
+    @pytest.fixture
+    def image(self):
+        return clsas.backproject(self.LINES, GRID, beam=self.BEAM, accuracy_db=-80)
+
+    def test_a_finished_folder_is_like_one_file(self, folder, image, tmp_path):
+        assert relative_error_db(clsas.mosaic(folder, GRID, **self.REQUEST).image(), image) < -60
+        (folder / END).touch()
+        found = clsas.mosaic(folder, GRID, tmp_path / "a.zarr", **self.REQUEST).image()
+        assert relative_error_db(found, image) < -60
+
+    def test_a_folder_that_may_grow_says_how_far_it_is_from_one_file(self, folder, image, tmp_path):
+        with pytest.warns(ClsasWarning, match="may differ by") as caught:
+            growing = clsas.mosaic(folder, GRID, tmp_path / "a.zarr", **self.REQUEST).image()
+        (stated,) = re.findall(r"by (-\d+) dB", str(caught[0].message))
+        assert relative_error_db(growing, image) == pytest.approx(float(stated), abs=4)
+        # Once complete, it continues as it began.
+        (folder / END).touch()
+        with pytest.warns(ClsasWarning, match="may differ by"):
+            again = clsas.mosaic(folder, GRID, tmp_path / "a.zarr", **self.REQUEST)
+        assert len(again.finished) == 2
+
+    def test_so_does_one_that_is_followed(self, folder, tmp_path):
+        (folder / END).touch()
+        with pytest.warns(ClsasWarning, match="of the 60 pings"):
+            list(clsas.mosaic(folder, GRID, tmp_path / "a.zarr", **self.REQUEST, follow_s=5))
+
+    @pytest.mark.parametrize(
+        "beam", [BeamWindow(8.0, "hann", along=[1, 0, 0]), BeamWindow(8.0, "hann", track_pings=9)]
+    )
+    def test_given_directions_are_the_same(self, folder, tmp_path, beam):
+        request = dict(self.REQUEST) | {"beam": beam}
+        image = clsas.backproject(self.LINES, GRID, beam=beam, accuracy_db=-80)
+        found = clsas.mosaic(folder, GRID, tmp_path / "a.zarr", **request).image()
+        assert relative_error_db(found, image) < -60
+
+    def test_long_or_straight_tracks_are_the_same(self, folder, tmp_path):
+        lines = dataclasses.replace(self.LINES, tx_m=along_x(60, 0.1), rx_m=along_x(60, 0.1))
+        clsas.save(folder / "0.h5", lines.select(slice(0, 20)))
+        for part in (1, 2):
+            (folder / f"{part}.h5").unlink()
+        clsas.mosaic(folder, GRID, tmp_path / "a.zarr", **self.REQUEST)  # without a warning
 
 
 @pytest.mark.slow
