@@ -10,6 +10,7 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from clsas.core import validate
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
@@ -31,6 +32,7 @@ OUTSIDE = 0.1
 """Share of the allowed error power that may come from outside the nominal band."""
 # Shares of the signal power that may lie outside the band, in tails of windows and finite lines.
 _OUTSIDE_BAND = (1e-8, 1e-6, 1e-4)
+_COMPETING = 0.5  # width of a gap over that of the guard band from which on they may be mistaken
 _CLOSING = 1 / 300  # cycles per sample around the point opposite the centre, which may alias
 _COHERENT_CYCLES = 2.0  # phase over the aperture up to which common parts add coherently
 _COHERENT_POINTS = 3  # sampled along either side of the grid; twice as many change nothing
@@ -121,10 +123,18 @@ def measure_spectrum(
     """Return the mean power spectrum of lines, relative to the middle of their occupied band.
 
     With a grid, frequencies that add up coherently in its image get the weight that they have
-    there. `energy` is the `line_energy` of the lines, if it is known.
+    there, and a warning is issued if the band cannot be told from its complement. `energy` is the
+    `line_energy` of the lines, if it is known.
     """
     frequency, power, faded = _mean_power(*_sampled_lines(lines, MEASURED_CHANNELS, energy))
-    centre, width, left_out = _occupied_band(frequency, faded)
+    centre, width, left_out, gap = _occupied_band(frequency, faded)
+    if grid is not None and gap:
+        validate.warn(
+            f"lines: the band wraps around half the sample rate, and has a gap of {gap:.0%} of the "
+            f"sample rate or more beside a guard band of {1 - width:.0%}. Which of them lies "
+            "within the band is not known: if it is the wider one, the image is wrong. Mix the "
+            "middle of the band to 0 Hz"
+        )
     distance = _distance(frequency, centre)
     share = _histogram(distance, power)
     if grid is not None:
@@ -156,31 +166,46 @@ def power_spectrum(lines: RangeLines) -> tuple[NDArray[np.float64], NDArray[np.f
 
 def _occupied_band(
     frequency: NDArray[np.float64], power: NDArray[np.float64]
-) -> tuple[float, float, float]:
+) -> tuple[float, float, float, float]:
     """Return middle and width of the occupied band, cycles per sample, and the power outside.
 
-    Frequencies farther than half a cycle per sample from the middle alias. The band is therefore
-    the narrowest arc of the frequency circle that contains nearly all power above the noise floor.
-    The opposite point then lies in the middle of the guard band, whatever the shape of the
-    spectrum. The share of power outside is the smallest one for which there is a guard band.
+    Frequencies farther than half a cycle per sample from the middle alias. If half the sample rate
+    is quiet, the carrier was mixed out, and the band extends from the lowest to the highest
+    frequency, whatever gaps it has. Otherwise it is the narrowest arc of the frequency circle that
+    contains nearly all power above the noise floor. The opposite point then lies in the middle of
+    the guard band, whatever the shape of the spectrum. The share of power outside is the smallest
+    one for which there is a guard band.
+
+    The last result is the width of another gap that might as well be the guard band, else 0.
     """
     count = len(power)
     smoothed = uniform_filter1d(power, max(round(_FLOOR_WIDTH * count), 1), mode="wrap")
     signal = np.maximum(power - _FLOOR_MARGIN * smoothed.min(), 0.0)
     if not signal.any():  # white: no arc is better than another
-        return float(np.angle(power @ np.exp(2j * np.pi * frequency)) / (2 * np.pi)), 0.5, 0.0
+        return float(np.angle(power @ np.exp(2j * np.pi * frequency)) / (2 * np.pi)), 0.5, 0.0, 0.0
     held = np.append(0.0, np.cumsum(np.tile(signal, 2)))
     least, *_, most = _OUTSIDE_BAND
     noise = np.clip(_NOISE_LEFT * count * smoothed.min(), least, most)
+    starts, half = np.arange(count), (count + 1) // 2  # the lowest frequency has the index `half`
+    gap = 0.0
     for outside in (noise, *(each for each in _OUTSIDE_BAND if each > noise)):
         ends = np.searchsorted(held, held[:count] + (1 - outside) * held[count])
-        bins = ends - np.arange(count)
+        bins = ends - starts
+        most = count / NEEDED_OVERSAMPLING
+        mixed = (bins <= most) & (ends <= np.where(starts < half, half, half + count))
+        if mixed.any():
+            first = int(np.argmin(np.where(mixed, bins, count)))
+            break
         first = int(np.argmin(bins))
-        if bins[first] * NEEDED_OVERSAMPLING <= count:
+        if bins[first] <= most:
+            length = int(_COMPETING * (count - bins[first]))
+            within = held[first + length : ends[first] + 1] - held[first : ends[first] + 1 - length]
+            if length and within.size and within.min() <= outside * held[count]:
+                gap = length / count
             break
     middle = (first + (bins[first] - 1) / 2) / count
     left_out = 1 - (held[ends[first]] - held[first]) / held[count] if outside > noise else 0.0
-    return float((middle + 0.5) % 1.0 - 0.5), float(bins[first] / count), max(left_out, 0.0)
+    return float((middle + 0.5) % 1.0 - 0.5), float(bins[first] / count), max(left_out, 0.0), gap
 
 
 def shares_of_bins(

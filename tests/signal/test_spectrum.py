@@ -1,3 +1,5 @@
+import warnings
+
 import numpy as np
 import pytest
 from cases import noise
@@ -7,6 +9,8 @@ from clsas.core.lines import RangeLines
 from clsas.core.wavelengths import band_wavelength_m
 from clsas.exact.reference import ideal
 from clsas.signal.spectrum import measure_spectrum
+
+GRID = Grid.plane((-0.1, 0.1, 3), (15, 15.2, 3))
 
 
 def lines_of(samples):
@@ -80,6 +84,59 @@ def test_the_centre_is_the_middle_of_the_occupied_band(occupied, tilt_db, noise_
     spectrum = measure_spectrum(lines_of(samples * np.exp(2j * np.pi * 0.3 * np.arange(2000))))
     assert spectrum.centre == pytest.approx(0.3, abs=0.01)
     assert spectrum.oversampling == pytest.approx(1 / occupied, rel=0.03)
+
+
+def bands(*parts, channels=40, seed=3):
+    """Noise in bands, each given by its centre, its width and the channels that have it."""
+    rng = np.random.default_rng(seed)
+    frequency = np.fft.fftfreq(2000)
+    samples = np.zeros((channels, 2000), complex)
+    for centre, width, some in parts:
+        inside = np.abs((frequency - centre + 0.5) % 1 - 0.5) < width / 2
+        noise = rng.normal(size=(channels, 2000, 2)) @ [1, 1j]
+        samples[some] += np.fft.ifft(inside * noise)[some]
+    return lines_of(samples)
+
+
+ALL = slice(None)
+
+
+@pytest.mark.parametrize(
+    ("parts", "centre", "width"),
+    [
+        ([(-0.32, 0.12, ALL), (0.32, 0.12, ALL)], 0.0, 0.76),
+        ([(-0.3, 0.1, ALL), (0.42, 0.1, ALL)], 0.06, 0.82),
+        ([(-0.4, 0.05, ALL), (0.0, 0.05, ALL), (0.4, 0.05, ALL)], 0.0, 0.85),
+        ([(-0.32, 0.12, ALL), (0.32, 0.12, [7])], 0.0, 0.76),
+        ([(0.1, 0.1, ALL), (0.4, 0.1, ALL)], 0.25, 0.4),
+    ],
+    ids=["two bands", "uneven", "three", "one channel in another", "on one side"],
+)
+def test_gaps_belong_to_the_band_where_half_the_sample_rate_is_quiet(parts, centre, width):
+    lines = bands(*parts)
+    spectrum = measure_spectrum(lines, GRID)
+    assert spectrum.centre == pytest.approx(centre, abs=0.01)
+    assert 1 / spectrum.oversampling == pytest.approx(width, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("parts", "centre", "says"),
+    [
+        ([(0.5, 0.3, ALL)], -0.5, False),
+        ([(0.4, 0.16, ALL), (-0.41, 0.16, ALL)], 0.495, False),
+        ([(0.4, 0.24, ALL), (-0.2, 0.1, ALL)], -0.435, True),
+        ([(0.5, 0.1, ALL), (0.0, 0.1, ALL)], None, True),
+    ],
+    ids=["no gap", "a narrow gap", "a gap half as wide", "two gaps alike"],
+)
+def test_a_band_that_wraps_is_unwrapped_unless_two_gaps_compete(parts, centre, says):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        spectrum = measure_spectrum(bands(*parts), GRID)
+    assert bool(caught) == says
+    assert all("the band wraps around half the sample rate" in str(c.message) for c in caught)
+    if centre is not None:
+        assert abs((spectrum.centre - centre + 0.5) % 1 - 0.5) < 0.015
 
 
 @pytest.mark.slow
