@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 EXHAUSTIVE = [pytest.mark.exhaustive]
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[1]
 PASSED = ROOT / ".cache" / "passed"
 TIERS = {
     "fast": "the fast tests (scripts/test --fast)",
