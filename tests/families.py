@@ -17,7 +17,7 @@ import numpy as np
 from apertures import Aperture, Floats, aperture, log_uniform
 from numpy.random import Generator
 from numpy.typing import NDArray
-from sums import SPEED_M_S, BentChannels, Channels, Echoes, Noise, Points, Sampling, weights
+from sums import SPEED_M_S, BentChannels, Both, Channels, Echoes, Noise, Points, Sampling, weights
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
@@ -75,6 +75,7 @@ class Family:
     grid: tuple[str, ...] = ("plane", "plane", "tilted")
     echoes: tuple[str, ...] = ("points", "points", "noise")
     water: tuple[str, ...] = ("one speed",)
+    occupied: tuple[str, ...] = ("whole band",)
 
 
 DENSE = ("ring", "arc", "helix", "raster", "planar", "headings", "star")
@@ -109,6 +110,13 @@ FAMILIES = {
     "dark under a beam": Family(
         aperture=("straight", "jittered", "headings"), beam=BEAMS, spacing=CLOSE,
         echoes=("points outside",),
+    ),
+    "echoes from beside the grid": Family(spacing=CLOSE, echoes=("points beside the grid",)),
+    "echoes from beside grid and beam": Family(
+        beam=BEAMS, spacing=CLOSE, echoes=("points beside the grid",)
+    ),
+    "gaps in the band": Family(
+        on_carrier=0.0, echoes=("points",), occupied=("two sub-bands", "hopping")
     ),
     "gains": Family(gains=UNEVEN),
     "gains, dense": Family(aperture=DENSE, gains=UNEVEN),
@@ -152,6 +160,7 @@ class _Parts:
     grid: str
     echoes: str
     water: str
+    occupied: str
 
     @classmethod
     def of(cls, rng: Generator, family: Family) -> _Parts:
@@ -178,7 +187,11 @@ def draw(name: str, seed: int) -> Scene:
     beam = _beam(rng, parts.beam, channels, pixels_m)
     on_carrier = bool(rng.random() < family.on_carrier and fraction > 0.05)
     sampling = _sampling(rng, carrier_hz, fraction, on_carrier)
+    if parts.occupied != "whole band":  # otherwise it is not known what lies within the band
+        sampling = dataclasses.replace(sampling, mixed=sampling.centre)
     echoes, near = _echoes(rng, parts.echoes, channels, sampling, pixels_m, beam, wave_m)
+    if parts.occupied != "whole band":
+        echoes = _with_a_gap(rng, parts.occupied, echoes)
     lines = RangeLines(
         echoes.samples(), echoes.first_m, sampling.step_m, channels.tx_m, channels.rx_m,
         sampling.mixed * SPEED_M_S / 2, SPEED_M_S, channels.velocity_m_s,
@@ -206,7 +219,7 @@ def draw(name: str, seed: int) -> Scene:
     return Scene(words, lines, grid, beam, some, values.sum(axis=0))
 
 
-_ORDINARY = ("monostatic", "at rest", "no beam", "equal gains", "one speed")
+_ORDINARY = ("monostatic", "at rest", "no beam", "equal gains", "one speed", "whole band")
 
 
 def _channels(rng: Generator, parts: _Parts, around: Aperture, wave_m: float) -> Channels:
@@ -399,6 +412,11 @@ def _echoes(
     # Points are off the pixels, as they are in life.
     points_m = pixels_m[chosen] + 0.3 * wave_m * rng.normal(size=(count, 3))
     amplitude = rng.normal(size=(count, 2)) @ [1, 1j]
+    if kind == "points beside the grid":
+        amplitude *= 10 ** (rng.uniform(-70, -25) / 20)
+        beside_m = _beside(rng, channels, points_m[: rng.integers(1, 4)])
+        points_m = np.concatenate([points_m, beside_m])
+        amplitude = np.append(amplitude, rng.normal(size=(len(beside_m), 2)) @ [1, 1j])
     tilt_db = float(rng.choice([0, 0, 10]))
     # Coarse pixels beside a point hold side lobes only: the brightest must be among the known.
     around = chosen[:, None] + rng.integers(-3, 4, (count, AROUND))
@@ -406,12 +424,40 @@ def _echoes(
     return Points.of(channels, sampling, points_m, amplitude, tilt_db, span_m), near
 
 
+def _beside(rng: Generator, channels: Channels, points_m: Floats) -> Floats:
+    """Return points turned about the middle of the channels: at their ranges, but elsewhere."""
+    middle_m = channels.centres_m.mean(axis=0)
+    away_m = points_m - middle_m
+    axis = np.cross(away_m[0], channels.along.mean(axis=0))
+    axis /= np.linalg.norm(axis)
+    turn = rng.choice([-1, 1]) * np.radians(log_uniform(rng, 5, 60))
+    across = np.cross(axis, away_m)
+    level = np.outer(away_m @ axis, axis)  # Rodrigues' formula
+    return middle_m + np.cos(turn) * (away_m - level) + np.sin(turn) * across + level
+
+
+def _with_a_gap(rng: Generator, kind: str, echoes: Points) -> Points | Both:
+    """Return echoes in two parts of the band: both in all channels, or a few in another."""
+    whole = echoes.sampling
+    width = whole.width * rng.uniform(0.1, 0.3)
+    low, high = (
+        dataclasses.replace(
+            whole, centre=whole.centre + side * (whole.width - width) / 2, width=width
+        )
+        for side in (-1, 1)
+    )
+    if kind == "two sub-bands":
+        return Both(echoes.within(low), echoes.within(high))
+    few = rng.random(len(echoes.channels.gain)) < rng.choice([0.02, 0.5])
+    return Both(echoes.within(low, ~few), echoes.within(high, few))
+
+
 def _wanted(
     rng: Generator, kind: str, channels: Channels, pixels_m: Floats, beam: BeamWindow | None
 ) -> Floats:
     """Return 1 for pixels where points may be, [pixels]: anywhere, or where the beam ends."""
     anywhere = np.ones(len(pixels_m))
-    if beam is None or kind == "points":
+    if beam is None or kind in ("points", "points beside the grid"):
         return anywhere
     some = np.unique(rng.integers(0, len(channels.gain), 40))
     sines = channels.select(some).sines(pixels_m)

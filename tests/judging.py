@@ -145,7 +145,7 @@ def _measured(
         return asked_db, None, FLOOR_DB
     of_reference_db = np.inf if reference is None else scene.error_db(reference.pixels)
     if reference is not None and of_reference_db < asked_db - 10:
-        floor_db = max(of_reference_db + REFERENCE_SLACK_DB, FLOOR_DB)
+        floor_db = max(of_reference_db, REFERENCE_DB - 10.0) + REFERENCE_SLACK_DB
         measured_db = relative_error_db(image, reference)
         for pixels in (256, 4096):  # one bound in twenty is too low: measure again, more closely
             certificate = certify(image, scene.lines, beam=scene.beam, pixels=pixels, seed=0)

@@ -173,6 +173,19 @@ class Points:
         length = int((last_m - first_m) / sampling.step_m) + 1
         return cls(channels, sampling, range_m, amplitude, tilt_db, first_m, length)
 
+    def within(self, sampling: Sampling, some: NDArray[np.bool_] | None = None) -> Points:
+        """Return the echoes in a part of the band, in some of the channels, in lines as long.
+
+        The sampling must have the step and the mixer of these echoes. Pulses of a narrower band
+        are longer, and the lines then begin earlier by what they take.
+        """
+        more = int(1.02 * FADED / (2 * np.pi * EDGE * sampling.width) / sampling.step_m) + 1
+        gain = self.channels.gain if some is None else self.channels.gain * some
+        return replace(
+            self, sampling=sampling, channels=replace(self.channels, gain=gain),
+            first_m=self.first_m - more * sampling.step_m, length=self.length + 2 * more,
+        )  # fmt: skip
+
     @property
     def _bands(self) -> list[oracle.Band]:
         width = self.sampling.width
@@ -197,6 +210,26 @@ class Points:
         """Return what is received from ranges, with its carrier."""
         amplitude = self.amplitude * self.channels.gain[:, None]
         return oracle.received([oracle.Echo(self.range_m, amplitude, self._bands)], range_m)
+
+
+@dataclass(frozen=True, eq=False)
+class Both:
+    """Echoes in two parts of a band, in lines that begin together."""
+
+    low: Points
+    high: Points
+
+    @property
+    def first_m(self) -> float:
+        return self.low.first_m
+
+    def samples(self) -> Complex:
+        """Return the range lines."""
+        return self.low.samples() + self.high.samples()
+
+    def received(self, range_m: Floats) -> Complex:
+        """Return what is received from ranges, with its carrier."""
+        return self.low.received(range_m) + self.high.received(range_m)
 
 
 @dataclass(frozen=True, eq=False)

@@ -108,10 +108,10 @@ class Ambiguity:
         if requested_db + in_db(self.brightness) < BEST_DB - _CLOSE_DB:
             dark_db = -in_db(self.brightness)
             validate.warn(
-                f"the image is {dark_db:.0f} dB darker than the echoes that the beam passes, "
-                "because most of them come from places where the beam hardly covers the grid: the "
+                f"the image is {dark_db:.0f} dB darker than the echoes at its ranges, because most "
+                "of them come from places beside the grid, or that the beam hardly covers: the "
                 f"error may be {BEST_DB + dark_db:.0f} dB instead of {name} {requested_db:.3g} dB; "
-                "use a wider beam, or a grid that the beam covers"
+                "use a larger grid, or a wider beam"
             )
         if self.ends > _MOST * allowed:
             validate.warn(

@@ -1,8 +1,8 @@
-"""Ratio of the power of an image to the power that its beam passes.
+"""Ratio of the power of an image to the power that its channels receive.
 
-If most echoes in the lines come from parts of the scene that the beam hardly covers, most of what
-the beam passes cancels in the image. Interpolation errors do not cancel. They are therefore larger
-relative to such an image than relative to an image that the beam covers evenly.
+If most echoes at the ranges of the pixels come from places beside the grid, or from such that the
+beam hardly covers, most of what the channels receive cancels in the image. Interpolation errors do
+not cancel. They are therefore larger relative to such an image than relative to one of a seabed.
 """
 
 from __future__ import annotations
@@ -22,14 +22,13 @@ from clsas.sonar.visibility import sines
 # of points at the edge of the beam look 3 dB brighter than they are; twice as many change 1 dB.
 _GROUP = 64
 _LEAST_GROUP = 32
-_GROUPS = 8  # groups of channels, spread evenly along the lines
-# Points along either side of the grid: first, and again if those find little power.
-_POINTS = (16, 48)
+_MOST = 1024  # channels summed together if groups are dark: a plain choice
+_GROUPS = 4  # groups of channels, spread evenly along the lines
+# Points along either side of the grid: first without and with a beam, whose coverage may vary, and
+# then if those find little power.
+_FEW, _SOME, _MANY = 8, 16, 48
 _DARKEST = 1e-8  # least ratio returned, far below what any image resolves
 _DARK = 0.5  # ratio above which images are not dark; sampling alone changes it by 1 dB
-# If the beam covers every point with this share of the power of the best-covered point, the image
-# is not dark. So many channels are sampled to find out.
-_COVERED, _COVERAGE_CHANNELS = 0.25, 256
 
 
 def brightness(
@@ -39,7 +38,7 @@ def brightness(
     beam: BeamWindow | None,
     along: NDArray[np.float64] | None,
 ) -> float:
-    """Return the power of an image over the power that its beam passes, 1 unless it is dark.
+    """Return the power of an image over the power that its channels receive, 1 unless it is dark.
 
     Parameters
     ----------
@@ -51,28 +50,25 @@ def brightness(
     Notes
     -----
     With z_i = w_i s_i(rho_i) exp(j 2 k rho_i), sums of z_i over groups of neighbouring channels
-    keep what arrives from about the direction of a pixel. The brightness is the power of these
-    sums, averaged over pixels and groups, over the power of all z_i. Groups are assumed to be
-    incoherent, as they are for echoes of a seabed. Coherent groups make images brighter.
+    keep what arrives from about the direction of a pixel: the beam of a group is so wide that no
+    bright echo within the grid is missed. The brightness is the power of these sums, averaged over
+    pixels and groups, over the power of all z_i. If it is low, it is that of the sums of all
+    channels, where echoes from beside the grid cancel further.
     """
-    if beam is None or along is None or beam.normalise:
-        return 1.0
     if lines.channels < 2 * _LEAST_GROUP or lines.length < 2:
-        return 1.0
-    some = some_channels(lines.channels, _COVERAGE_CHANNELS)
-    covered = _weights(lines, some, grid.spread(_POINTS[0]), beam, along) ** 2
-    covered = covered.sum(axis=1)
-    if not covered.any() or covered.min() >= _COVERED * covered.max():
         return 1.0
     group = min(_GROUP, lines.channels // 2)
     starts = np.linspace(0, lines.channels - group, _GROUPS).astype(np.int64)
     channels = starts[:, None] + np.arange(group)
     found = 1.0
-    for most in _POINTS:
+    for most in (_FEW if beam is None else _SOME, _MANY):
         points_m = grid.spread(most)
         found = _of_groups(lines, channels, points_m, spectrum, beam, along)
         if found > _DARK:
             return 1.0
+    # Echoes from beside the grid also cancel between groups.
+    whole = some_channels(lines.channels, _MOST)[None]
+    found = min(found, _of_groups(lines, whole, points_m, spectrum, beam, along))
     return max(found, _DARKEST)
 
 
@@ -81,8 +77,8 @@ def _of_groups(
     groups: NDArray[np.int64],
     points_m: NDArray[np.float64],
     spectrum: Spectrum,
-    beam: BeamWindow,
-    along: NDArray[np.float64],
+    beam: BeamWindow | None,
+    along: NDArray[np.float64] | None,
 ) -> float:
     """Return the power of sums over groups [groups, channels], relative to that of their terms."""
     channels = groups.ravel()
@@ -104,7 +100,9 @@ def _of_groups(
     )
     turns += part.carrier_cycles_per_m * range_m
     values *= np.exp(2j * np.pi * (turns - np.rint(turns)))
-    values *= inside * _weights(lines, channels, points_m, beam, along)
+    values *= inside
+    if beam is not None and along is not None:
+        values *= _weights(lines, channels, points_m, beam, along)
     sums = values.reshape(len(points_m), *groups.shape).sum(axis=-1)
     passed = float(np.vdot(values, values).real)
     return float(np.vdot(sums, sums).real) / passed if passed else 1.0

@@ -132,7 +132,7 @@ def measure_spectrum(
         validate.warn(
             f"lines: the band wraps around half the sample rate, and has a gap of {gap:.0%} of the "
             f"sample rate or more beside a guard band of {1 - width:.0%}. Which of them lies "
-            "within the band is not known: if it is the wider one, the image is wrong. Mix the "
+            "within the band is not known: if it is the wider one, the image is in error. Mix the "
             "middle of the band to 0 Hz"
         )
     distance = _distance(frequency, centre)

@@ -46,9 +46,13 @@ def test_a_scene_of_every_family(family):
     assert missed(family, 1, -55, [-45]) == []
 
 
+# Scenes whose echoes come from beside the grid may miss by some dB, as docs/accuracy.md says.
+PREDICTED = [family for family in FAMILIES if not family.startswith("echoes from beside")]
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("number", range(12))
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", PREDICTED)
 def test_new_scenes_of_every_family(family, number):
     """The order of the tests has a seed, from which those of the scenes follow."""
     seed = (random.getrandbits(32) + number) % 2**32
