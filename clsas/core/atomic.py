@@ -7,6 +7,7 @@ next writer in the folder removes it. The contents reach the disk before the fil
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import fcntl
 import os
@@ -21,6 +22,7 @@ from clsas.core.reading import check_ordinary
 
 _PATTERN = ".clsas-*.part"
 _LOCK = ".clsas.lock"
+_HERE, _EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
 
 
 @contextmanager
@@ -136,8 +138,10 @@ def creating(path: Path) -> Iterator[Path]:
 def replacing_folder(path: Path) -> Iterator[Path]:
     """Yield an empty temporary folder to fill; on success it replaces the folder `path`, if any.
 
-    The old folder stays in place until the new one is complete and on the disk. There is a moment
-    between two renamings in which neither is at `path`.
+    The old folder stays in place until the new one is complete and on the disk. Then both are
+    exchanged in one step, if system and file system can do so. Otherwise the old folder is at
+    `.clsas-NAME.old` for a moment; if the process is killed then, the next call for `path` restores
+    it.
 
     Raises
     ------
@@ -145,19 +149,38 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         If the parent of `path` does not exist or cannot be written, `path` is a file, or the disk
         is full.
     """
-    with _temporary(path, Path.mkdir) as (new, _), _temporary(path, Path.mkdir) as (old, _):
+    old = path.with_name(f".clsas-{path.name}.old")
+    if old.is_dir() and not path.exists():
+        os.rename(old, path)
+    with _temporary(path, Path.mkdir) as (new, _):
         yield new
         os.sync()  # one call for thousands of files
-        exists = path.exists()
-        if exists:
-            os.rename(path, old)
-        try:
+        if not path.is_dir():
             os.rename(new, path)
-        except OSError:
-            if exists:
+        elif not _exchanged(new, path):
+            _remove(old)
+            os.rename(path, old)
+            try:
+                os.rename(new, path)
+            except OSError:
                 os.rename(old, path)
-            raise
+                raise
         sync_folder(path.parent)
+        _remove(old)
+
+
+def _exchanged(first: Path, second: Path) -> bool:
+    """Exchange two folders in one step; return False where this is not possible."""
+    try:
+        exchange = ctypes.CDLL(None, use_errno=True).renameat2
+    except AttributeError:  # of Linux alone
+        return False
+    if exchange(_HERE, os.fsencode(first), _HERE, os.fsencode(second), _EXCHANGE) == 0:
+        return True
+    number = ctypes.get_errno()
+    if number in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
+        return False
+    raise OSError(number, os.strerror(number), str(second))
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from clsas.core import atomic
-from clsas.core.atomic import creating, locked, replacing
+from clsas.core.atomic import creating, locked, replacing, replacing_folder
 
 
 @pytest.mark.parametrize("names", [None, "the temporary one"])
@@ -54,6 +54,77 @@ def test_the_next_writer_removes_what_a_killed_one_left(tmp_path, statement):
     with replacing(tmp_path / "b.h5") as part:
         part.write_text("whole")
     assert [path.name for path in tmp_path.iterdir()] == ["b.h5"]
+
+
+def contents(folder):
+    return {path.name: path.read_text() for path in folder.iterdir()}
+
+
+BEFORE, AFTER = {"a": "before", "b": "before"}, {"b": "after", "c": "after"}
+ENDED = 7
+
+
+def exit_after(name, folder):
+    """Replace a folder in a process that ends after the first or a later call of a function."""
+    program = f"""
+import os
+from pathlib import Path
+from clsas.core import atomic
+
+def ending(work, calls):
+    def wrapped(*given):
+        found = work(*given)
+        calls.append(found)
+        if len(calls) == {name[-1]}:
+            os._exit({ENDED})
+        return found
+    return wrapped
+
+if {name!r}.startswith("exchange"):
+    atomic._exchanged = ending(atomic._exchanged, [])
+else:
+    atomic._exchanged = lambda *_: False
+    os.rename = ending(os.rename, [])
+with atomic.replacing_folder(Path({str(folder)!r})) as new:
+    for name in "bc":
+        (new / name).write_text("after")
+"""
+    return subprocess.run([sys.executable, "-c", program], check=False).returncode
+
+
+@pytest.mark.parametrize(
+    ("killed", "left"), [("exchange 1", AFTER), ("rename 1", BEFORE), ("rename 2", AFTER)]
+)
+def test_a_kill_leaves_a_whole_folder_that_the_next_command_keeps(tmp_path, killed, left):
+    path = tmp_path / "web"
+    path.mkdir()
+    for name, text in BEFORE.items():
+        (path / name).write_text(text)
+    assert exit_after(killed, path) == ENDED
+    with replacing(tmp_path / "other") as part:
+        part.write_text("whole")
+    try:
+        with replacing_folder(path):
+            assert contents(path) == left
+            raise InterruptedError
+    except InterruptedError:
+        assert contents(path) == left
+    with replacing_folder(path) as new:
+        (new / "d").write_text("last")
+    assert contents(path) == {"d": "last"}
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["other", "web"]
+
+
+def test_folders_are_exchanged_in_one_step_where_the_system_can(tmp_path):
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "name").write_text(name)
+    if not atomic._exchanged(tmp_path / "first", tmp_path / "second"):
+        pytest.skip("this system or file system exchanges no folders")
+    assert contents(tmp_path / "first") == {"name": "second"}
+    assert contents(tmp_path / "second") == {"name": "first"}
+    with pytest.raises(FileNotFoundError, match="gone"):
+        atomic._exchanged(tmp_path / "first", tmp_path / "gone")
 
 
 def test_what_another_writer_is_at_stays(tmp_path):

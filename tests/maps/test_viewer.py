@@ -15,6 +15,7 @@ from stores import GRID, LINES, REQUEST
 
 import clsas
 from clsas.cli import main
+from clsas.core import atomic
 from clsas.maps import tiles, viewer
 from clsas.maps.frames import Frame, fitted_degrees
 from clsas.maps.tiles import Pyramid, Quantization, factors_of, shape_of
@@ -298,6 +299,7 @@ class TestFolder:
     def test_comes_back_if_the_new_one_cannot_take_its_place(self, image, tmp_path, monkeypatch):
         small = clsas.Image(image.pixels[:20, :30], image.grid.window(slice(20), slice(30)))
         viewer.write(small, tmp_path / "web")
+        monkeypatch.setattr(atomic, "_exchanged", lambda *_: False)
         rename, renamed = os.rename, []
 
         def fail_once(one, other):
