@@ -281,7 +281,7 @@ def write_costs(folder: Path, infos: list[Any], slow: float) -> None:
     """
     costs = {f"{name}_ns": cost for name, cost in COSTS_NS.items()}
     costs |= {name: slow * costs[name] for name in ("pixel_ns", "point_ns")}
-    table = {"source": "scaled", "measured": _MEASURED, "costs": costs}
+    table = _signed({"source": "scaled", "measured": _MEASURED, "costs": costs})
     keys = [
         f"{info.label}, {info.driver}, {info.compute_units} compute units, {info.width} lanes"
         f"{', permuting' if info.permute else ''}, clsas {clsas.__version__}"
@@ -322,9 +322,14 @@ def with_fields(plan: clsas.Plan, fields: Mapping[str, Any]) -> clsas.Plan:
             place = place[each]
         place[last] = _unpacked(value) if name.endswith("_coefficients") else value
     if values.pop("digest", None) is not None:
-        digest = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
-        values["digest"] = digest[:16]
+        values = _signed(values)
     return clsas.Plan.from_json(json.dumps(values))
+
+
+def _signed(record: dict[str, Any]) -> dict[str, Any]:
+    """Return a record with its digest, as commits before and after write it."""
+    digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+    return record | {"digest": digest[:16]}
 
 
 def _path(name: str, values: Mapping[str, Any]) -> list[str]:

@@ -7,8 +7,8 @@ import numpy as np
 from cases import along_x, lines_over
 
 import clsas
+from clsas.core.digests import with_digest
 from clsas.core.grid import Grid
-from clsas.mosaics.documents import with_checksum
 
 PLANE = Grid.plane((-4, 4, 40), (30, 40, 30))
 GRID = PLANE.with_height(np.linspace(0, 1, PLANE.size).reshape(PLANE.shape))
@@ -34,7 +34,7 @@ def change(path, **attributes):
     document = json.loads((path / "zarr.json").read_text())
     changed = {**document["attributes"], **attributes}
     kept = {name: value for name, value in changed.items() if value is not None}
-    document["attributes"] = with_checksum(kept)
+    document["attributes"] = with_digest(kept)
     (path / "zarr.json").write_text(json.dumps(document))
 
 

@@ -6,8 +6,6 @@ message names the file, the table and the key.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -17,6 +15,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from clsas.core import reading, validate
+from clsas.core.digests import digest
 from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.sound_speed import SoundSpeed
@@ -135,11 +134,12 @@ def simulation_digest(text: bytes, folder: Path) -> str:
     """Return a digest of all that a scene's range lines depend on, including clsas's version."""
     tables = reading.parse_toml(text)
     used = {name: table for name, table in tables.items() if name not in _IMAGING}
-    digest = hashlib.sha256(json.dumps([__version__, used], sort_keys=True, default=str).encode())
-    for table in ("track", "sound_speed"):
-        if isinstance(file := tables.get(table, {}).get("file"), str):
-            digest.update(reading.read_bytes(folder / file))
-    return digest.hexdigest()[:12]
+    paths = [
+        folder / file
+        for table in ("track", "sound_speed")
+        if isinstance(file := tables.get(table, {}).get("file"), str)
+    ]
+    return digest([__version__, used, *map(reading.read_bytes, paths)])
 
 
 def built_in_scene(name: str) -> bytes:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from clsas.core import validate
-from clsas.core.digests import grid_digest
+from clsas.core.digests import digest
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 
@@ -93,7 +93,7 @@ def _checked(images: Image | Sequence[Image]) -> list[Image]:
         raise ValueError("images must have at least one image, got none")
     for look in looks:
         validate.instance("every entry of images", look, Image)
-    digests = {grid_digest(look.grid) for look in looks}
+    digests = {digest(look.grid) for look in looks}
     if len(digests) > 1:
         raise ValueError(f"images must have one grid, got {len(digests)} different ones")
     return looks

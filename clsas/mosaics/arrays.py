@@ -15,19 +15,17 @@ from zarr.codecs import Crc32cCodec
 
 from clsas.core import validate
 from clsas.core.atomic import creating, make_folders, staging, sync_folder
-from clsas.core.digests import grid_digest
+from clsas.core.digests import grid_digest, with_digest
 from clsas.core.grid import Grid
 from clsas.mosaics.documents import (
     DIGESTS,
     FORMAT,
-    HEIGHTS_VERSION,
     VECTORS,
     VERSION,
     DamageError,
     check_own,
     plane_of,
     read_document,
-    with_checksum,
     write_attributes,
 )
 from clsas.mosaics.durable import DurableStore
@@ -84,7 +82,7 @@ def create_store(
     levels = levels_of(grid.shape, patch_shape)
     attributes = {
         "format": FORMAT,
-        "version": VERSION if window is None else HEIGHTS_VERSION,
+        "version": VERSION,
         "patch_shape": list(patch_shape),
         CHUNK_SHAPE: list(map(chunk_side, patch_shape, grid.shape)),
         LEVELS: levels.json(),
@@ -96,7 +94,7 @@ def create_store(
     with creating(path) as temporary:
         _create_arrays(temporary, grid, attributes)
         digests = _digests(temporary, attributes, grid.height_m is not None)
-        write_attributes(temporary, with_checksum(attributes | {DIGESTS: digests}))
+        write_attributes(temporary, with_digest(attributes | {DIGESTS: digests}))
 
 
 def open_array(path: Path, attributes: dict[str, Any], name: str) -> zarr.Array:
@@ -132,7 +130,7 @@ def add_levels(path: Path) -> None:
         for name in sorted(names):
             _exchange(path, name, new, old)
     digests = _digests(path, attributes, has_height(path, attributes))
-    write_attributes(path, with_checksum(attributes | {DIGESTS: digests}))
+    write_attributes(path, with_digest(attributes | {DIGESTS: digests}))
 
 
 def write_values(
@@ -218,7 +216,7 @@ def repair(path: Path, grid: Grid) -> dict[str, str]:
                 _exchange(path, name if name in axes else f"{name}/zarr.json", new, old)
     if found or DIGESTS not in attributes:
         digests = _digests(path, attributes, with_height)
-        write_attributes(path, with_checksum(attributes | {DIGESTS: digests}))
+        write_attributes(path, with_digest(attributes | {DIGESTS: digests}))
     return found
 
 

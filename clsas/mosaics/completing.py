@@ -8,7 +8,6 @@ continued leaves the same levels.
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Callable
 from functools import lru_cache, partial
@@ -19,15 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.atomic import sync_folder
+from clsas.core.digests import digest, is_intact, with_digest
 from clsas.mosaics.arrays import open_array, write_values
 from clsas.mosaics.chunks import chunk_checksums
 from clsas.mosaics.documents import (
     DamageError,
-    canonical,
     check_own,
-    is_intact,
     read_attributes,
-    with_checksum,
     write_attributes,
 )
 from clsas.mosaics.levels import (
@@ -53,10 +50,10 @@ def digest_of_patches(checksums: dict[PatchIndex, Checksums]) -> str:
     for (row, column), each in checksums.items():
         layers = [each[name] for name in LAYERS if name in each]
         pixels[f"{row}.{column}"] = [each["pixels"], *layers] if layers else each["pixels"]
-    return hashlib.sha256(canonical(pixels)).hexdigest()[:16]
+    return digest(pixels)
 
 
-def is_current(path: Path, attributes: dict[str, Any], digest: str) -> bool:
+def is_current(path: Path, attributes: dict[str, Any], patches: str) -> bool:
     """Return whether the levels of a mosaic are those of its patches.
 
     Parameters
@@ -65,40 +62,66 @@ def is_current(path: Path, attributes: dict[str, Any], digest: str) -> bool:
         The store.
     attributes : dict
         Attributes of the store.
-    digest : str
+    patches : str
         Digest of the finished patches.
     """
     try:
-        stored = read_attributes(path / LEVELS)
-        found = {
-            array.name: chunk_checksums(path, array, _all_chunks(array))
+        stored = _read_record(path)
+        return stored[_PATCHES] == patches and all(
+            chunk_checksums(path, array, _all_chunks(array)) == stored[_CHUNKS].get(array.name)
             for array in mosaic_arrays(attributes)
-        }
-    except (OSError, DamageError, ValueError):
+        )
+    except (OSError, ValueError):
         return False
-    return is_intact(stored) and stored.get(_PATCHES) == digest and stored.get(_CHUNKS) == found
 
 
-def damage(path: Path, attributes: dict[str, Any]) -> dict[str, str]:
-    """Read the levels of a mosaic; return the reason for each damaged array, by its name."""
+def damage(path: Path, attributes: dict[str, Any], patches: str) -> dict[str, str]:
+    """Read the levels of a mosaic; return the reason for each damaged array, by its name.
+
+    Levels that are missing or belong to other patches are not damaged: they are computed again.
+    If their record is damaged, the result names it, since nothing else is known then.
+
+    Raises
+    ------
+    OSError
+        If the record cannot be read.
+    """
+    try:
+        stored = _read_record(path)
+    except DamageError as error:
+        return {LEVELS: str(error)}
+    if stored[_PATCHES] != patches:
+        return {}
     found = {}
     for array in mosaic_arrays(attributes):
         try:
-            stored = open_array(path, attributes, array.name)
+            values = open_array(path, attributes, array.name)
         except DamageError:  # of the metadata, which are compared elsewhere
             continue
         try:
+            checksums = chunk_checksums(path, array, _all_chunks(array))
+            same = checksums == stored[_CHUNKS].get(array.name)
             for window in (_window(array, chunk) for chunk in _all_chunks(array)):
-                _ = stored[window]
+                _ = values[window]
         except ValueError:  # Zarr's message about a checksum
+            same = False
+        if not same:
             found[array.name] = "its values do not match their checksum"
     return found
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    """Return the record of the levels; raise DamageError or OSError if it cannot be read."""
+    stored = read_attributes(path / LEVELS)
+    if not (is_intact(stored) and _PATCHES in stored and isinstance(stored.get(_CHUNKS), dict)):
+        raise DamageError("its record does not match its digest")
+    return stored
 
 
 def complete(
     path: Path,
     attributes: dict[str, Any],
-    digest: str,
+    patches: str,
     read: Callable[[str, slice, slice], NDArray],
     progress: Callable[[int, int], object] | None,
 ) -> None:
@@ -110,7 +133,7 @@ def complete(
         The store.
     attributes : dict
         Attributes of the store.
-    digest : str
+    patches : str
         Digest of the finished patches.
     read : callable
         Called as read(name, rows, columns) with slices; returns pixels or a layer of the mosaic.
@@ -140,7 +163,7 @@ def complete(
         if progress is not None:
             progress(done, len(work))
     chunks = {array.name: chunk_checksums(path, array, _all_chunks(array)) for array in arrays}
-    write_attributes(folder, with_checksum({_PATCHES: digest, _CHUNKS: chunks}))
+    write_attributes(folder, with_digest({_PATCHES: patches, _CHUNKS: chunks}))
 
 
 def _level(

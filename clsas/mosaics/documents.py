@@ -1,4 +1,4 @@
-"""Documents of a store: JSON attributes of Zarr groups, with checksums.
+"""Documents of a store: JSON attributes of Zarr groups, with digests.
 
 The store's own document describes the mosaic and the inputs that it was made with. Every finished
 patch has a document too, its record (`clsas.mosaics.record`).
@@ -9,28 +9,21 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from clsas.core import validate
 from clsas.core.atomic import make_folders, replacing
+from clsas.core.digests import is_intact
 from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.reading import parse_json, read_bytes
 from clsas.mosaics.levels import WINDOW, are_levels
 
-CHECKSUM = "crc32"
-"""Attribute with the checksum of all others."""
-
 FORMAT = "clsas mosaic"
-VERSION = 3
-HEIGHTS_VERSION = 5
-"""Version of mosaics of heights. Those of images are of version 3 still."""
-
-# Version 1 had no checksums, version 2 no levels, and version 4 no heights of pixels in shadow.
-READABLE = (2, VERSION, HEIGHTS_VERSION)
+VERSION = 6
+"""Version of stores. Before version 6, digests left out some fields of the lines and the grid."""
 
 DIGESTS = "metadata"
 """Attribute with a digest of every array's metadata. Stores of early versions lack it."""
@@ -111,22 +104,6 @@ def write_attributes(folder: Path, attributes: dict[str, Any]) -> None:
         temporary.write_text(json.dumps(document, indent=1))
 
 
-def with_checksum(attributes: dict[str, Any]) -> dict[str, Any]:
-    """Return attributes with a checksum added."""
-    others = {name: value for name, value in attributes.items() if name != CHECKSUM}
-    return others | {CHECKSUM: f"{zlib.crc32(canonical(others)):08x}"}
-
-
-def canonical(values: Mapping[str, Any]) -> bytes:
-    """Return values as JSON that does not depend on their order, for checksums and digests."""
-    return json.dumps(values, sort_keys=True, separators=(",", ":")).encode()
-
-
-def is_intact(attributes: dict[str, Any]) -> bool:
-    """Return whether attributes match their checksum."""
-    return attributes == with_checksum(attributes)
-
-
 def read_document(path: Path) -> dict[str, Any]:
     """Return the attributes of a whole mosaic.
 
@@ -141,13 +118,13 @@ def read_document(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} exists and is not a mosaic of clsas") from error
     if attributes.get("format") != FORMAT:
         raise ValueError(f"{path} exists and is not a mosaic of clsas")
-    if attributes.get("version") not in READABLE:
+    if attributes.get("version") != VERSION:
         raise ValueError(
             f"{path} is a mosaic of version {attributes.get('version')}, but this clsas works "
-            f"with versions {', '.join(map(str, READABLE))}: choose another path"
+            f"with version {VERSION}: choose another path"
         )
     if not is_intact(attributes):
-        raise ValueError(f"{path} is damaged: its attributes do not match their checksum")
+        raise ValueError(f"{path} is damaged: its attributes do not match their digest")
     if not _is_complete(attributes):
         raise ValueError(f"{path} is damaged: its attributes are not those of a mosaic")
     return attributes

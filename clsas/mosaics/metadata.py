@@ -7,7 +7,6 @@ Zarr only if they describe an array as clsas writes it.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,9 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.core.digests import digest
 from clsas.core.grid import Grid
 from clsas.core.reading import parse_json, read_bytes
-from clsas.mosaics.documents import DIGESTS, DamageError, canonical, plane_of, read_attributes
+from clsas.mosaics.documents import DIGESTS, DamageError, plane_of, read_attributes
 from clsas.mosaics.levels import axis_of, mosaic_arrays, patch_arrays, stored_levels
 
 GROUP = "patches"
@@ -136,7 +136,7 @@ def has_height(path: Path, attributes: Mapping[str, Any]) -> bool:
     return (path / "height").exists() if digests is None else "height" in digests
 
 
-def checked(path: Path, name: str, form: Form, digest: str | None) -> Checked:
+def checked(path: Path, name: str, form: Form, expected: str | None) -> Checked:
     """Return the metadata of an array of a store after checking them.
 
     Parameters
@@ -147,7 +147,7 @@ def checked(path: Path, name: str, form: Form, digest: str | None) -> Checked:
         Name of the array.
     form : Form
         Required type and shape of the array.
-    digest : str or None
+    expected : str or None
         Expected digest, or None if the store has none.
 
     Raises
@@ -167,8 +167,8 @@ def checked(path: Path, name: str, form: Form, digest: str | None) -> Checked:
     difference = _difference(metadata, form)
     if difference:
         raise DamageError(f"its metadata are not those of a mosaic: {difference}")
-    found = digest_of(metadata)
-    if digest is not None and found != digest:
+    found = digest(metadata)
+    if expected is not None and found != expected:
         raise DamageError("its metadata do not match their digest")
     chunk = math.prod(metadata["chunk_grid"]["configuration"]["chunk_shape"])
     return Checked(text, chunk * ITEM_BYTES[form.data_type] + CHECKSUM_BYTES, found)
@@ -189,11 +189,6 @@ def check_group(path: Path, name: str) -> None:
         raise DamageError("its metadata cannot be read") from error
     if attributes:
         raise DamageError("it has attributes that were not written")
-
-
-def digest_of(metadata: Mapping[str, Any]) -> str:
-    """Return a digest of metadata."""
-    return hashlib.sha256(canonical(metadata)).hexdigest()[:16]
 
 
 def _difference(metadata: Any, form: Form) -> str | None:

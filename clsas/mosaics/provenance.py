@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from clsas.core.digests import grid_digest
+from clsas.core.digests import digest, grid_digest
 from clsas.core.grid import Grid
 from clsas.mosaics.documents import PARTS_OF_B, read_document
 from clsas.mosaics.survey import Survey
@@ -86,8 +85,7 @@ def stored_digest(path: Path) -> str:
     ValueError
         If there is no mosaic at the path, or its document is damaged.
     """
-    text = json.dumps(read_document(path)["inputs"], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return digest(read_document(path)["inputs"])
 
 
 def beam_json(beam: BeamWindow) -> str:

@@ -1,7 +1,7 @@
 """Records of finished patches: how each was formed, and its checksums.
 
 A record is stored as the attributes of an empty Zarr group. It contains a checksum of the patch's
-pixels and one of itself, so that a changed bit in either is detected.
+pixels and a digest of itself, so that a changed bit in either is detected.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from clsas.core import reprs
-from clsas.mosaics.documents import DamageError, is_intact, read_attributes, with_checksum
+from clsas.core.digests import is_intact, with_digest
+from clsas.mosaics.documents import DamageError, read_attributes
 
 PIXELS_CHECKSUM = "pixels_crc32c"
 """Attribute with the checksum of a patch's pixels, or the list of those of its chunks."""
@@ -114,7 +115,7 @@ class Record:
         own = asdict(self)
         if self.heights is None:  # of an image
             del own["heights"]
-        return with_checksum(own | stored)
+        return with_digest(own | stored)
 
     @classmethod
     def read(cls, folder: Path) -> tuple[Record, Checksums] | None:
@@ -129,7 +130,7 @@ class Record:
             return None
         stored = read_attributes(folder)
         if not is_intact(stored):
-            raise DamageError("its record does not match its checksum")
+            raise DamageError("its record does not match its digest")
         names = {field.name for field in fields(cls)}
         try:
             record = cls(**{name: value for name, value in stored.items() if name in names})

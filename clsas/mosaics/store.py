@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core import reprs, validate
-from clsas.core.digests import grid_digest
+from clsas.core.digests import grid_digest, with_digest
 from clsas.core.extras import needed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
@@ -32,7 +32,6 @@ from clsas.mosaics.documents import (
     check_place,
     is_there,
     read_document,
-    with_checksum,
     write_attributes,
 )
 from clsas.mosaics.levels import (
@@ -260,7 +259,7 @@ class Store:
         attributes = read_document(self.path)
         check_inputs(inputs, attributes["inputs"]["pixels"])
         if attributes["inputs"] != inputs:
-            write_attributes(self.path, with_checksum(attributes | {"inputs": inputs}))
+            write_attributes(self.path, with_digest(attributes | {"inputs": inputs}))
 
     def records(self) -> dict[PatchIndex, Record]:
         """Return the records of all finished patches, by row and column.
@@ -649,6 +648,8 @@ class Store:
         """Return the factor of a level; raise ValueError if there is none."""
         factor = validate.count("factor", factor)
         if factor not in (found := self.levels):
+            if damaged := self._level_damage():
+                raise ValueError(f"{self.path} is damaged: {describe_arrays(damaged)}{REPAIR}")
             known = ", ".join(map(str, found)) or "none: clsas mosaic --add-levels adds them"
             raise ValueError(
                 f"factor must be that of a level of {self.path} ({known}), got {factor}"
@@ -683,9 +684,9 @@ class Store:
 
     def _level_damage(self) -> dict[str, str]:
         """Read the levels that mix patches, if they are complete; return those that are damaged."""
-        if not (self.path / LEVELS / "zarr.json").exists() or not self._is_complete():
+        if not (self.path / LEVELS / "zarr.json").exists():
             return {}
-        return _completing().damage(self.path, read_document(self.path))
+        return _completing().damage(self.path, read_document(self.path), self._digest())
 
 
 def _completing() -> ModuleType:

@@ -7,7 +7,6 @@ is recorded. Only the geometry is kept in memory; samples are read when a patch 
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core import validate
-from clsas.core.digests import lines_digest
+from clsas.core.digests import Without, digest
 from clsas.core.lines import RangeLines
 from clsas.files.hdf5 import FileFormatError, read_geometry, read_samples
 
@@ -29,8 +28,11 @@ END = "end"
 _TAPER = 64  # samples over which a line fades where it is cut
 _MARGIN = 32  # unchanged samples between pixels and taper, for interpolation and its ringing
 _DIGESTED = 16  # lines of a file that enter its digest; all of them would take too long to read
-_SKIPPED = 64  # unused channels in a row that are read along: faster than a second read
 _LOOK = "look_direction"  # which only some files of a survey may state
+# Samples are those of the part. Files added later may remove the look direction of all channels. The
+# georeference is that of the grid, which mosaics compare.
+_NOT_IN_PARTS: Without = {RangeLines: ("samples", _LOOK, "georeference")}
+_SKIPPED = 64  # unused channels in a row that are read along: faster than a second read
 _GAP = 3.0  # a gap is a distance between pings of more than this many median distances
 
 
@@ -92,14 +94,15 @@ class Survey:
         found = []
         for index, part in enumerate(self.parts[first:], first):
             count = self.begins[index + 1] - self.begins[index]
-            digest = hashlib.sha256(lines_digest(self._part_geometry(index)).encode())
             if isinstance(part, RangeLines):
-                digest.update(np.ascontiguousarray(part.samples).data)
+                samples = [part.samples]
             else:
-                for channel in np.unique(np.linspace(0, count - 1, _DIGESTED).astype(int)):
-                    rows, columns = slice(channel, channel + 1), slice(0, self.lengths[index])
-                    digest.update(np.ascontiguousarray(self._samples(index, rows, columns)).data)
-            found.append(digest.hexdigest()[:16])
+                columns = slice(0, self.lengths[index])
+                samples = [
+                    self._samples(index, slice(channel, channel + 1), columns)
+                    for channel in np.unique(np.linspace(0, count - 1, _DIGESTED).astype(int))
+                ]
+            found.append(digest([self._part_geometry(index), *samples], _NOT_IN_PARTS))
         return found
 
     def within(self, near_m: NDArray[np.float64], far_m: NDArray[np.float64]) -> NDArray[np.bool_]:

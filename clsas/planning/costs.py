@@ -14,6 +14,7 @@ import numpy as np
 from clsas.core import reading, validate
 from clsas.core.atomic import replacing
 from clsas.core.cache import cache_folder, private_folder, trusted_cache
+from clsas.core.digests import is_intact, with_digest
 from clsas.core.version import __version__
 from clsas.opencl.device import Device, DeviceInfo
 from clsas.plans.predictions import CostSource, Work
@@ -167,7 +168,8 @@ def save(device: Device, costs: Costs) -> Path:
     except (OSError, ValueError):
         stored = {}  # whoever reads the file is warned
     measured = datetime.now(UTC).isoformat(timespec="seconds")
-    stored[key(device.info)] = {"source": "scaled", "measured": measured, "costs": asdict(costs)}
+    table = {"source": "scaled", "measured": measured, "costs": asdict(costs)}
+    stored[key(device.info)] = with_digest(table)
     with replacing(file) as temporary:
         temporary.write_text(json.dumps(stored, indent=1))
     return file
@@ -199,6 +201,8 @@ def _known(table: dict[str, Any]) -> KnownCosts:
     costs = {name: validate.number(name, table["costs"][name], "ns") for name in names}
     if table["source"] != "scaled" or not table["measured"]:
         raise ValueError("costs must be scaled, at a time")
+    if not is_intact(table):
+        raise ValueError("costs do not match their digest")
     return KnownCosts(Costs(**costs), "scaled", table["measured"])
 
 

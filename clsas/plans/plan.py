@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 from clsas.core import reprs, validate
-from clsas.core.digests import grid_digest, lines_digest
+from clsas.core.digests import DIGEST, grid_digest, is_intact, lines_digest, with_digest
 from clsas.core.extras import needed
 from clsas.core.fields import CONFIG, Constraint, Number, StoredAs, explained
 from clsas.core.grid import Grid
@@ -25,9 +24,9 @@ from clsas.sonar.simplify import EFFECTS
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
-VERSION = 5
-"""Version of a plan's JSON. Version 1, from before clsas 0.1.0, had no number; version 2 had a
-single mean track; version 3 lacked the origin of costs; version 4 called `method` `image`."""
+VERSION = 6
+"""Version of a plan's JSON. Version 1, from before clsas 0.1.0, had no number. Before version 6,
+digests of lines and grids were computed in another way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +184,7 @@ class Plan:
         # The digest is of lists and numbers as they are after a round trip through JSON.
         values = {"version": VERSION} | json.loads(json.dumps(_stored().dump_python(self)))
         if filters:
-            values["digest"] = _json_digest(values)
+            values = with_digest(values)
         else:
             _drop(values, "coefficients")
         return json.dumps(values, indent=1)
@@ -218,8 +217,7 @@ class Plan:
                 raise ValueError(f"it must be an object, got {validate.shown(values)}")
             _check_version(values)
             _check_digest(values)
-            values = _renamed(values) if values["version"] == 4 else values
-            values = {name: values[name] for name in values if name not in ("version", "digest")}
+            values = {name: values[name] for name in values if name not in ("version", DIGEST)}
             return _stored().validate_json(json.dumps(values))
         except ValidationError as error:
             problem = explained(error, values)
@@ -279,33 +277,19 @@ def _check_version(values: dict[str, Any]) -> None:
     version = values.get("version", 1 if "roots_at_once" in values else None)
     if version is None:
         raise ValueError("it lacks 'version'")
-    if version not in (4, VERSION):
+    if version != VERSION:
         by = "clsas before 0.1.0" if version == 1 else "another version of clsas"
         raise ValueError(
-            f"it has version {validate.shown(version)}, written by {by}; this clsas reads versions "
-            f"4 and {VERSION}: make the plan again with clsas.plan"
+            f"it has version {validate.shown(version)}, written by {by}; this clsas reads version "
+            f"{VERSION}: make the plan again with clsas.plan"
         )
-
-
-def _renamed(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of a text of version 4 with the names of version 5."""
-    image = values.get("image")
-    method = (
-        {"kind" if name == "method" else name: value for name, value in image.items()}
-        if isinstance(image, dict)
-        else image
-    )
-    return {("method" if name == "image" else name): values[name] for name in values} | (
-        {"method": method} if "image" in values else {}
-    )
 
 
 def _check_digest(values: dict[str, Any]) -> None:
     """Raise ValueError unless a text matches the digest in it."""
-    if "digest" not in values:
+    if DIGEST not in values:
         raise ValueError("it lacks 'digest', like texts that `to_json` wrote without filters")
-    said = {name: value for name, value in values.items() if name != "digest"}
-    if values["digest"] != _json_digest(said):
+    if not is_intact(values):
         raise ValueError("its digest differs: the text was changed or damaged")
 
 
@@ -323,7 +307,3 @@ def _drop(values: dict[str, Any], name: str) -> None:
     for value in values.values():
         if isinstance(value, dict):
             _drop(value, name)
-
-
-def _json_digest(values: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]

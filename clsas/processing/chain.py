@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -81,9 +81,9 @@ class Processed:
         """
         return self._read_lines()
 
-    @property
+    @cached_property
     def image(self) -> Image:
-        """Image, read from the folder.
+        """Image, read from the folder the first time.
 
         Raises
         ------
@@ -94,9 +94,11 @@ class Processed:
         """
         return self._result("image", Image)
 
-    @property
+    @cached_property
     def heights(self) -> Heights:
-        """Heights of the seabed, read from the folder or, all of them, from the store of a mosaic.
+        """Heights of the seabed, read the first time.
+
+        They are read from the folder or, all of them, from the store of a mosaic.
 
         Raises
         ------
@@ -259,7 +261,7 @@ class _Chain:
         digest = self._digest(name, options)
         record = self.records.get(name)
         # A mosaic always runs: it has its own records, and forms only the missing patches.
-        kept = record is not None and record.digest == digest and not is_mosaic(name, self.scene)
+        kept = record is not None and record.inputs == digest and not is_mosaic(name, self.scene)
         messages: tuple[str, ...] = ()
         if record is None or not kept or not record.is_intact(self.folder):
             record = self._run(name, digest, options, progress)
@@ -276,7 +278,7 @@ class _Chain:
     def leave(self, name: str) -> None:
         """Skip a step of the scene, and warn if its files are out of date."""
         digest, record = self._digest(name, options_of(name, self.scene)), self.records.get(name)
-        if record is not None and record.digest != digest:
+        if record is not None and record.inputs != digest:
             self.warn_if_outdated(name, "since its lines or options have changed")
         if name in CORRECTIONS:
             self.digest = digest
@@ -324,7 +326,7 @@ class _Chain:
                 files.append(f"{name}.h5")
             record = StepRecord(
                 name=name,
-                digest=digest,
+                inputs=digest,
                 lines=self.digest,
                 corrections=self.corrections,
                 options=json_able(options),

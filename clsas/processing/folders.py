@@ -10,7 +10,7 @@ from pathlib import Path
 from clsas.core import validate
 from clsas.core.atomic import locked
 from clsas.files.scene_files import SceneFile
-from clsas.processing.record import StepRecord, read_records
+from clsas.processing.record import NAME, StepRecord, read_records
 from clsas.processing.recording import Recording
 from clsas.processing.steps import FILES
 
@@ -46,6 +46,9 @@ def checked_records(
 ) -> dict[str, StepRecord]:
     """Return the records of the folder after checking that steps replace only their own files.
 
+    A damaged record is replaced by one without inputs, so that its step runs again and may replace
+    the files that it may have written.
+
     Raises
     ------
     ValueError
@@ -53,8 +56,20 @@ def checked_records(
         that no record names.
     OSError
         If the record cannot be read.
+
+    Warns
+    -----
+    ClsasWarning
+        If records are damaged.
     """
-    records = read_records(folder, scene)
+    records, is_damaged = read_records(folder, scene)
+    if is_damaged:
+        lost = {name: FILES[name] for name in FILES if name not in records}
+        for name, files in lost.items():
+            if found := [file for file in files if os.path.lexists(folder / file)]:
+                records[name] = StepRecord(name, "", files=dict.fromkeys(found, ""))
+        again = [name for name in lost if name in records or name in names]
+        validate.warn(f"{folder / NAME} is damaged; these steps are run again: {', '.join(again)}")
     own = {file for record in records.values() for file in record.files}
     for name in names:
         for file in FILES[name]:

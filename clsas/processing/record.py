@@ -10,6 +10,7 @@ import json
 import os
 import platform
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,14 +20,17 @@ import scipy
 
 from clsas.core import reading, reprs, validate
 from clsas.core.atomic import replacing
+from clsas.core.digests import DIGEST, digest, is_intact, with_digest
 from clsas.core.json_types import json_able
-from clsas.core.lines import RangeLines
 from clsas.core.version import __version__
 from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
 
 NAME = "process.json"
-_FORMAT, _VERSION = "clsas processing", 2
+_FORMAT, _VERSION = "clsas processing", 3
+_MARK = f'"format": "{_FORMAT}"'.encode()
+"""Text by which a damaged record can still be told from a file of another program."""
+
 _BLOCK = 1 << 22  # bytes that are read at once: a plain choice
 
 
@@ -39,7 +43,7 @@ class StepRecord:
     name : str
         The step: "inspect", "calibrate", "navigate", "focus", "pair_errors", "image", "heights" or
         "mosaic".
-    digest : str
+    inputs : str
         Digest of the inputs, the options and the version of clsas.
     lines : str
         Digest of the lines that the step began with: that of the recording, or of the last step
@@ -61,7 +65,7 @@ class StepRecord:
     """
 
     name: str
-    digest: str
+    inputs: str
     lines: str = ""
     corrections: tuple[str, ...] = ()
     options: dict[str, Any] = field(default_factory=dict)
@@ -92,10 +96,10 @@ class StepRecord:
             return False
 
 
-def read_records(folder: Path, scene: SceneFile) -> dict[str, StepRecord]:
-    """Return the records in a scene's folder by step; none if there is no `process.json`.
+def read_records(folder: Path, scene: SceneFile) -> tuple[dict[str, StepRecord], bool]:
+    """Return the intact records in a scene's folder by step, and whether others are damaged.
 
-    Records of single steps that cannot be read are left out.
+    There are none without `process.json`, nor if its entries before the steps are damaged.
 
     Raises
     ------
@@ -104,45 +108,51 @@ def read_records(folder: Path, scene: SceneFile) -> dict[str, StepRecord]:
     OSError
         If the file cannot be read.
     """
+    text, document = b"", None
     try:
-        document = reading.parse_json(reading.read_bytes(folder / NAME))
+        text = reading.read_bytes(folder / NAME)
+        document = reading.parse_json(text)
     except FileNotFoundError:
-        return {}
+        return {}, False
     except (IsADirectoryError, ValueError):
-        document = None
+        pass
     contains = f"output {str(folder)!r} contains"
     if not isinstance(document, dict) or document.get("format") != _FORMAT:
+        if _MARK in text:
+            return {}, True
         raise ValueError(
-            f"{contains} a {NAME} that clsas did not write: choose another output, or remove the "
-            "file"
+            f"{contains} a {NAME} that clsas did not write, or whose beginning is damaged: choose "
+            "another output, or remove the file"
         )
-    if document.get("version") != _VERSION or not isinstance(document.get("steps"), list):
+    if document.get("version") != _VERSION:
         raise ValueError(
             f"{contains} a {NAME} of another version of clsas: choose another output, or remove "
             "the folder"
         )
+    steps = document.pop("steps", None)
+    if not is_intact(document) or not isinstance(steps, list):
+        return {}, True
     if (other := document.get("scene")) != (own := _of_folder(scene, folder)):
         raise ValueError(
             f"{contains} the results of another scene: {validate.shown(other)} relative to the "
             f"folder, not {own!r}. Choose another output, or remove the folder"
         )
     found = {}
-    for step in document["steps"]:
-        try:
+    for step in filter(is_intact, steps):
+        values = {name: value for name, value in step.items() if name != DIGEST}
+        with suppress(TypeError, LookupError):
             tuples = {name: tuple(step[name]) for name in ("corrections", "warnings")}
-            record = StepRecord(**{**step, **tuples})
+            record = StepRecord(**{**values, **tuples})
             if isinstance(record.files, dict) and all(_is_plain(name) for name in record.files):
                 found[str(record.name)] = record
-        except (TypeError, LookupError):
-            continue
-    return found
+    return found, len(found) < len(steps)
 
 
 def write_records(
     folder: Path, scene: SceneFile, given: dict[str, Any], records: Iterable[StepRecord]
 ) -> None:
     """Write the record of a folder in one step."""
-    document = {
+    document: dict[str, Any] = {
         "format": _FORMAT,
         "version": _VERSION,
         "clsas": __version__,
@@ -152,17 +162,16 @@ def write_records(
         "machine": platform.platform(),
         "scene": _of_folder(scene, folder),
         "recording": given,
-        "steps": [asdict(record) for record in records],
     }
-    text = json.dumps(json_able(document), indent=1, allow_nan=False)
+    steps = [with_digest(json_able(asdict(record))) for record in records]
+    text = json.dumps(with_digest(document) | {"steps": steps}, indent=1, allow_nan=False)
     with replacing(folder / NAME) as temporary:
         temporary.write_text(text)
 
 
 def step_digest(name: str, options: dict[str, Any], *inputs: str) -> str:
     """Return the digest of a step, from its options and the digests of its inputs."""
-    text = json.dumps([__version__, name, json_able(options), *inputs], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return digest([__version__, name, options, *inputs])
 
 
 def file_digest(path: Path) -> str:
@@ -178,15 +187,6 @@ def file_digest(path: Path) -> str:
     with path.open("rb") as file:
         while block := file.read(_BLOCK):
             sha.update(block)
-    return sha.hexdigest()[:16]
-
-
-def contents_digest(lines: RangeLines) -> str:
-    """Return a digest of lines, including their samples."""
-    scalars = [lines.range_step_m, lines.carrier_hz, lines.sound_speed_m_s]
-    sha = hashlib.sha256(np.array(scalars).tobytes())
-    for array in (lines.samples, *lines.per_channel.values()):
-        sha.update(np.ascontiguousarray(array).data)
     return sha.hexdigest()[:16]
 
 

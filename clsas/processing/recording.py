@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from clsas.core import validate
+from clsas.core.digests import digest
 from clsas.core.lines import RangeLines
 from clsas.files.formats import load
 from clsas.files.scene_files import SceneFile
-from clsas.processing.record import contents_digest, file_digest, step_digest
+from clsas.processing.record import file_digest, step_digest
 from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
 
@@ -44,8 +45,8 @@ class Recording:
         if isinstance(given, Echoes):
             given = compress(given, **options)
         if isinstance(given, RangeLines):
-            lines, digest = given, contents_digest(given)
-            return cls({"file": None, "digest": digest}, digest, None, lines, options)
+            found = digest(given)
+            return cls({"file": None, "digest": found}, found, None, given, options)
         path = scene.process.get("lines") if given is None else validate.path("lines", given)
         if path is None:
             raise ValueError(
@@ -55,9 +56,9 @@ class Recording:
             raise ValueError(
                 f"{scene.name}: [process] lines must be a file, but {path} does not exist"
             )
-        digest = file_digest(path)
-        of_both = step_digest("recording", options, digest)
-        return cls({"file": str(path), "digest": digest}, of_both, path, None, options)
+        found = file_digest(path)
+        of_both = step_digest("recording", options, found)
+        return cls({"file": str(path), "digest": found}, of_both, path, None, options)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields to pickle, without lines that were read: they are read again."""
@@ -84,20 +85,21 @@ class Recording:
         return compress(found, **self._compression) if isinstance(found, Echoes) else found
 
 
-def loaded(path: Path, digest: str, *kinds: type) -> Any:
+def loaded(path: Path, expected: str, *kinds: type) -> Any:
     """Return the object in a file after checking the digest of the file.
 
     Raises
     ------
     ValueError
-        If the file contains an object of another type than `kinds`, or has another digest.
+        If the file contains an object of another type than `kinds`, or has another digest than
+        `expected`.
     """
     found = load(path)
     if not isinstance(found, kinds):
         names = " or ".join(kind.__name__ for kind in kinds)
         raise ValueError(f"{path} must contain {names}, got {type(found).__name__}")
     # Compute the digest after reading, so that a change in between is detected.
-    if file_digest(path) != digest:
+    if file_digest(path) != expected:
         raise ValueError(
             f"{path} has changed since its digest was recorded: run clsas process again"
         )

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from clsas import plot
 from clsas.core import banks
 from clsas.core.atomic import replacing, staging
-from clsas.core.digests import grid_digest
+from clsas.core.digests import digest
 from clsas.core.extras import install_command, is_installed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
@@ -138,9 +138,7 @@ def options_of(step: str, scene: SceneFile) -> dict[str, Any]:
     """Return all options of a scene that a step depends on, as JSON types or arrays."""
     options = dict(scene.process.get(step, {}))
     if step in ("inspect", "focus", "pair_errors", "image", "heights", "mosaic"):
-        options["grid"] = None if scene.grid is None else grid_digest(scene.grid)
-        if scene.georeference is not None:
-            options["georeference"] = str(scene.georeference)
+        options["grid"] = None if scene.grid is None else digest(scene.grid)
         options["beam"] = scene.image.get("beam")
     if step == "pair_errors":
         options["heights"] = scene.process["heights"]

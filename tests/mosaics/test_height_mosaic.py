@@ -600,6 +600,20 @@ class TestBadInput:
         with pytest.raises(ValueError, match="made with other inputs"):
             clsas.mosaic(flat_banks()[0], GRID, path)
 
+    @pytest.mark.slow
+    def test_other_bank_numbers(self, tmp_path):
+        first, second = flat_banks()
+        names = "samples", "tx_m", "rx_m", "first_range_m"
+        joined = {
+            name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names
+        }
+        numbers = np.repeat([0, 1], first.channels)
+        request = {"b": None, "grid": GRID, "store": tmp_path / "a.zarr", **REQUEST, "patch_m": 2.0}
+        clsas.mosaic_heights(replace(first, **joined, bank_numbers=numbers), **request)
+        for others in (1 - numbers, 2 * (1 - numbers)):
+            with pytest.raises(ValueError, match="the range lines differ"):
+                clsas.mosaic_heights(replace(first, **joined, bank_numbers=others), **request)
+
     def test_a_mosaic_of_images_has_no_heights(self, tmp_path):
         list(clsas.mosaic(flat_banks()[0], GRID, tmp_path / "a.zarr", tolerance_db=-30))
         store = clsas.Store.opened(tmp_path / "a.zarr")

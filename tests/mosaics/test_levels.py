@@ -314,8 +314,47 @@ def test_damaged_levels_that_mix_patches_are_computed_again(tmp_path):
     assert files_of(store.path) == whole
     chunk.unlink()
     assert store.levels == (2, 4)
+    assert list(store.array_damage()) == ["8x/amplitude"]
     assert store.complete_levels()
     assert files_of(store.path) == whole
+
+
+@pytest.mark.parametrize("kind", ["a bit", "a digit", "cut", "empty", "another record"])
+@pytest.mark.parametrize("patch_shape", [MIXED, ODD], ids=["some levels", "all levels"])
+def test_a_damaged_record_of_levels_is_reported(tmp_path, patch_shape, kind):
+    store = finished(tmp_path / "a.zarr", patch_shape)
+    whole, record = files_of(store.path), store.path / "levels/zarr.json"
+    content = bytearray(record.read_bytes())
+    at = content.index(b"8x/amplitude") + 18
+    match kind:
+        case "a bit":
+            content[at] ^= 2
+        case "a digit":
+            content[at] = ord("0") if content[at] != ord("0") else ord("1")
+        case "cut":
+            del content[-9:]
+        case "empty":
+            content.clear()
+        case "another record":
+            content[:] = whole[Path("patches/0.0/zarr.json")]
+    record.write_bytes(content)
+    assert list(store.array_damage()) == ["levels"]
+    verified = CliRunner().invoke(main, ["mosaic", "--verify", "-o", str(store.path)])
+    assert verified.exit_code == 1
+    assert "levels: its record" in verified.output
+    with pytest.raises(ValueError, match=r"damaged: levels: its record .*; run clsas mosaic"):
+        store.read_level(8)
+    with pytest.warns(clsas.ClsasWarning, match="these levels are computed again: levels: its"):
+        store = begun(store.path, patch_shape)
+    assert store.complete_levels()
+    assert files_of(store.path) == whole
+
+
+def test_levels_of_other_patches_are_not_damaged(tmp_path):
+    store = finished(tmp_path / "a.zarr", MIXED)
+    write(store, patches_of(MIXED)[0], pixels_of(1))
+    assert not store.array_damage()
+    assert store.complete_levels()
 
 
 def test_adding_levels_finds_damaged_ones(tmp_path):
@@ -366,7 +405,7 @@ def test_metadata_of_levels_are_repaired(tmp_path, name):
     assert files_of(store.path) == whole
 
 
-class TestStoresOfVersion2:
+class TestStoresWithoutLevels:
     """Without levels, and with one chunk for each patch."""
 
     @pytest.fixture
@@ -375,7 +414,7 @@ class TestStoresOfVersion2:
             patch.setattr("clsas.mosaics.levels.CHUNK_SIDE", 1024)
             patch.setattr("clsas.mosaics.arrays.levels_of", lambda *_: Levels())
             path = begun(tmp_path / "old.zarr", ODD).path
-            change(path, version=2, chunk_shape=None, levels=None)
+            change(path, chunk_shape=None, levels=None)
             store = clsas.Store.opened(path)
             for window in patches_of(ODD)[:-1]:
                 write(store, window)

@@ -556,7 +556,7 @@ class TestResuming:
         stored = json.loads(record.read_text())
         stored["attributes"][name] = value
         record.write_text(json.dumps(stored))
-        with pytest.warns(ClsasWarning, match="patch 1,2: its record does not match its checksum"):
+        with pytest.warns(ClsasWarning, match="patch 1,2: its record does not match its digest"):
             again = list(clsas.mosaic(LINES, GRID, path, **REQUEST))
         assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
 

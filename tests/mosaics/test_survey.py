@@ -11,6 +11,7 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
+from clsas.core.sound_speed import SoundSpeed
 from clsas.exact.backprojection import backproject
 from clsas.files.hdf5 import FileFormatError, load, save
 from clsas.mosaics.survey import END, files_of, has_ended, largest_gap_m, open_files, open_survey
@@ -109,6 +110,28 @@ def test_a_digest_changes_with_what_it_is_of():
     moved = replace(LINES, tx_m=LINES.tx_m + 1e-6)
     louder = replace(LINES, samples=2 * LINES.samples)
     assert len({*digest, *open_survey(moved).digests(), *open_survey(louder).digests()}) == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("bank_numbers", np.arange(120) % 2),
+        ("sound_speed", SoundSpeed([0, 80], [1500, 1490], surface_z_m=10.0)),
+        ("rx_velocity_m_s", [1.0, 0, 0]),
+    ],
+)
+@pytest.mark.parametrize("in_file", [False, True], ids=["memory", "file"])
+def test_a_digest_changes_with_every_field(tmp_path, name, value, in_file):
+    found = []
+    for number, lines in enumerate([LINES, replace(LINES, **{name: value})]):
+        save(path := tmp_path / f"{number}.h5", lines)
+        found += open_survey(path if in_file else lines).digests()
+    assert len(set(found)) == 2
+
+
+def test_a_look_direction_which_later_files_may_lack_is_not_in_digests():
+    looking = replace(LINES, look_direction=[0, 1.0, 0])
+    assert open_survey(looking).digests() == open_survey(LINES).digests()
 
 
 def test_a_survey_grows_by_files_that_follow(folder):

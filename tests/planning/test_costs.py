@@ -87,6 +87,16 @@ def test_a_broken_number_is_as_good_as_none(cache, platform, value):
         assert costs.load(platform) == KnownCosts(costs.defaults(platform), "default")
 
 
+@pytest.mark.parametrize("digit", range(4))
+def test_a_flipped_bit_is_noticed(cache, platform, digit):
+    costs.save(platform, OTHER)
+    content = bytearray(cache.read_bytes())
+    content[content.index(b"_ns") + len('_ns": ') + digit // 2] ^= 1 << digit % 2
+    cache.write_bytes(content)
+    with pytest.warns(ClsasWarning, match="costs.json are ignored"):
+        assert costs.load(platform).source == "default"
+
+
 def test_a_number_too_few_is_as_good_as_none(cache, platform):
     costs.save(platform, OTHER)
     stored = json.loads(cache.read_text())

@@ -19,7 +19,7 @@ from factorizing import (
     swaying,
 )
 
-from clsas.core.digests import grid_digest, lines_digest
+from clsas.core.digests import grid_digest, lines_digest, with_digest
 from clsas.core.grid import Grid
 from clsas.core.sound_speed import SoundSpeed
 from clsas.exact.backprojection import form_exactly
@@ -27,7 +27,7 @@ from clsas.opencl.device import open_device
 from clsas.planning import costs
 from clsas.planning.factorize import factorize
 from clsas.planning.planner import plan
-from clsas.plans.plan import VERSION, Plan, _json_digest
+from clsas.plans.plan import VERSION, Plan
 from clsas.sonar.beam import BeamWindow
 
 
@@ -63,7 +63,7 @@ def changeable(plan):
 
 def signed(values):
     """The JSON of a changed dict, with a new digest."""
-    return json.dumps(values | {"digest": _json_digest(values)})
+    return json.dumps(with_digest(values))
 
 
 def replaced(plan, path, value):
@@ -219,30 +219,13 @@ def test_the_message_names_the_mistake(chosen, field, value, message):
         Plan.from_json(replaced(chosen, field, value))
 
 
-@pytest.mark.parametrize("version", [1, VERSION + 1, "2"])
+@pytest.mark.parametrize("version", [1, VERSION - 1, VERSION + 1, "2"])
 def test_a_plan_of_another_version_is_refused(chosen, version):
     values = changeable(chosen) | {"version": version}
     if version == 1:  # it had no number, and its fields were not nested
         values = values["method"] | {"tolerance_db": -50.0}
     with pytest.raises(ValueError, match=r"written by .*: make the plan again with clsas\.plan"):
         Plan.from_json(json.dumps(values))
-
-
-def test_a_plan_of_version_4_is_read(any_plan):
-    values = changeable(any_plan)
-    image = values.pop("method")
-    image["method"] = image.pop("kind")
-    again = Plan.from_json(signed(values | {"version": 4, "image": image}))
-    assert again.to_json() == any_plan.to_json()
-
-
-@pytest.mark.parametrize("image", [None, [], {}, "x"])
-def test_a_wrong_plan_of_version_4_is_refused(chosen, image):
-    values = changeable(chosen)
-    del values["method"]
-    for each in (values, values | {"image": image}):
-        with pytest.raises(ValueError, match=r"text must be a plan as of Plan\.to_json: .*method"):
-            Plan.from_json(signed(each | {"version": 4}))
 
 
 @pytest.mark.parametrize("coefficients", ["none", [[1.0]], [[[None]]], []])
