@@ -79,7 +79,7 @@ _LISTED = 3  # patches that are listed for each flag; arbitrary
 )  # fmt: skip
 @click.option(
     "--add-levels", is_flag=True,
-    help="Form nothing; add levels, for fast overviews, to a store of an early version.",
+    help="Form nothing; compute levels, for fast overviews, that are missing or damaged.",
 )  # fmt: skip
 @options.picture("an overview in dB")
 @options.levels
@@ -118,7 +118,7 @@ def mosaic(
     patches again. With --verify it only lists damage; the exit code is then 1 if there is any.
 
     A store contains the image at 2, 4, 8, ... times the pixel spacing too, which pictures are drawn
-    from. Stores of early versions get these levels by --add-levels.
+    from. --add-levels computes those that are missing or damaged.
 
     \b
     Example:  clsas mosaic scene.toml --lines lines.h5 -o image.zarr --picture image.png
@@ -305,7 +305,7 @@ def _add_levels(path: Path, as_json: bool) -> None:
 def _verify(path: Path, as_json: bool) -> None:
     """Report which patches and arrays of a store are damaged; exit with code 1 if any is."""
     store = clsas.Store.opened(path)
-    arrays, has_digests = store.array_damage(), store.has_digests
+    arrays = store.array_damage()
     # Without the metadata of pixels, patches cannot be read.
     damage, finished = {}, None
     if "pixels" not in arrays:
@@ -319,15 +319,9 @@ def _verify(path: Path, as_json: bool) -> None:
         lines = [f"{printable(path)}: no patch can be compared with its checksum"]
     lines += [f"  {name}: {printable(reason)}" for name, reason in arrays.items()]
     lines += [f"  patch {index}: {printable(reason)}" for index, reason in damaged.items()]
-    if not has_digests:
-        lines.append(
-            "  The store has no digests of its metadata, since an earlier version of clsas wrote "
-            "it. Changed\n  names and units of its arrays are not noticed. clsas mosaic with the "
-            "same inputs adds digests."
-        )
     report(
         as_json, "\n".join(lines), file=path, finished=finished, damaged=damaged,
-        damaged_arrays=arrays, has_digests=has_digests,
+        damaged_arrays=arrays,
     )  # fmt: skip
     if damage or arrays:
         click.get_current_context().exit(1)

@@ -129,7 +129,7 @@ def add_levels(path: Path) -> None:
         _create_arrays(new, plane_of(attributes), attributes)
         for name in sorted(names):
             _exchange(path, name, new, old)
-    digests = _digests(path, attributes, has_height(path, attributes))
+    digests = _digests(path, attributes, has_height(attributes))
     write_attributes(path, with_digest(attributes | {DIGESTS: digests}))
 
 
@@ -146,7 +146,7 @@ def write_values(
 
 def check_metadata(path: Path, attributes: dict[str, Any]) -> None:
     """Raise a DamageError that names the array if the metadata of any array are damaged."""
-    for name, form in forms(attributes, has_height(path, attributes)).items():
+    for name, form in forms(attributes, has_height(attributes)).items():
         try:
             _checked(path, attributes, name, form)
         except DamageError as error:
@@ -187,7 +187,7 @@ def compared(
 
 
 def repair(path: Path, grid: Grid) -> dict[str, str]:
-    """Rewrite damaged metadata, coordinates and heights, and add digests if there are none.
+    """Rewrite damaged metadata, coordinates and heights.
 
     Parameters
     ----------
@@ -214,7 +214,6 @@ def repair(path: Path, grid: Grid) -> dict[str, str]:
             for name in found:
                 # Replace the metadata alone, since the chunks of pixels and the records must stay.
                 _exchange(path, name if name in axes else f"{name}/zarr.json", new, old)
-    if found or DIGESTS not in attributes:
         digests = _digests(path, attributes, with_height)
         write_attributes(path, with_digest(attributes | {DIGESTS: digests}))
     return found
@@ -240,7 +239,7 @@ def _digests(path: Path, attributes: dict[str, Any], with_height: bool) -> dict[
 
 def _checked(path: Path, attributes: dict[str, Any], name: str, form: Form) -> Checked:
     """Return the metadata of an array; raise DamageError if they are damaged."""
-    return checked(path, name, form, attributes.get(DIGESTS, {}).get(name))
+    return checked(path, name, form, attributes[DIGESTS].get(name))
 
 
 def _opened(path: Path, attributes: dict[str, Any], name: str, *, read_only: bool) -> zarr.Array:

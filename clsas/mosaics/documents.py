@@ -26,7 +26,7 @@ VERSION = 6
 """Version of stores. Before version 6, digests left out some fields of the lines and the grid."""
 
 DIGESTS = "metadata"
-"""Attribute with a digest of every array's metadata. Stores of early versions lack it."""
+"""Attribute with a digest of every array's metadata."""
 
 PARTS_OF_B = "parts_of_b"
 """Input with the digests of the second bank's files, if they are not those of the first one."""
@@ -136,7 +136,7 @@ def plane_of(attributes: Mapping[str, Any]) -> Grid | None:
     if stored is None:
         return None
     inputs = attributes["inputs"]
-    place = inputs.get("georeference")  # stores of early versions lack it
+    place = inputs.get("georeference")
     georeference = None if place is None else Georeference(**place)
     return Grid.oriented(**stored, shape=tuple(inputs["pixels"]), georeference=georeference)
 
@@ -177,7 +177,7 @@ def _is_complete(attributes: dict[str, Any]) -> bool:
         return False
     if not (
         _is_shape(attributes.get("patch_shape"))
-        and isinstance(attributes.get(DIGESTS, {}), dict)
+        and isinstance(attributes.get(DIGESTS), dict)
         and (grid is None or (isinstance(grid, dict) and grid.keys() == set(VECTORS)))
         and (WINDOW not in attributes or (grid is not None and _is_shape(attributes[WINDOW])))
     ):

@@ -61,7 +61,7 @@ LEVELS = "levels"
 """Attribute that lists the levels, and name of the group that records those of the mosaic."""
 
 CHUNK_SHAPE = "chunk_shape"
-"""Attribute with the chunks of the pixels. Stores of version 2 lack it: a patch is a chunk."""
+"""Attribute with the chunks of the pixels; without it, a patch is a chunk."""
 
 _CONVENTION = {
     "uuid": "d35379db-88df-4056-af3a-620245f8e347",

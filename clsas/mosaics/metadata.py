@@ -130,10 +130,9 @@ def axes_of(attributes: Mapping[str, Any]) -> dict[str, Axis]:
     return found
 
 
-def has_height(path: Path, attributes: Mapping[str, Any]) -> bool:
+def has_height(attributes: Mapping[str, Any]) -> bool:
     """Return whether the grid of a store has heights."""
-    digests = attributes.get(DIGESTS)
-    return (path / "height").exists() if digests is None else "height" in digests
+    return "height" in attributes[DIGESTS]
 
 
 def checked(path: Path, name: str, form: Form, expected: str | None) -> Checked:
@@ -148,7 +147,7 @@ def checked(path: Path, name: str, form: Form, expected: str | None) -> Checked:
     form : Form
         Required type and shape of the array.
     expected : str or None
-        Expected digest, or None if the store has none.
+        Expected digest, or None for any.
 
     Raises
     ------

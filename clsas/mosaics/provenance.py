@@ -16,8 +16,6 @@ from clsas.sonar.beam import BeamWindow
 REQUESTS = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
 """Requests for accuracy or a method, of which a mosaic takes at most one."""
 
-_ADDED = ("carrier_hz", "sound_speed_m_s")  # which stores of early versions lack
-
 
 class OtherInputsError(ValueError):
     """A store was made with other inputs than those given."""
@@ -61,7 +59,7 @@ def differences(
         found.append("the range lines of both banks were in one source, or are now")
     for name, theirs in given.items():
         mine = stored.get(name)
-        if name in ("parts", PARTS_OF_B) or (name in _ADDED and name not in stored):
+        if name in ("parts", PARTS_OF_B):
             continue
         if name == "grid" and mine != theirs:
             if stored.get("pixels") == given["pixels"]:

@@ -26,7 +26,6 @@ from clsas.core.image import Image
 from clsas.interferometry.result import Heights
 from clsas.mosaics import stored_heights
 from clsas.mosaics.documents import (
-    DIGESTS,
     DamageError,
     check_inputs,
     check_place,
@@ -133,21 +132,13 @@ class Store:
     def levels(self) -> tuple[int, ...]:
         """Factors of the levels that `read_level` can read, ascending, such as (2, 4, 8).
 
-        Empty for a mosaic that fits on a screen, or one of an early version to which `add_levels`
-        has not added any. Levels that mix patches are missing until a run has finished all patches.
+        Empty for a mosaic that fits on a screen. Levels that mix patches are missing until a run
+        has finished all patches.
         """
         arrays = list(self._arrays.files.arrays)
         if self._arrays.of_mosaic and self._is_complete():
             arrays = [*arrays, *self._arrays.of_mosaic]
         return tuple(sorted({array.factor for array in arrays} - {1}))
-
-    @property
-    def has_digests(self) -> bool:
-        """True if the store has digests of its arrays' metadata.
-
-        Stores of early versions lack them until a run continues the mosaic.
-        """
-        return DIGESTS in read_document(self.path)
 
     @property
     def grid(self) -> Grid:
@@ -378,7 +369,7 @@ class Store:
         return True
 
     def add_levels(self, progress: Callable[[int, int], object] | None = None) -> bool:
-        """Add levels to a store of an early version, computed from its pixels.
+        """Compute levels that are missing or damaged from the pixels.
 
         Patches and records stay as they are. If patches are formed later, run it again, or let the
         run that forms the last of them compute the levels.
@@ -658,7 +649,7 @@ class Store:
 
     def _compared(self) -> tuple[Grid | None, dict[str, str]]:
         attributes = read_document(self.path)
-        return zarr_arrays().compared(self.path, attributes, has_height(self.path, attributes))
+        return zarr_arrays().compared(self.path, attributes, has_height(attributes))
 
     @cached_property
     def _arrays(self) -> StoredArrays:

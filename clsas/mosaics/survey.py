@@ -29,8 +29,8 @@ _TAPER = 64  # samples over which a line fades where it is cut
 _MARGIN = 32  # unchanged samples between pixels and taper, for interpolation and its ringing
 _DIGESTED = 16  # lines of a file that enter its digest; all of them would take too long to read
 _LOOK = "look_direction"  # which only some files of a survey may state
-# Samples are those of the part. Files added later may remove the look direction of all channels. The
-# georeference is that of the grid, which mosaics compare.
+# Samples are those of the part, and the georeference is that of the grid, which mosaics compare.
+# Files added later may remove the look direction of all channels.
 _NOT_IN_PARTS: Without = {RangeLines: ("samples", _LOOK, "georeference")}
 _SKIPPED = 64  # unused channels in a row that are read along: faster than a second read
 _GAP = 3.0  # a gap is a distance between pings of more than this many median distances

@@ -54,7 +54,7 @@ def test_a_scene_is_all_it_needs(made):
     assert "2 x 2 patches of 50 x 40 pixels, 4 formed in" in stdout
     assert "predicted error at most -40" in stdout
     told = stderr.splitlines()
-    assert re.search(r"scene-\w{12}\.lines\.h5: range lines, simulated from .*scene.toml$", told[0])
+    assert re.search(r"scene-\w{16}\.lines\.h5: range lines, simulated from .*scene.toml$", told[0])
     assert sum(line.startswith("patch ") for line in told) == 4
     assert (folder / "image.png").read_bytes().startswith(b"\x89PNG")
     scene = read_scene(folder / "scene.toml")

@@ -39,10 +39,9 @@ def check_repaired(path, kept, name):
 
 def test_a_whole_store_has_no_damage(path):
     assert clsas.Store.opened(path).array_damage() == {}
-    assert clsas.Store.opened(path).has_digests
     said, found = verified(path, 0)
     assert said == f"{path}: 6 patches match their checksums, none damaged\n"
-    assert (found["damaged_arrays"], found["has_digests"]) == ({}, True)
+    assert found["damaged_arrays"] == {}
 
 
 @pytest.mark.exhaustive
@@ -172,41 +171,6 @@ def test_a_killed_run_leaves_a_store_that_is_repaired_by_the_next(path, kept, mo
     check_repaired(path, kept, "height")
 
 
-class TestStoresWithoutDigests:
-    """As the first releases of this version wrote them."""
-
-    @pytest.fixture
-    def path(self, path):
-        change(path, metadata=None)
-        return path
-
-    def test_it_is_read_and_verify_says_so(self, path):
-        store = clsas.Store.opened(path)
-        assert store.image().pixels.any()
-        np.testing.assert_array_equal(store.grid.height_m, GRID.height_m)
-        said, found = verified(path, 0)
-        assert "6 patches match their checksums, none damaged" in said
-        assert "no digests of its metadata, since an earlier version" in said
-        assert (found["has_digests"], found["damaged_arrays"]) == (False, {})
-
-    def test_it_gets_digests_when_it_is_continued(self, path, kept):
-        assert list(clsas.mosaic(LINES, GRID, path, **REQUEST)) == []
-        assert clsas.Store.opened(path).has_digests
-        assert files_of(path) == kept
-
-    @pytest.mark.parametrize("name", ["x", "y", "height"])
-    def test_values_are_compared_and_repaired_all_the_same(self, path, kept, name):
-        zeros(path / name)
-        assert list(verified(path, 1)[1]["damaged_arrays"]) == [name]
-        check_repaired(path, kept, name)
-
-    def test_heights_that_are_gone_are_missed(self, path, kept):
-        shutil.rmtree(path / "height")
-        with pytest.raises(ValueError, match="its grid differs from what was written"):
-            clsas.Store.opened(path).image()
-        check_repaired(path, kept, "height")
-
-
 class TestChunksOfNoPixels:
     def test_in_metadata(self, path, kept):
         grid = {"name": "regular", "configuration": {"chunk_shape": [0, 14]}}
@@ -218,7 +182,6 @@ class TestChunksOfNoPixels:
 
     @pytest.mark.parametrize("name", ["x", "height"])
     def test_in_coordinates(self, path, kept, name):
-        change(path, metadata=None)
         shape = [0] if name == "x" else [30, 0]
         grid = {"name": "regular", "configuration": {"chunk_shape": shape}}
         change_metadata(path, name, chunk_grid=grid)
@@ -243,6 +206,7 @@ class TestChunksOfNoPixels:
         {"inputs": {"parts": []}},
         {"inputs": {"parts": [], "pixels": [0, 5]}},
         {"metadata": []},
+        {"metadata": None},
     ],
 )
 def test_a_document_of_wrong_types_is_damage(path, changed):

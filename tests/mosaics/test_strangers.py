@@ -13,6 +13,7 @@ from stores import GRID, LINES, REQUEST, change, change_metadata, files_of
 
 import clsas
 from clsas.core import validate
+from clsas.core.digests import digest
 
 numcodecs = pytest.importorskip("numcodecs")
 zarr = pytest.importorskip("zarr")
@@ -57,10 +58,9 @@ def trusting(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("has_digests", [True, False])
 @pytest.mark.parametrize("name", ["height", "pixels", "x"])
 @pytest.mark.usefixtures("trusting")
-def test_pickles_of_zarr_format_2_do_not_run(path, tmp_path, name, has_digests):
+def test_pickles_of_zarr_format_2_do_not_run(path, tmp_path, name):
     mark = tmp_path / "ran"
     shape = [40] if name == "x" else [30, 40]
     metadata = {
@@ -68,8 +68,6 @@ def test_pickles_of_zarr_format_2_do_not_run(path, tmp_path, name, has_digests):
         "filters": [{"id": "vlen-utf8"}, {"id": "pickle", "protocol": 5}], "compressor": None,
         "fill_value": "",
     }  # fmt: skip
-    if not has_digests:
-        change(path, metadata=None)
     shutil.rmtree(path / name)
     (path / name).mkdir()
     (path / name / ".zarray").write_text(json.dumps(metadata))
@@ -89,7 +87,6 @@ def test_pickles_of_zarr_format_2_do_not_run(path, tmp_path, name, has_digests):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("has_digests", [True, False])
 @pytest.mark.parametrize("name", ["height", "pixels"])
 @pytest.mark.parametrize(
     "entries",
@@ -122,9 +119,7 @@ def test_pickles_of_zarr_format_2_do_not_run(path, tmp_path, name, has_digests):
     ],
     ids=lambda entries: str(entries)[:40],
 )
-def test_zarr_is_not_asked_about_other_metadata(path, monkeypatch, name, entries, has_digests):
-    if not has_digests:
-        change(path, metadata=None)
+def test_zarr_is_not_asked_about_other_metadata(path, monkeypatch, name, entries):
     change_metadata(path, name, **entries)
     opened = []
     open_array = zarr.open_array
@@ -167,10 +162,12 @@ def test_a_store_that_claims_more_than_memory_is_refused(path, monkeypatch):
     document = json.loads((path / "zarr.json").read_text())["attributes"]
     inputs = document["inputs"] | {"pixels": [side, side]}
     sides = {"patch_shape": [50, 50], "chunk_shape": [50, 50]}
-    change(path, inputs=inputs, **sides, levels=None, metadata=None)
+    digests = {}
     for name, axes in {"pixels": 2, "height": 2, "x": 1, "y": 1}.items():
         grid = {"name": "regular", "configuration": {"chunk_shape": axes * [50]}}
         change_metadata(path, name, shape=axes * [side], chunk_grid=grid)
+        digests[name] = digest(json.loads((path / name / "zarr.json").read_text()))
+    change(path, inputs=inputs, **sides, levels=None, metadata=digests)
     shutil.rmtree(path / "height" / "c")
     monkeypatch.setattr(validate, "_memory_bytes", lambda: 2**30)
     store = clsas.Store.opened(path)

@@ -166,7 +166,7 @@ def test_a_record_that_cannot_be_read_is_no_licence_to_replace(plain):
             clsas.process(plain)
         assert contents(folder) == before | {"process.json": text.encode()}
     path.write_text(json.dumps(record | {"steps": []}))
-    with pytest.raises(ValueError, match="contains image.h5, which image would"):
+    with pytest.raises(ValueError, match=r"contains image\.h5, which image would"):
         clsas.process(plain)
 
 
