@@ -1,13 +1,12 @@
-"""The cache folder: measured costs, simulated lines, and folders of worker processes.
+"""The cache folder: compiled kernels, measured costs, simulated lines, folders of worker processes.
 
-Worker processes import modules from their folder, and plans depend on stored costs. Anybody who can
-write to the cache folder can therefore act as its user. It is used only if nobody else can write to
-it.
+Drivers load compiled kernels into the process, worker processes import modules from their folder,
+and plans depend on stored costs. Anybody who can write to the cache folder can therefore act as its
+user. It is used only if nobody else can write to it.
 """
 
 from __future__ import annotations
 
-import errno
 import grp
 import os
 import pwd
@@ -17,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 
 _MODE = 0o700  # of folders that are created here
+_VARIABLE = "CLSAS_CACHE"
 
 
 def cache_folder() -> Path:
@@ -24,14 +24,18 @@ def cache_folder() -> Path:
 
     The folder is not checked and may not exist; see `trusted_cache` and `private_folder`.
     """
-    return Path(os.environ.get("CLSAS_CACHE") or _user_caches() / "clsas")
+    return Path(os.environ.get(_VARIABLE) or user_caches() / "clsas")
 
 
-def _user_caches() -> Path:
-    """Return the user's cache folder for all programs, by the XDG specification or as on macOS."""
+def user_caches() -> Path:
+    """Return the user's cache folder for all programs, by the XDG specification or as on macOS.
+
+    It begins with "~" if the user has no home directory, and is then refused by `made_private`.
+    """
     if os.path.isabs(given := os.environ.get("XDG_CACHE_HOME", "")):
         return Path(given)  # the specification tells programs to ignore relative paths
-    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
+    home = Path(os.path.expanduser("~"))
+    return home / ("Library/Caches" if sys.platform == "darwin" else ".cache")
 
 
 def trusted_cache() -> Path:
@@ -44,8 +48,8 @@ def trusted_cache() -> Path:
         message names the folder and CLSAS_CACHE.
     """
     folder = cache_folder()
-    _check(folder)
-    _check_access(folder, os.R_OK | os.X_OK, "read")
+    _check(folder, _VARIABLE)
+    _check_access(folder, _VARIABLE, os.R_OK | os.X_OK, "read")
     return folder
 
 
@@ -62,24 +66,45 @@ def private_folder(*names: str) -> Path:
     Raises
     ------
     PermissionError
-        If another user can change the contents of the folder, or this user cannot write to it.
-    OSError
-        If the folder cannot be created.
+        As from `made_private`.
     """
-    folder = trusted_cache().joinpath(*names)
-    for each in reversed([folder, *folder.parents]):
-        if not each.is_dir():
-            with suppress(FileExistsError):  # another process created it; checked below
-                each.mkdir(_MODE)
-    _check(folder)
+    return made_private(trusted_cache().joinpath(*names), _VARIABLE)
+
+
+def made_private(folder: Path, variable: str) -> Path:
+    """Return a folder that only this user can write to, and create it if it does not exist.
+
+    Parameters
+    ----------
+    folder : Path
+    variable : str
+        Environment variable that selects the folder, which the message of an error names.
+
+    Raises
+    ------
+    PermissionError
+        If another user can change the contents of the folder, or this user cannot create it or
+        write to it.
+    """
+    _check(folder, variable)
+    try:
+        for each in reversed([folder, *folder.parents]):
+            if not each.is_dir():
+                with suppress(FileExistsError):  # another process created it; checked below
+                    each.mkdir(_MODE)
+    except OSError as error:
+        raise _refusal(folder, variable, f"it cannot be created ({error.strerror})") from error
+    _check(folder, variable)
     if not folder.is_dir():
-        raise NotADirectoryError(errno.ENOTDIR, "is not a folder", str(folder))
-    _check_access(folder, os.W_OK | os.X_OK, "write to")
+        raise _refusal(folder, variable, "it is not a folder")
+    _check_access(folder, variable, os.W_OK | os.X_OK, "write to")
     return folder
 
 
-def _check(folder: Path) -> None:
+def _check(folder: Path, variable: str) -> None:
     """Raise PermissionError if another user can change the contents of a folder or replace it."""
+    if folder.parts[:1] == ("~",):
+        raise _refusal(folder, variable, "your home directory is not known")
     try:
         real = Path(os.path.realpath(folder))
         links = _links(Path(os.path.abspath(folder)), set())
@@ -88,19 +113,19 @@ def _check(folder: Path) -> None:
     except PermissionError as error:
         found = f"{error.filename} cannot be searched"
     if found:
-        raise _refusal(folder, found)
+        raise _refusal(folder, variable, found)
 
 
-def _check_access(folder: Path, access: int, verb: str) -> None:
+def _check_access(folder: Path, variable: str, access: int, verb: str) -> None:
     """Raise PermissionError if the folder exists and this user has no such access to it."""
     if folder.is_dir() and not os.access(folder, access, effective_ids=True):
-        raise _refusal(folder, f"you cannot {verb} it")
+        raise _refusal(folder, variable, f"you cannot {verb} it")
 
 
-def _refusal(folder: Path, reason: str) -> PermissionError:
+def _refusal(folder: Path, variable: str, reason: str) -> PermissionError:
     return PermissionError(
         f"the cache folder {folder} is not used because {reason}: set the environment variable "
-        "CLSAS_CACHE to a folder that belongs to you and that others cannot write to"
+        f"{variable} to a folder that belongs to you and that others cannot write to"
     )
 
 

@@ -22,7 +22,15 @@ from numpy.typing import DTypeLike
 
 from clsas.core import reprs, validate
 from clsas.opencl.kernels import Kernel, kernel_parameters, kernel_source, whole_source
-from clsas.opencl.refusals import DeviceError, check_process, no_device, no_match, not_built
+from clsas.opencl.refusals import (
+    POCL,
+    DeviceError,
+    check_process,
+    no_device,
+    no_match,
+    not_built,
+    prepare_caches,
+)
 
 ENVIRONMENT_VARIABLE = "CLSAS_DEVICE"
 KINDS = ("gpu", "cpu", "accelerator")
@@ -364,12 +372,15 @@ def _compiled_vectors(device: cl.Device) -> tuple[int, bool]:
 
 def _raw_devices() -> list[cl.Device]:
     check_process()
+    no_pocl = prepare_caches()
     try:
         platforms = cl.get_platforms()
     except cl.LogicError:  # the loader found no driver at all
         return []
     devices = []
     for platform in platforms:
+        if no_pocl and platform.name == POCL:
+            continue
         try:
             devices += platform.get_devices()
         except cl.RuntimeError:  # a platform without a device
@@ -431,7 +442,8 @@ def choose(request: str | int | None = None) -> tuple[DeviceInfo, str]:
         if chosen.kind == "gpu":
             return chosen, "the first GPU"
         widest = f" with vectors of {chosen.width}" if chosen.width > 1 else ""
-        return chosen, f"the first {chosen.kind.upper()}{widest}; there is no GPU"
+        others = ". ".join(filter(None, ("there is no GPU", prepare_caches())))
+        return chosen, f"the first {chosen.kind.upper()}{widest}; {others}"
     if isinstance(request, str) and re.fullmatch(r"\s*[0-9]+\s*", request, re.ASCII):
         request = int(request)
     if isinstance(request, (int, np.integer)) and not isinstance(request, bool):

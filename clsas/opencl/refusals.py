@@ -1,4 +1,4 @@
-"""Errors if OpenCL cannot be used: no driver, no cache folder for PoCL, or a forked process."""
+"""Errors if OpenCL cannot be used: no driver, no private cache for PoCL, or a forked process."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import pyopencl as cl
 
+from clsas.core.cache import made_private, private_folder, user_caches
 from clsas.core.extras import install_command
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ No OpenCL device was found. Any one of the following provides one:
 
 POCL = "Portable Computing Language"
 """Name of PoCL's platform."""
+_POCL_VARIABLE = "POCL_CACHE_DIR"
 _KERNEL_BYTES = 1 << 16  # arbitrary size of a kernel on disk, for which a full disk has no room
 
 
@@ -38,7 +40,7 @@ class DeviceError(RuntimeError):
 
 def no_device() -> DeviceError:
     """Return the error for a machine without devices, which says how to get one."""
-    if any(platform.name == POCL for platform in _platforms()) and (why := _cache_problem()):
+    if any(platform.name == POCL for platform in _platforms()) and (why := _pocl_problem()):
         return DeviceError(f"No OpenCL device was found: {why}")
     folder = Path(cl.__file__).parent / ".libs"
     return DeviceError(_HOW_TO_GET_A_DEVICE.format(folder=folder, command=install_command("pocl")))
@@ -47,17 +49,17 @@ def no_device() -> DeviceError:
 def no_match(what: str, devices: Sequence[DeviceInfo]) -> DeviceError:
     """Return the error for a request that no device matches.
 
-    If PoCL is installed but cannot write its cache folder, it has no device, and the message says
-    so.
+    If PoCL is installed but has no private folder that it can write to, it has no device, and the
+    message says so.
     """
     of_pocl = any(info.platform == POCL for info in devices)
-    why = "" if of_pocl or all(each.name != POCL for each in _platforms()) else _cache_problem()
+    why = "" if of_pocl or all(each.name != POCL for each in _platforms()) else _pocl_problem()
     return DeviceError(f"No device matches {what}{why and f'. {why}'}")
 
 
 def not_built(what: str, platform: str, error: cl.Error) -> DeviceError:
     """Return the error for a build that failed, with the log of the platform's driver."""
-    if platform == POCL and (why := _cache_problem()):
+    if platform == POCL and (why := _pocl_problem()):
         return DeviceError(f"{what}: {why}")
     return DeviceError(f"{what}:\n{indent(str(error), '  ', lambda line: True)}")
 
@@ -90,27 +92,41 @@ def _first_process() -> int:
     return os.getpid()
 
 
-def _cache_problem() -> str:
-    """Return why PoCL cannot write its cache folder, which it needs to build; "" if it can."""
-    folder = _cache_folder()
+@functools.cache
+def prepare_caches() -> str:
+    """Make PoCL and PyOpenCL use private folders; return why PoCL has none, or "" if it has one.
+
+    Both load code from their caches. Without this, PoCL uses the folder that a variable names, and
+    /tmp/pocl if there is no home directory, whoever can write there. It reads the variable when
+    platforms are first listed.
+    """
     try:
-        os.makedirs(folder, exist_ok=True)
+        for name in ("pytools", "pyopencl"):
+            made_private(user_caches() / name, "XDG_CACHE_HOME")
+    except OSError:
+        # The variable PYOPENCL_NO_CACHE is read when PyOpenCL is imported, which is too early.
+        cl._PYOPENCL_NO_CACHE = True
+    given = os.environ.get(_POCL_VARIABLE)
+    try:
+        folder = made_private(Path(given), _POCL_VARIABLE) if given else private_folder("kernels")
+    except OSError as error:
+        os.environ[_POCL_VARIABLE] = os.devnull  # PoCL cannot write there, and has no device
+        return f"PoCL cannot be used: {error}"
+    os.environ[_POCL_VARIABLE] = str(folder.absolute())
+    return ""
+
+
+def _pocl_problem() -> str:
+    """Return why PoCL cannot write its cache folder, which it needs to build; "" if it can."""
+    if why := prepare_caches():
+        return why
+    folder = os.environ[_POCL_VARIABLE]
+    try:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(_KERNEL_BYTES))
     except OSError as error:
         return (
             f"PoCL cannot write its cache folder {folder!r} ({error.strerror}). Set the "
-            "environment variable POCL_CACHE_DIR to a folder that can be written"
+            f"environment variable {_POCL_VARIABLE} to a folder that can be written"
         )
     return ""
-
-
-def _cache_folder() -> str:
-    """Return the folder in which PoCL keeps built kernels."""
-    given = os.environ.get("POCL_CACHE_DIR")
-    if given is not None:
-        return given
-    if caches := os.environ.get("XDG_CACHE_HOME"):
-        return f"{caches}/pocl/kcache"
-    home = os.environ.get("HOME")
-    return "/tmp/pocl/kcache" if home is None else f"{home}/.cache/pocl/kcache"

@@ -211,8 +211,26 @@ def test_a_cache_of_the_administrator_can_be_read(shared, monkeypatch):
 def test_a_file_in_its_place_is_named(folder):
     folder.parent.mkdir()
     folder.write_text("")
-    with pytest.raises(NotADirectoryError, match=str(folder)):
-        cache.private_folder()
+    for names in ((), ("deeper",)):
+        with pytest.raises(PermissionError, match=f"{folder}.* is not a folder|cannot be created"):
+            cache.private_folder(*names)
+
+
+def test_a_folder_of_another_program_is_checked_by_the_same_rule(shared):
+    (shared / "open").mkdir()
+    (shared / "open").chmod(0o777)
+    with pytest.raises(PermissionError, match=r"other users can write.*variable OTHER to a folder"):
+        cache.made_private(shared / "open", "OTHER")
+    assert cache.made_private(shared / "own" / "deeper", "OTHER") == shared / "own" / "deeper"
+
+
+def test_a_user_without_a_home_directory_is_told_to_name_a_folder(monkeypatch):
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as it does without a home
+    for name in ("CLSAS_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    for work in (cache.trusted_cache, cache.private_folder):
+        with pytest.raises(PermissionError, match=r"home directory is not known: set.*CLSAS_CACHE"):
+            work()
 
 
 def test_a_group_of_this_user_alone_is_nobody_else(shared, monkeypatch):

@@ -1,11 +1,18 @@
-"""Errors if OpenCL cannot be used: forked processes, and caches that PoCL cannot write."""
+"""Errors if OpenCL cannot be used: forked processes, and caches that are not private."""
 
+import errno
+import functools
 import os
+import shutil
+import stat
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pyopencl
 import pytest
 
 from clsas.core.validate import printable
@@ -47,9 +54,14 @@ from clsas.opencl.device import open_device
 
 try:
     open_device("pocl").kernel("peak", WIDTH=1, CHAINS=8)
+    print("built")
 except clsas.DeviceError as error:
     print(error)
 """
+
+needs_pocl = pytest.mark.skipif(
+    all(info.platform != refusals.POCL for info in list_devices()), reason="PoCL is not here"
+)
 
 
 def in_a_process(code, *arguments, **environment):
@@ -100,44 +112,155 @@ def no_folder(tmp_path):
     return tmp_path / "file" / "folder"
 
 
-def test_a_cache_that_pocl_cannot_write_is_named(monkeypatch, no_folder):
+@pytest.fixture
+def anew(monkeypatch):
+    """Return a function that prepares the caches as a new process does, with other variables."""
     monkeypatch.setattr(refusals, "_platforms", lambda: [SimpleNamespace(name=refusals.POCL)])
-    for variable, value, folder in (
-        ("POCL_CACHE_DIR", no_folder, f"{no_folder}"),
-        ("POCL_CACHE_DIR", "", ""),
-        ("XDG_CACHE_HOME", no_folder, f"{no_folder}/pocl/kcache"),
-        ("HOME", no_folder, f"{no_folder}/.cache/pocl/kcache"),
+    monkeypatch.setattr(pyopencl, "_PYOPENCL_NO_CACHE", False)
+
+    def prepared(**variables):
+        for name in ("POCL_CACHE_DIR", "XDG_CACHE_HOME", "CLSAS_CACHE"):
+            monkeypatch.setenv(name, str(variables.get(name, "")))
+        prepare = functools.cache(refusals.prepare_caches.__wrapped__)
+        monkeypatch.setattr(refusals, "prepare_caches", prepare)
+        return prepare()
+
+    return prepared
+
+
+def test_a_cache_that_pocl_cannot_write_is_named(anew, no_folder):
+    for variable, folder in (
+        ("POCL_CACHE_DIR", no_folder),
+        ("POCL_CACHE_DIR", "/dev/null"),
+        ("CLSAS_CACHE", no_folder),
     ):
-        with monkeypatch.context() as patch:
-            for name in ("POCL_CACHE_DIR", "XDG_CACHE_HOME"):
-                patch.delenv(name, raising=False)
-            patch.setenv(variable, str(value))
-            for error in (
-                refusals.no_device(),
-                refusals.not_built("image.cl", refusals.POCL, ValueError("a log")),
-            ):
-                assert f"PoCL cannot write its cache folder {folder!r}" in str(error)
-                assert "environment variable POCL_CACHE_DIR" in str(error)
-                assert "pip install" not in str(error)
-            other = refusals.not_built("image.cl", "NVIDIA CUDA", ValueError("a log"))
-            assert str(other) == "image.cl:\n  a log"
+        anew(**{variable: folder})
+        for error in (
+            refusals.no_device(),
+            refusals.not_built("image.cl", refusals.POCL, ValueError("a log")),
+        ):
+            assert f"PoCL cannot be used: the cache folder {folder}" in str(error)
+            assert f"environment variable {variable}" in str(error)
+            assert "pip install" not in str(error)
+        other = refusals.not_built("image.cl", "NVIDIA CUDA", ValueError("a log"))
+        assert str(other) == "image.cl:\n  a log"
 
 
-def test_with_a_cache_the_error_is_another(monkeypatch, tmp_path):
-    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "made" / "anew"))
+def test_a_cache_that_is_full_is_named(anew, tmp_path, monkeypatch):
+    assert anew(POCL_CACHE_DIR=tmp_path / "cache") == ""
+
+    def full(**_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", full)
+    said = str(refusals.not_built("image.cl", refusals.POCL, ValueError("a log")))
+    assert f"PoCL cannot write its cache folder '{tmp_path / 'cache'}' (No space" in said
+    assert "environment variable POCL_CACHE_DIR" in said
+
+
+def test_with_a_cache_the_error_is_another(anew, tmp_path):
+    anew(POCL_CACHE_DIR=tmp_path / "made" / "anew")
     assert "pip install" in str(refusals.no_device())
     said = str(refusals.not_built("image.cl", refusals.POCL, ValueError("a log")))
     assert said == "image.cl:\n  a log"
 
 
+def test_pocl_keeps_kernels_in_the_cache_folder_unless_another_is_named(
+    anew, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    for variables, folder in (
+        ({"CLSAS_CACHE": tmp_path / "a"}, tmp_path / "a" / "kernels"),
+        ({"CLSAS_CACHE": tmp_path / "a", "POCL_CACHE_DIR": tmp_path / "b"}, tmp_path / "b"),
+        ({"POCL_CACHE_DIR": "relative"}, tmp_path / "relative"),
+    ):
+        assert anew(**variables) == ""
+        assert os.environ["POCL_CACHE_DIR"] == str(folder)
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+def test_pyopencl_uses_its_cache_only_if_it_is_private(anew, open_folder, tmp_path):
+    (tmp_path / "own").mkdir(0o700)
+    for folder, is_used in ((open_folder, False), (tmp_path / "own", True)):
+        pyopencl._PYOPENCL_NO_CACHE = False
+        anew(XDG_CACHE_HOME=folder, CLSAS_CACHE=tmp_path / "cache")
+        assert is_used != pyopencl._PYOPENCL_NO_CACHE
+    assert not list(open_folder.iterdir())
+
+
+ACCOUNT = 4242  # has no entry in the list of users
+
+
+@pytest.fixture
+def open_folder():
+    """A folder in which everybody can replace what others have written."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o777)
+        if not all(each.stat().st_mode & stat.S_IXOTH for each in Path(folder).parents):
+            pytest.skip("others cannot reach the folder of temporary files")
+        yield Path(folder)
+
+
+@pytest.fixture
+def as_account(open_folder):
+    """Return a function that builds a kernel as another user, without HOME, and its output."""
+    become = [
+        *("setpriv", f"--reuid={ACCOUNT}", f"--regid={ACCOUNT}", "--clear-groups"),
+        *("--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search"),  # to read the package
+    ]
+    if (
+        not shutil.which("setpriv")
+        or subprocess.run([*become, "true"], capture_output=True).returncode
+    ):
+        pytest.skip("cannot become another user")
+
+    def formed(**variables):
+        done = subprocess.run(
+            [*become, sys.executable, "-c", BUILD],
+            env={"PATH": os.environ["PATH"], "PYTHONPATH": os.pathsep.join(sys.path)} | variables,
+            cwd=open_folder, capture_output=True, text=True, timeout=300,
+        )  # fmt: skip
+        assert (done.returncode, done.stderr) == (0, "")
+        return done.stdout
+
+    return formed
+
+
+@needs_pocl
 @pytest.mark.slow
-@pytest.mark.skipif(
-    all(info.platform != refusals.POCL for info in list_devices()), reason="PoCL is not here"
-)
+def test_an_account_without_a_home_needs_one_variable(as_account, open_folder):
+    own = open_folder / "own"
+    own.mkdir()
+    open_folder.chmod(0o1777)
+    os.chown(own, ACCOUNT, ACCOUNT)
+    own.chmod(0o755)
+    said = as_account()
+    assert "PoCL cannot be used: the cache folder ~/.cache/clsas" in said
+    assert "set the environment variable CLSAS_CACHE" in said
+    assert as_account(CLSAS_CACHE=str(own)) == "built\n"
+    assert list((own / "kernels").iterdir())
+    assert as_account(POCL_CACHE_DIR=str(own / "pocl")) == "built\n"
+    assert list((own / "pocl").iterdir())
+
+
+@needs_pocl
+@pytest.mark.slow
+@pytest.mark.parametrize("variable", ["POCL_CACHE_DIR", "CLSAS_CACHE", "XDG_CACHE_HOME", "HOME"])
+def test_kernels_of_a_folder_that_others_can_write_to_are_not_loaded(
+    as_account, open_folder, variable
+):
+    said = as_account(**{variable: str(open_folder)})
+    assert f"PoCL cannot be used: the cache folder {open_folder}" in said
+    assert f"other users can write to {open_folder}" in said
+    assert not list(open_folder.iterdir())
+
+
+@needs_pocl
+@pytest.mark.slow
 def test_a_command_without_a_cache_names_it(no_folder):
     for folder in (str(no_folder), "/dev/null"):
         said = in_a_process(BUILD, POCL_CACHE_DIR=folder, PYOPENCL_NO_CACHE="1")
-        assert f"PoCL cannot write its cache folder {folder!r}" in said
+        assert f"PoCL cannot be used: the cache folder {folder}" in said
 
 
 def test_the_command_line_prints_the_advice_line_by_line():
