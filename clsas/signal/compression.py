@@ -24,7 +24,12 @@ from clsas.sonar.system import Pulse
 Window = str | float | tuple
 
 # Width, in bandwidths, of the edges that the band of the filter gets when the filter is truncated.
+# They are wider if the filter would otherwise need a padding longer than this many recordings.
 _BAND_EDGE = 0.1
+_MOST_PADDING = 8
+# Least product of bandwidth and duration of a recording. Below it, lines have one or two samples
+# and lie within a tenth of a resolution cell. At half the value, the padding is twice as long.
+_LEAST_PRODUCT = 0.1
 # Power added to that of the pulse before the division by it, relative to the mean over the band.
 # Codes need it, whose spectra have zeros. For a chirp of 150 cycles, values from 1e-4 to 0.1 give
 # the same side lobes and noise to 0.1 dB.
@@ -62,7 +67,8 @@ def compress(
         ratio of whole numbers, for which `range_step_m` of the result is exact.
     bandwidth_hz : float, optional
         Width of the band that is kept, centred on the carrier, hertz. The default is that of the
-        pulse. It is required without a pulse, and must lie within the sampled band of a replica.
+        pulse. It is required without a pulse, must lie within the sampled band of a replica, and
+        must be at least 0.1 over the duration of the recording.
     replica : Replica, optional
         Measured pulse, which the matched filter uses instead of the nominal one of `echoes`.
     equalize : bool
@@ -85,8 +91,8 @@ def compress(
     ------
     TypeError, ValueError
         If an argument has the wrong type or is outside its limits, the band is not within the
-        sampled band, the recording is not longer than the pulse, or the lines do not fit into
-        memory.
+        sampled band or too narrow for the recording, the recording is not longer than the pulse, or
+        the lines do not fit into memory.
 
     See Also
     --------
@@ -139,7 +145,8 @@ def compress(
             f"got {(echoes.length - 1) / rate:g} s"
         )
 
-    fade = EDGE_PRODUCT * rate / (_BAND_EDGE * band)
+    edge = max(_BAND_EDGE * band, EDGE_PRODUCT * rate / (_MOST_PADDING * echoes.length))
+    fade = EDGE_PRODUCT * rate / edge
     wanted = float(oversampling) * band / rate
     budget, cause = validate.Budget(), "oversampling" if wanted > 1 else "bandwidth_hz"
     budget.take(cause, 8 * echoes.channels * whole * wanted)
@@ -151,15 +158,17 @@ def compress(
     padded, resampled = units * ratio.denominator, units * ratio.numerator
     length = int(whole * ratio + 1e-9) + 1
 
-    outermost = math.ceil((0.5 + _BAND_EDGE) * band * padded / rate)
-    # If the edges of the filter do not fit, compute twice as many points and keep every other one.
-    every = 1 if resampled > 2 * outermost else 2
+    outermost = math.ceil((0.5 * band + edge) * padded / rate)
+    # If the edges of the filter do not fit, compute more points, and keep one of `every`.
+    every = -(-(2 * outermost + 1) // resampled)
     rows = min(max(1, _BLOCK // max(padded, every * resampled)), echoes.channels)
     in_work = 16 * (rows + _FFT_LINES) * (padded + every * resampled)
     in_work += _BYTES_MIXED * rows * echoes.length + _BYTES_FILTERED * 2 * outermost
     budget.take(cause, 0, passing_bytes=in_work)
     bins = np.arange(-outermost, outermost + 1)
-    response = _filter_response(pulse, band, weights, bins, padded / rate, echoes.length / rate)
+    response = _filter_response(
+        pulse, band, edge, weights, bins, padded / rate, echoes.length / rate
+    )
     response *= every * resampled / padded
 
     samples = np.empty((echoes.channels, length), np.complex64)
@@ -252,14 +261,27 @@ def _band(echoes: Echoes, bandwidth_hz: float | None, replica: Replica | None) -
             )
     if replica is not None:
         limit = min(limit, replica.sample_rate_hz)
-    return validate.number("bandwidth_hz", bandwidth_hz, "Hz", above=0.0, most=limit)
+    band = validate.number("bandwidth_hz", bandwidth_hz, "Hz", above=0.0, most=limit)
+    least = least_bandwidth_hz(echoes.length, echoes.sample_rate_hz)
+    if band < least:
+        raise ValueError(
+            f"bandwidth_hz must be at least {least:.4g} Hz, a tenth over the duration of the "
+            f"recording ({echoes.length / echoes.sample_rate_hz:.4g} s), got {band:g} Hz"
+        )
+    return band
+
+
+def least_bandwidth_hz(length: int, sample_rate_hz: float) -> float:
+    """Return the narrowest band to which recordings of `length` samples can be compressed."""
+    return _LEAST_PRODUCT * sample_rate_hz / length
 
 
 def _fraction(ratio: float) -> Fraction:
     """Return a fraction of small whole numbers that approximates a ratio to 1e-6."""
     if ratio > 1:
         return Fraction(ratio).limit_denominator(1000)
-    return 1 / Fraction(1 / ratio).limit_denominator(1000)
+    # A transform has at least as many points as the numerator, which is about 1e6 at most.
+    return 1 / Fraction(1 / ratio).limit_denominator(min(max(1, int(1e6 * ratio)), 1000))
 
 
 def _equalized(
@@ -283,6 +305,7 @@ def _equalized(
 def _filter_response(
     pulse: Pulse | Replica | None,
     band: float,
+    edge: float,
     weights: Callable[[NDArray], NDArray],
     bins: NDArray[np.int_],
     period_s: float,
@@ -303,7 +326,7 @@ def _filter_response(
     # The phase of P changes with frequency at most at the rate of its duration. Windows have a few
     # cycles over the band.
     rate = 8 / band + (0.0 if pulse is None else pulse.duration_s)
-    points = fft.next_fast_len(math.ceil(1.25 * band * period_s))
+    points = fft.next_fast_len(math.ceil((1.05 * band + 2 * edge) * period_s))
     lag = fft.fftfreq(points) * period_s
     impulse = fourier_integral(matched, edges, lag, sign=1, rate=rate)
     total = fourier_integral(energy, edges, 0.0, sign=1, rate=rate).real

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from clsas.core import validate
 from clsas.core.lines import RangeLines
-from clsas.signal.compression import Window, compress
+from clsas.signal.compression import Window, compress, least_bandwidth_hz
 from clsas.signal.echoes import Echoes
 
 
@@ -103,6 +103,12 @@ def from_full_matrix(
             f"carrier_hz must be at most a quarter of the sample rate, {rate_hz / 4:g} Hz, for a "
             f"band of twice the carrier, got {carrier_hz:g} Hz: give bandwidth_hz, at most "
             f"{rate_hz - 2 * carrier_hz:g} Hz"
+        )
+    least = least_bandwidth_hz(samples.shape[-1], rate_hz)
+    if bandwidth_hz is None and 2 * carrier_hz < least:
+        raise ValueError(
+            f"carrier_hz must be at least {least / 2:.4g} Hz for a band of twice the carrier and "
+            f"samples of {samples.shape[-1] / rate_hz:.4g} s, got {carrier_hz:g} Hz"
         )
     last_s = abs(start_s) + samples.shape[-1] / rate_hz
     validate.phase(carrier_hz, speed, speed / 2 * last_s)

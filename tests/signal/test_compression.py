@@ -15,6 +15,7 @@ from clsas.simulation.simulator import simulate
 from clsas.sonar.system import Pulse, Sonar
 from clsas.sonar.track import Track
 
+compression = importlib.import_module("clsas.signal.compression")
 C = 1500.0
 CARRIER = 1e6
 BAND = 100e3
@@ -268,13 +269,48 @@ def test_sampling_below_and_at_the_bandwidth():
     )
 
 
+@pytest.mark.parametrize("cycles", [0.1, 0.3, 1.0, 3.0, 11.0, 30.0])
+@pytest.mark.parametrize("length", [1, 7, 500])
+def test_narrow_bands_are_the_direct_convolution(length, cycles, monkeypatch):
+    """Bands of few cycles over the recording give exact lines, with a bounded padding."""
+    rate = 200e3
+    band = min(cycles * rate / length, rate)
+    rng = np.random.default_rng(length)
+    samples = rng.standard_normal((1, length)) + 1j * rng.standard_normal((1, length))
+    echoes = Echoes(samples, 0.0, rate, CARRIER, [0, 0, 0], [0, 0, 0], C)
+    padded = []
+    fft = compression.fft.fft
+    monkeypatch.setattr(
+        compression.fft, "fft", lambda x, *n, **more: padded.extend(n) or fft(x, *n, **more)
+    )
+    lines = compress(echoes, bandwidth_hz=band, oversampling=2)
+    assert max(padded) < 32 * length + 64
+    delay = (2 / C * ranges(lines)[0])[:, None] - np.arange(length) / rate
+    expected = band / rate * np.sinc(band * delay) @ samples[0]
+    assert db(lines.samples[0] - expected, expected) < -110
+
+
+@pytest.mark.parametrize("rate_over_band", [9950.0503, 99012.345])
+def test_awkward_ratios_of_rates_do_not_lengthen_transforms(rate_over_band, monkeypatch):
+    """The ratio is a fraction accurate to 1e-6, and not a more accurate one of larger numbers."""
+    echoes = Echoes(np.ones((1, 10000), complex), 0, 200e3, CARRIER, [0, 0, 0], [0, 0, 0], C)
+    padded = []
+    fft = compression.fft.fft
+    monkeypatch.setattr(
+        compression.fft, "fft", lambda x, *n, **more: padded.extend(n) or fft(x, *n, **more)
+    )
+    lines = compress(echoes, bandwidth_hz=200e3 / rate_over_band, oversampling=1)
+    assert max(padded) < 1.1e6
+    assert lines.range_step_m == pytest.approx(C / 2 / 200e3 * rate_over_band, rel=1e-6)
+
+
 def test_channels_in_blocks_progress_and_fields(monkeypatch):
     sonar = Sonar(PULSES["up"], [[0.3, 0, 0], [-0.3, 0, 0]])
     track = Track.straight([0, 0, 0], [1, 0, 0], 3, 0.1)
     echoes = simulate(sonar, track, PointTargets([[0, 40, 0]]), motion_in_flight=True)
     whole = compress(echoes)
     calls = []
-    monkeypatch.setattr(importlib.import_module("clsas.signal.compression"), "_BLOCK", 1)
+    monkeypatch.setattr(compression, "_BLOCK", 1)
     parts = compress(echoes, progress=lambda *done: calls.append(done))
     assert calls == [(i + 1, 6) for i in range(6)]
     np.testing.assert_array_equal(whole.samples, parts.samples)
@@ -304,7 +340,12 @@ GOOD = Echoes(np.zeros((2, 900), complex), 0.0, 200e3, CARRIER, [0, 0, 0], [0, 0
         ({"echoes": None}, TypeError, "echoes must be of type Echoes, got NoneType"),
         ({"progress": 1}, TypeError, "progress must be a function or None, got 1"),
         ({"oversampling": 1e12}, ValueError, "oversampling must be finite and >= 1 and <= 10000"),
-        ({"bandwidth_hz": 1e-300}, ValueError, "bandwidth_hz must ask for at most .* GiB"),
+        (
+            {"bandwidth_hz": 1e-300},
+            ValueError,
+            r"bandwidth_hz must be at least 22.22 Hz, a tenth over .* \(0.0045 s\), got 1e-300 Hz",
+        ),
+        ({"bandwidth_hz": 22}, ValueError, "bandwidth_hz must be at least 22.22 Hz, .* got 22 Hz"),
         ({"bandwidth_hz": 300e3}, ValueError, "bandwidth_hz must be .* <= 200000 Hz, got 300000"),
         ({"bandwidth_hz": 0}, ValueError, "bandwidth_hz must be finite and > 0 .*, got 0"),
         ({"bandwidth_hz": None}, ValueError, "bandwidth_hz must be given for echoes without"),
