@@ -11,9 +11,12 @@ from typing import Any
 
 from clsas.core import validate
 
-# Memory that parsing one byte of TOML or JSON may take. The worst case is an empty list: "[],"
-# becomes 64 bytes in Python.
-_PARSED_BYTES = 32
+# Most memory that parsing one byte takes, which tests/core/test_reading.py measures. The worst cases
+# are empty lists in JSON, nested tables in TOML, one long heading over columns, and short rows.
+JSON_BYTES = 32
+TOML_BYTES = 500
+COLUMNS_BYTES = 40
+ROWS_BYTES = 100
 _NOT_ORDINARY = {
     stat.S_ISFIFO: "a pipe",
     stat.S_ISSOCK: "a socket",
@@ -33,8 +36,10 @@ def check_ordinary(path: str | os.PathLike) -> None:
             raise ValueError(f"{os.fspath(path)} must be an ordinary file, got {kind}")
 
 
-def read_bytes(path: str | os.PathLike) -> bytes:
+def read_bytes(path: str | os.PathLike, parsed_bytes: int = JSON_BYTES) -> bytes:
     """Return the contents of an ordinary file that is to be parsed.
+
+    `parsed_bytes` is the memory that parsing may take per byte of the file.
 
     Raises
     ------
@@ -45,17 +50,17 @@ def read_bytes(path: str | os.PathLike) -> bytes:
     """
     path = Path(path)
     check_ordinary(path)
-    validate.memory(str(path), _PARSED_BYTES * path.stat().st_size)
+    validate.memory(str(path), parsed_bytes * path.stat().st_size)
     return path.read_bytes()
 
 
-def read_text(path: str | os.PathLike) -> str:
+def read_text(path: str | os.PathLike, parsed_bytes: int) -> str:
     """Return the text of an ordinary file in UTF-8, with or without a byte-order mark.
 
     Raises ValueError if it is not UTF-8, and as `read_bytes` does.
     """
     try:
-        return read_bytes(path).decode("utf-8-sig")
+        return read_bytes(path, parsed_bytes).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(
             f"{os.fspath(path)} must be text in UTF-8, got the byte "

@@ -220,7 +220,7 @@ class _Parameters:
 def _rows(path: Path, first: int, last: int) -> list[list[str]]:
     """Return the rows of a CSV file. The first is skipped if columns first to last lack numbers."""
     try:
-        text = reading.read_bytes(path).decode("utf-8-sig")
+        text = reading.read_bytes(path, reading.ROWS_BYTES).decode("utf-8-sig")
         rows = [row for row in csv.reader(text.splitlines()) if row]
     except (ValueError, csv.Error) as error:
         raise FileFormatError(f"{path} is not a table: {error}") from None

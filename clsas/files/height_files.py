@@ -56,7 +56,7 @@ def read_heights(path: str | os.PathLike, shape: tuple[int, ...]) -> NDArray[np.
 
 def _from_csv(path: Path) -> NDArray:
     try:
-        text = reading.read_bytes(path).decode("utf-8-sig")
+        text = reading.read_bytes(path, reading.COLUMNS_BYTES).decode("utf-8-sig")
         if not text.strip():
             raise ValueError("the file is empty")
         return np.loadtxt(io.StringIO(text), np.float64, delimiter=",", ndmin=2)

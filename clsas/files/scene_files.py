@@ -105,7 +105,9 @@ def read_scene(path: str | os.PathLike) -> SceneFile:
         If the file cannot be read.
     """
     path = Path(path)
-    return parse_scene(reading.read_bytes(path), name=str(path), folder=path.parent)
+    return parse_scene(
+        reading.read_bytes(path, reading.TOML_BYTES), name=str(path), folder=path.parent
+    )
 
 
 def parse_scene(text: bytes, *, name: str, folder: Path) -> SceneFile:
