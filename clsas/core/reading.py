@@ -11,7 +11,7 @@ from typing import Any
 
 from clsas.core import validate
 
-# Most memory that parsing one byte takes, which tests/core/test_reading.py measures. The worst cases
+# Most memory that parsing a byte takes, which tests/core/test_reading.py measures. The worst cases
 # are empty lists in JSON, nested tables in TOML, one long heading over columns, and short rows.
 JSON_BYTES = 32
 TOML_BYTES = 500

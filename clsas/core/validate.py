@@ -85,7 +85,8 @@ def number(
     scalar: Any = value
     if getattr(value, "ndim", None) == 0:
         scalar = scalar[()]
-    if isinstance(scalar, bool) or not isinstance(scalar, Real) or np.ma.is_masked(value):
+    is_real = isinstance(scalar, Real) and not isinstance(scalar, (bool, np.timedelta64))
+    if not is_real or np.ma.is_masked(value):
         kind = f"number in {unit}" if unit else "number"
         raise TypeError(f"{name} must be one real {kind}, got {shown(value)}")
     try:

@@ -175,6 +175,7 @@ def _find_peak(
     """Return row and column of the largest pixel near coordinates on the axes."""
     if search_m is not None:
         validate.positive("search_m", search_m, "m")
+        validate.number("search_m", search_m, "m", most=validate.FARTHEST_M)
     windows = []
     for axis, at in zip(axes, near_m, strict=True):
         count, index = len(axis.places_m), (at - axis.places_m[0]) / axis.step_m
@@ -213,6 +214,11 @@ def _find_peak(
 def on_axes(grid: Grid, axes: tuple[Axis, Axis], near: Sequence[float]) -> NDArray[np.float64]:
     """Return the coordinates on the axes, in metres, of two numbers or of a position."""
     position_m = validate.array("near", near, np.float64, None)
+    if not np.all(np.abs(position_m) <= validate.FARTHEST_M):
+        raise ValueError(
+            f"near must lie within {validate.FARTHEST_M:g} m of the origin, got "
+            f"{validate.shown(near)}"
+        )
     if position_m.shape != (3,):
         return validate.array("near", position_m, np.float64, (2,))
     origin_m, row_step_m, column_step_m = grid.vectors_m

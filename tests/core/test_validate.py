@@ -1,6 +1,7 @@
 import re
 import subprocess
 import sys
+from datetime import timedelta
 from fractions import Fraction
 
 import numpy as np
@@ -35,7 +36,9 @@ def test_number_takes_every_real_number(value):
     "value",
     [
         *(True, np.True_, np.array(True), "fast", "3", b"3", None, [1.0, 2.0], [3.0], np.ones(1)),
-        *(1j, np.complex64(1), np.ma.masked, np.datetime64("now")),
+        *(1j, np.complex64(1), np.ma.masked, np.datetime64("now"), timedelta(seconds=1)),
+        # NumPy's durations are integers, too.
+        *(np.timedelta64(1, "s"), np.timedelta64(1), np.timedelta64("NaT"), np.array(1, "m8[ms]")),
     ],
 )
 def test_number_refuses_other_kinds(value):

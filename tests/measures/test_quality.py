@@ -228,6 +228,10 @@ def test_takes_the_greatest_pixel_within_the_search():
         ({"extent_m": 1e-9}, r"extent_m must be finite and >= 0\.01 m, got 1e-09"),
         ({"extent_m": 0}, r"extent_m must be finite and >= 0\.01 m, got 0"),
         ({"search_m": -1}, "search_m must be finite and > 0 m"),
+        ({"search_m": 1e308}, r"search_m must be finite and <= 1e\+09 m, got 1e\+308"),
+        ({"search_m": 1e10}, r"search_m must be .* <= 1e\+09 m, got 1e\+10"),
+        ({"near": (1e308, AT[1])}, r"near must lie within 1e\+09 m of the origin, got \(1e\+308"),
+        ({"near": (-1.7e308,) * 3}, r"near must lie within 1e\+09 m of the origin"),
     ],
 )
 def test_bad_input_is_named(change, words):

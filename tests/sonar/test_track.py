@@ -183,6 +183,13 @@ def test_bad_track(arguments, error, message):
         ({"pings": 0}, ValueError, "pings must be at least 1, got 0"),
         ({"pings": 2.5}, TypeError, "pings must be a whole number, got 2.5"),
         ({"ping_interval_s": 0}, ValueError, "ping_interval_s must be finite and > 0 s, got 0"),
+        (
+            {"ping_interval_s": np.timedelta64(1, "s")},
+            TypeError,
+            r"ping_interval_s must be one real number in s, got np.timedelta64\(1,'s'\)",
+        ),
+        ({"sway_m": np.timedelta64(1, "s")}, TypeError, "sway_m must be real numbers"),
+        ({"pings": np.timedelta64(5, "ms")}, TypeError, "pings must be a whole number"),
         ({"sway_m": [0.0, 1.0]}, ValueError, r"sway_m must have shape \(5\).* got \(2,\)"),
         ({"heave_m": lambda t: t[:2]}, ValueError, r"heave_m must have shape \(5\)"),
         ({"roll_rad": lambda t: np.full(5, np.nan)}, ValueError, "roll_rad must be finite"),
