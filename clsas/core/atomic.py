@@ -60,10 +60,10 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 
 @contextmanager
 def assembling(path: str | os.PathLike) -> Iterator[Path]:
-    """Yield a temporary folder in which `path` is assembled; rename the file to `path` on success.
+    """Yield the path of a file to write in a temporary folder; rename it to `path` on success.
 
-    The file must have the name of `path` in that folder, where programs may replace it and keep
-    files of their own. Everything else is as for `replacing`.
+    Programs may replace the file and keep files of their own in that folder. Everything else is as
+    for `replacing`.
 
     Raises
     ------
@@ -73,8 +73,8 @@ def assembling(path: str | os.PathLike) -> Iterator[Path]:
     path, before = _target(Path(path))
     with _temporary(path, Path.mkdir) as (folder, _):
         folder.chmod(stat.S_IRWXU)  # nobody else can read the file before it has its mode
-        yield folder
         made = folder / path.name
+        yield made
         descriptor = _open(made)
         try:
             if before is not None:

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.core import validate
 from clsas.core.atomic import assembling
 from clsas.core.extras import needed
 from clsas.core.lines import RangeLines
@@ -102,7 +103,7 @@ def write(
     Raises
     ------
     ValueError
-        If the grid is vertical, or the source is damaged or changes.
+        If the grid is vertical, the source is damaged or changes, or UTF-8 cannot encode the path.
     OSError
         If the file cannot be written, for example on a full disk.
     ImportError
@@ -111,13 +112,13 @@ def write(
     with needed("GeoTIFF files"):
         import rasterio
     colours = colour_table(options.colour_map) if options.kind == "8bit" else None
-    with assembling(path) as folder, rasterio.Env(GDAL_CACHEMAX=_CACHE_MB):
+    with assembling(path) as made, rasterio.Env(GDAL_CACHEMAX=_CACHE_MB):
+        validate.text("path of a GeoTIFF", str(made))  # rasterio encodes it as UTF-8
+        folder = made.parent
         bands = bands_of(source, options.kind)
         check_space(folder, len(bands) * _SPACE_BYTES[options.kind] * source.grid.size)
         try:
-            _Export(folder, source, bands, options, progress).write(
-                folder / path.name, tags, colours
-            )
+            _Export(folder, source, bands, options, progress).write(made, tags, colours)
         except Exception as error:
             if not type(error).__module__.startswith("rasterio"):
                 raise

@@ -315,6 +315,30 @@ def test_files_that_cannot_be_written_leave_nothing(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_link_stays_and_the_file_behind_it_is_replaced(tmp_path):
+    image, _ = scene(UTM_NORTH)
+    (tmp_path / "link.tif").symlink_to(tmp_path / "image.tif")
+    clsas.export(image, tmp_path / "link.tif")
+    assert (tmp_path / "link.tif").is_symlink()
+    with rasterio.open(tmp_path / "image.tif") as file:
+        assert file.shape == image.pixels.shape
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["image.tif", "link.tif"]
+
+
+@pytest.mark.parametrize("name", [b"a\xff.tif", b"\x80/image.tif", b"link.tif"])
+def test_names_that_are_not_utf8_are_refused_by_name(tmp_path, name):
+    """GDAL's Python packages cannot pass on bytes that UTF-8 cannot decode."""
+    path = tmp_path / os.fsdecode(name)
+    path.parent.mkdir(exist_ok=True)
+    if path.name == "link.tif":
+        path.symlink_to(tmp_path / os.fsdecode(b"\xc3x.tif"))
+    before = sorted(path.parent.iterdir())
+    grid = clsas.Grid.plane((0, 2, 21), (40, 41, 11), georeference=local(90.0))
+    with pytest.raises(ValueError, match=r"path of a GeoTIFF must be text of Unicode .*\\udc"):
+        clsas.export(clsas.Image(np.ones(grid.shape, complex), grid), path)
+    assert sorted(path.parent.iterdir()) == before
+
+
 @pytest.mark.parametrize("share", ["0.4", *also("0.1", "0.9")])
 def test_a_killed_export_leaves_no_file_and_is_cleared_away(tmp_path, share):
     done = subprocess.run([sys.executable, "-c", PROGRAM, tmp_path / "a.tif", share])
