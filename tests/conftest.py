@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 import warnings
+from pathlib import Path
 
 import hypothesis
 import numpy as np
@@ -91,6 +92,17 @@ def platform(request):
 def device(request):
     """Every platform's first device, and a CPU also with other vector widths."""
     return variant(*request.param)
+
+
+@pytest.fixture(scope="session")
+def without_grids():
+    """PROJ without grids of datum shifts, as its wheel installs it."""
+    pyproj = pytest.importorskip("pyproj")
+    if pyproj.network.is_network_enabled():
+        pytest.skip("PROJ fetches grids")
+    folders = [pyproj.datadir.get_user_data_dir(), *pyproj.datadir.get_data_dir().split(os.pathsep)]
+    if any(True for folder in folders for _ in Path(folder).glob("*.tif")):
+        pytest.skip("PROJ has grids here")
 
 
 def pytest_sessionstart(session):

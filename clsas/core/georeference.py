@@ -280,15 +280,14 @@ class Georeference:
             projection.
         ImportError
             If pyproj is not installed (extra `maps`).
+
+        Warns
+        -----
+        ClsasWarning
+            If PROJ lacks the grid of a datum shift that would be more accurate there.
         """
-        place_m = self.to_map(positions_m)
-        easting_m, northing_m = place_m[..., 0], place_m[..., 1]
-        longitude, latitude = self._transformer().transform(
-            easting_m, northing_m, direction="INVERSE"
-        )
-        found = np.stack([latitude, longitude, place_m[..., 2]], axis=-1)
-        if not np.isfinite(found).all():
-            raise ValueError(f"positions_m must lie within the map of {self}")
+        found = geographic(self, positions_m)
+        self._warn_of_missing_grid(found)
         return found
 
     def from_geographic(
@@ -311,6 +310,11 @@ class Georeference:
         ImportError
             If pyproj is not installed (extra `maps`).
 
+        Warns
+        -----
+        ClsasWarning
+            As for `to_geographic`.
+
         Examples
         --------
         >>> import clsas
@@ -321,10 +325,11 @@ class Georeference:
         latitude, longitude = projections.checked(latitude_deg, longitude_deg)
         height = validate.array("height_m", height_m, np.float64, None)
         latitude, longitude, height = projections.alike(latitude, longitude, height)
-        easting_m, northing_m = self._transformer().transform(longitude, latitude)
+        easting_m, northing_m = projections.to_map(self.map_crs()).transform(longitude, latitude)
         place_m = np.stack([easting_m, northing_m, height], axis=-1)
         if not np.isfinite(place_m).all():
             raise ValueError(f"latitude_deg and longitude_deg must lie within the map of {self}")
+        self._warn_of_missing_grid(np.stack([latitude, longitude], axis=-1))
         return self.from_map(place_m)
 
     def convergence_deg(
@@ -422,12 +427,24 @@ class Georeference:
             sine, cosine = cosine, -sine
         return np.array([[sine, cosine], [-cosine, sine]])
 
-    def _transformer(self) -> pyproj.Transformer:
-        """Return the transform from longitude and latitude to easting and northing."""
-        crs = self.map_crs()  # raises if pyproj is missing
-        import pyproj
+    def _warn_of_missing_grid(self, geographic_deg: NDArray[np.float64]) -> None:
+        """Warn if PROJ lacks a better datum shift at the first of latitudes and longitudes."""
+        if self.is_projected and geographic_deg.size:
+            latitude, longitude = geographic_deg.reshape(-1, geographic_deg.shape[-1])[0, :2]
+            projections.warn_of_missing_grid(self.map_crs(), str(self), latitude, longitude)
 
-        return pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+
+def geographic(place: Georeference, positions_m: ArrayLike) -> NDArray[np.float64]:
+    """Return what `Georeference.to_geographic` does, and leave out its warning."""
+    place_m = place.to_map(positions_m)
+    easting_m, northing_m = place_m[..., 0], place_m[..., 1]
+    longitude, latitude = projections.to_map(place.map_crs()).transform(
+        easting_m, northing_m, direction="INVERSE"
+    )
+    found = np.stack([latitude, longitude, place_m[..., 2]], axis=-1)
+    if not np.isfinite(found).all():
+        raise ValueError(f"positions_m must lie within the map of {place}")
+    return found
 
 
 class Recorded(Protocol):

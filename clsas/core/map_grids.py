@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core import projections, validate
-from clsas.core.georeference import Georeference
+from clsas.core.georeference import Georeference, geographic
 from clsas.core.grid import Grid
 
 Affine = tuple[float, float, float, float, float, float]
@@ -119,7 +119,7 @@ def warn_of_place(grid: Grid) -> None:
     hint = "; check the coordinate reference system, and that x and y are easting and northing"
     crs = place.map_crs()
     try:
-        latitude, longitude, _ = place.to_geographic(np.mean(grid.bounds_m, axis=0))
+        latitude, longitude, _ = geographic(place, np.mean(grid.bounds_m, axis=0))
     except ValueError:
         validate.warn(f"the middle of the grid is outside the map of {place}{hint}")
         return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -134,6 +135,50 @@ def scale_of(crs: pyproj.CRS, latitude_deg: float, longitude_deg: float) -> floa
 
     factors = pyproj.Proj(crs).get_factors(longitude_deg, latitude_deg)
     return max(factors.meridional_scale, factors.parallel_scale, key=lambda scale: abs(scale - 1))
+
+
+def to_map(crs: pyproj.CRS) -> pyproj.Transformer:
+    """Return the transform from longitude and latitude (WGS 84) to easting and northing."""
+    import pyproj
+
+    return pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+
+
+def warn_of_missing_grid(
+    crs: pyproj.CRS, name: str, latitude_deg: float, longitude_deg: float
+) -> None:
+    """Warn if PROJ lacks the grid of a datum shift that is better than the one it uses at a place.
+
+    Warns
+    -----
+    ClsasWarning
+        The message states both accuracies and the grid.
+    """
+    from pyproj.transformer import AreaOfInterest, TransformerGroup
+
+    transform = to_map(crs)
+    transform.transform(longitude_deg, latitude_deg)
+    used_m = transform.get_last_used_operation().accuracy
+    if used_m == 0:  # no shift, as between WGS 84 and its UTM
+        return
+    there = AreaOfInterest(longitude_deg, latitude_deg, longitude_deg, latitude_deg)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # pyproj's own, without the accuracies
+        group = TransformerGroup("EPSG:4326", crs, always_xy=True, area_of_interest=there)
+    # PROJ gives -1 for an unknown accuracy, which is that of conversions without a datum shift.
+    limit_m = used_m if used_m > 0 else math.inf
+    better = [each for each in group.unavailable_operations if 0 <= each.accuracy < limit_m]
+    if not better:
+        return
+    best = min(better, key=lambda operation: operation.accuracy)
+    grids = [grid.short_name for grid in best.grids if not grid.available]
+    accuracy = f"an accuracy of {used_m:g} m" if used_m > 0 else "unknown accuracy"
+    validate.warn(
+        f"PROJ converts between WGS 84 and {name} with {accuracy} instead of {best.accuracy:g} m, "
+        f"because it lacks {' and '.join(grids)}: run "
+        f"{' and '.join(f'`pyproj sync --file {grid}`' for grid in grids)}, or set the environment "
+        "variable PROJ_NETWORK to ON"
+    )
 
 
 @lru_cache(maxsize=32)

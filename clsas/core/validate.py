@@ -92,7 +92,7 @@ def number(
     try:
         result = float(scalar)
     except OverflowError:  # an int or a fraction beyond float64
-        result = math.inf if scalar > 0 else -math.inf  # type: ignore[operator]
+        result = math.inf if scalar > 0 else -math.inf
     limits = []
     if above is not None:
         limits.append(f"> {above:g}")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
-from clsas.core.georeference import Georeference
+from clsas.core.georeference import Georeference, geographic
 from clsas.core.grid import Grid
 from clsas.maps.orientation import Orientation
 
@@ -100,8 +100,8 @@ class Raster:
         import sarkit.wgs84
 
         place, centre_m = self.georeference, self.positions_m(self.centre)
-        places = place.to_geographic(self.positions_m(self.corners))
-        middle, middle_m = place.to_geographic(centre_m), ecf_m(place, centre_m)
+        places = geographic(place, self.positions_m(self.corners))
+        middle, middle_m = geographic(place, centre_m), ecf_m(place, centre_m)
         radar_m = polynomial.polyval(time_s, track)
         velocity_m_s = polynomial.polyval(time_s, polynomial.polyder(track))
         normal = np.cross(velocity_m_s, middle_m - radar_m)
@@ -126,4 +126,4 @@ def ecf_m(place: Georeference, positions_m: NDArray[np.float64]) -> NDArray[np.f
     """Return earth-centred, earth-fixed coordinates of positions [..., 3], metres."""
     import sarkit.wgs84
 
-    return sarkit.wgs84.geodetic_to_cartesian(place.to_geographic(positions_m))
+    return sarkit.wgs84.geodetic_to_cartesian(geographic(place, positions_m))

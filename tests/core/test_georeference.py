@@ -1,5 +1,6 @@
 """Georeferences: conversions against PROJ's geodesics, and what is refused."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -174,3 +175,54 @@ def test_pixels_of_a_north_up_grid_are_no_larger_than_the_grid():
     for pixel_m in (1e-6, 5e-324):
         with pytest.raises(ValueError, match=r"pixel_m must ask for at most .* memory"):
             place.north_up(grid, pixel_m)
+
+
+@pytest.mark.parametrize(
+    ("crs", "latitude", "longitude", "used_m", "best_m", "grid"),
+    [
+        ("EPSG:27700", 52.0, -1.5, 2, 1, "uk_os_OSTN15_NTv2_OSGBtoETRS.tif"),
+        ("EPSG:31467", 50.0, 9.0, 3, 1, "de_adv_BETA2007.tif"),
+        ("EPSG:26710", 40.1, -122.0, 7, 2, "ca_nrc_ntv2_0.tif"),
+        ("EPSG:26910", 40.0, -123.0, 4, 2, "us_noaa_cnhpgn.tif"),
+        ("EPSG:7405", 52.0, -1.5, 2, 1, "uk_os_OSTN15_NTv2_OSGBtoETRS.tif"),
+    ],
+)
+def test_a_datum_shift_without_its_grid_is_a_warning(
+    crs, latitude, longitude, used_m, best_m, grid, without_grids
+):
+    place = clsas.Georeference.projected(crs)
+    said = (
+        rf"between WGS 84 and {crs} with an accuracy of {used_m} m instead of {best_m} m, "
+        rf"because it lacks {grid}: run `pyproj sync --file {grid}`, or .* PROJ_NETWORK"
+    )
+    with pytest.warns(clsas.ClsasWarning, match=said) as caught:
+        at_m = place.from_geographic(latitude, longitude, 0.0)
+    assert len(caught) == 1
+    with pytest.warns(clsas.ClsasWarning, match=said) as caught:
+        back = place.to_geographic([at_m, at_m])
+    assert len(caught) == 1
+    np.testing.assert_allclose(back[0], [latitude, longitude, 0], atol=1e-7)
+    with pytest.warns(clsas.ClsasWarning, match=said) as caught:
+        clsas.Track.from_geographic(
+            [latitude] * 3, [longitude] * 3, 0, 90.0, [0, 1, 2], georeference=place
+        )
+    assert len(caught) == 1
+
+
+@pytest.mark.parametrize(
+    ("crs", "latitude", "longitude"),
+    [
+        ("EPSG:32632", 60.0, 9.0),  # WGS 84
+        ("EPSG:3857", 60.0, 5.0),
+        ("EPSG:25832", 60.0, 9.0),  # ETRS 89, for which there is no grid
+        ("EPSG:28992", 52.0, 5.0),  # needs none
+        ("EPSG:21781", 47.0, 8.0),  # its grid would be no more accurate
+        ("EPSG:26910", 50.0, -123.0),  # its grids are those of other places
+        ("+proj=utm +zone=32 +ellps=GRS80", 50.0, 9.0),  # of unknown datum
+    ],
+)
+def test_the_best_known_datum_shift_is_no_warning(crs, latitude, longitude, without_grids):
+    place = clsas.Georeference.projected(crs)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        place.to_geographic(place.from_geographic(latitude, longitude, 0.0))

@@ -388,3 +388,12 @@ def test_a_full_disk_leaves_the_earlier_file(tmp_path, monkeypatch):
         clsas.export(image, tmp_path / "a.nitf", lines=lines)
     assert (tmp_path / "a.nitf").read_bytes() == b"earlier"
     assert [each.name for each in tmp_path.iterdir()] == ["a.nitf"]
+
+
+@pytest.mark.parametrize("name", ["image.nitf", "page"])
+def test_a_missing_grid_is_one_warning_of_an_export(name, tmp_path, without_grids):
+    place = clsas.Georeference.projected("EPSG:26710")  # NAD 27
+    lines = lines_of(place) if name == "image.nitf" else None
+    with pytest.warns(clsas.ClsasWarning, match="pyproj sync --file") as caught:
+        clsas.export(image_of(place), tmp_path / name, lines=lines)
+    assert len([each for each in caught if each.category is clsas.ClsasWarning]) == 1
