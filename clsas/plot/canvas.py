@@ -6,6 +6,10 @@ import os
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
 from clsas.core import validate
 from clsas.core.atomic import replacing
 from clsas.core.extras import needed
@@ -104,6 +108,23 @@ def with_fewer_colours(png: str | os.PathLike | BytesIO, colours: int) -> bytes:
         few = picture.convert("RGB").quantize(colours, dither=Image.Dither.NONE)
     few.save(reduced, format="png", optimize=True)
     return reduced.getvalue()
+
+
+def with_palette(png: BytesIO, palette: NDArray[np.uint8]) -> bytes:
+    """Return a PNG whose pixels have the nearest of up to 256 colours, uint8 [colours, 3].
+
+    Unlike with `with_fewer_colours`, colours of few pixels are kept.
+    """
+    from PIL import Image
+
+    with Image.open(png) as picture:
+        pixels = np.asarray(picture.convert("RGB"))
+    nearest = KDTree(palette).query(pixels)[1].astype(np.uint8)
+    reduced = Image.fromarray(nearest)
+    reduced.putpalette(palette.tobytes())
+    written = BytesIO()
+    reduced.save(written, format="png", optimize=True)
+    return written.getvalue()
 
 
 def figure_class() -> type[Figure]:

@@ -23,7 +23,7 @@ from clsas.plot.canvas import (
     length_unit,
     new_figure,
     plain_ticks,
-    with_fewer_colours,
+    with_palette,
 )
 from clsas.plot.colours import COLOUR_MAP, colour_map
 from clsas.plot.map_marks import draw_north, draw_scale_bar
@@ -44,7 +44,8 @@ _MOST_PIXELS = 1500  # pixels drawn along an axis; pictures have fewer dots
 _SAME_DB = 1e-3  # largest difference of levels that may come from rounding
 _COUNTED = 1 << 22  # most pixels from which percentiles are computed
 _WIDTH_IN = 7.0  # width of figures; about the height of those that are higher than wide
-_PREVIEW_IN, _PREVIEW_DPI, _PREVIEW_COLOURS = 4.5, 96.0, 64  # for 20 to 90 kB in a notebook
+_PREVIEW_IN, _PREVIEW_DPI = 4.5, 96.0  # for 10 to 100 kB in a notebook
+_PREVIEW_LEVELS, _PREVIEW_GREYS = 208, 48  # 0.3 dB each over 60 dB, and 48 for letters
 
 
 @dataclass(frozen=True)
@@ -256,10 +257,14 @@ def image_html(image: Image) -> str:
     if image.grid.points_m is not None or not is_installed("matplotlib"):
         return text
     figure = new_figure(*_size_in(image, _PREVIEW_IN), layout="compressed")
-    _draw_image(image, figure.subplots())
+    axes = _draw_image(image, figure.subplots())
+    axes.get_images()[0].set_interpolation_stage("data")  # mixed colours are not in the palette
     drawn = BytesIO()
     figure.savefig(drawn, format="png", dpi=_PREVIEW_DPI, bbox_inches="tight")
-    picture = base64.b64encode(with_fewer_colours(drawn, _PREVIEW_COLOURS)).decode()
+    shades = np.linspace(0, 1, _PREVIEW_GREYS)[:, None].repeat(3, axis=1)
+    colours = [colour_map(COLOUR_MAP)(np.linspace(0, 1, _PREVIEW_LEVELS))[:, :3], shades]
+    palette = np.rint(255 * np.concatenate(colours)).astype(np.uint8)
+    picture = base64.b64encode(with_palette(drawn, palette)).decode()
     return f'<div><img alt="Amplitude in dB" src="data:image/png;base64,{picture}">{text}</div>'
 
 

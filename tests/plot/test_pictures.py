@@ -250,6 +250,41 @@ def test_notebooks_show_a_small_picture():
     assert 250 < height < 600
 
 
+def test_notebooks_show_every_decibel_in_a_colour_of_its_own():
+    """Also levels of few pixels, in an image of which most is at the floor."""
+    from PIL import Image as Picture
+
+    grid = Grid.plane(x=(0, 3, 301), y=(40, 42, 201))
+    level_db = np.full(grid.shape, -60.0)
+    level_db[100:, :] = -(np.arange(301) // 5)  # stripes of 1 dB
+    page = Image(10 ** (level_db / 20) + 0j, grid)._repr_html_()
+    (encoded,) = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    pixels = np.asarray(Picture.open(io.BytesIO(base64.b64decode(encoded))).convert("RGB"))
+    expected = 255 * colour_map("inferno")(np.linspace(0, 1, 256))[:, :3]
+    row = pixels[len(pixels) // 4]  # in the upper half, across the stripes
+    shown = [int(np.abs(expected - each).sum(axis=1).argmin()) for each in row]
+    is_image = np.abs(expected[shown] - row).max(axis=1) <= 4
+    found_db = {round(60 * at / 255) for at, ok in zip(shown, is_image, strict=True) if ok}
+    assert set(range(1, 61)) <= found_db
+    colours = {tuple(each) for each, ok in zip(row, is_image, strict=True) if ok}
+    assert len(colours) >= 60
+    assert len(page) < 150_000
+
+
+def test_notebooks_mix_no_colours_where_pixels_share_a_dot():
+    """A mixture of black and yellow is on no colour map, and would be shown as grey."""
+    from PIL import Image as Picture
+
+    grid = Grid.plane(x=(0, 3, 600), y=(40, 43, 600))
+    levels = np.where(np.arange(600) % 2, 1.0, 1e-3)
+    page = Image(levels[:, None] * speckle(grid).pixels, grid)._repr_html_()
+    (encoded,) = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    pixels = np.asarray(Picture.open(io.BytesIO(base64.b64decode(encoded))).convert("RGB"))
+    inner = pixels[100:200, 100:200].reshape(-1, 3)
+    expected = 255 * colour_map("inferno")(np.linspace(0, 1, 256))[:, :3]
+    assert np.abs(expected - inner[:, None]).max(axis=2).min(axis=1).max() <= 4
+
+
 def test_notebooks_show_text_without_matplotlib_and_of_points(monkeypatch):
     points = Image(np.ones(4, complex), Grid.points(np.ones((4, 3))))
     assert points._repr_html_() == "<pre>Image(4 complex pixels, x 1 m, y 1 m, z 1 m)</pre>"
