@@ -57,9 +57,18 @@ def brightness(
     """
     if lines.channels < 2 * _LEAST_GROUP or lines.length < 2:
         return 1.0
+    if beam is None and len(grid.spread(_FEW)) < _FEW**2:
+        return 1.0  # a few pixels are dark by chance, which `clsas.signal.scatter` allows for
     group = min(_GROUP, lines.channels // 2)
-    starts = np.linspace(0, lines.channels - group, _GROUPS).astype(np.int64)
-    channels = starts[:, None] + np.arange(group)
+    centres_m = lines.phase_centres_m  # in any order
+    order = np.argsort(centres_m[:, np.ptp(centres_m, axis=0).argmax()], kind="stable")
+    middles = order[np.linspace(0, lines.channels - 1, 2 * _GROUPS + 1)[1::2].astype(np.int64)]
+    channels = np.stack(
+        [
+            np.argpartition(np.sum((centres_m - centres_m[each]) ** 2, axis=1), group - 1)[:group]
+            for each in middles
+        ]
+    )
     found = 1.0
     for most in (_FEW if beam is None else _SOME, _MANY):
         points_m = grid.spread(most)
@@ -67,7 +76,7 @@ def brightness(
         if found > _DARK:
             return 1.0
     # Echoes from beside the grid also cancel between groups.
-    whole = some_channels(lines.channels, _MOST)[None]
+    whole = order[some_channels(lines.channels, _MOST)][None]
     found = min(found, _of_groups(lines, whole, points_m, spectrum, beam, along))
     return max(found, _DARKEST)
 
