@@ -3,6 +3,7 @@
 import functools
 import hashlib
 import inspect
+import os
 import pickle
 import shutil
 from pathlib import Path
@@ -33,7 +34,7 @@ def kept(make):
         for other in FOLDER.iterdir():
             if other != state:
                 shutil.rmtree(other, ignore_errors=True)
-        partial = file.with_suffix(f".{id(made)}")
+        partial = file.with_name(f"{file.name}.{os.getpid()}")
         partial.write_bytes(pickle.dumps(made))
         partial.replace(file)  # so that no process reads half of it
         return made

@@ -33,8 +33,10 @@ class Item:
         return next(iter(self.iter_markers(name)), None)
 
 
-def config(tier, resume=False):
-    return SimpleNamespace(getoption={"tier": tier, "resume": resume}.get)
+def config(tier, resume=False, source=pytest.Config.ArgsSource.TESTPATHS, **options):
+    return SimpleNamespace(
+        getoption=({"tier": tier, "resume": resume} | options).get, args_source=source
+    )
 
 
 def test_each_tier_adds_to_the_one_before(monkeypatch):
@@ -58,21 +60,32 @@ def test_a_run_of_everything_continues_where_it_was_stopped(monkeypatch, tmp_pat
     items = [Item(nodeid=name) for name in names]
     everything, again = config("all"), config("all", resume=True)
     tiers.begin(everything)
-    for name, when, outcome in zip(
-        names, ("call", "call", "setup", "setup"), ("passed", "failed", "skipped", "passed"),
-        strict=True,
-    ):  # fmt: skip
+    outcomes = {
+        "a": {"setup": "passed", "call": "passed", "teardown": "passed"},
+        "b": {"setup": "passed", "call": "failed", "teardown": "passed"},
+        "c": {"setup": "skipped", "teardown": "passed"},
+        "d": {"setup": "passed", "call": "passed", "teardown": "failed"},
+    }
+    some = config("all", source=pytest.Config.ArgsSource.ARGS)
+    for name, (when, outcome) in (
+        (name, each)
+        for name, of_test in zip(names, outcomes.values(), strict=True)
+        for each in of_test.items()
+    ):
         report = SimpleNamespace(
             nodeid=name, when=when, passed=outcome == "passed", skipped=outcome == "skipped"
         )
-        tiers.keep(everything, report)
-        tiers.keep(config("change"), report)
-    tiers.begin(again)
+        for run in (config("change"), some, config("all", keyword="a"), everything):
+            tiers.keep(run, report)
+    for run in (again, some, config("all", collectonly=True)):
+        tiers.begin(run)
     assert tiers.left_out(again, items) == [items[0], items[2]]
-    monkeypatch.setattr(tiers, "_digest", lambda file: "of other code")
+    monkeypatch.setattr(tiers, "_digest", lambda: "of other code")
     assert tiers.left_out(again, items) == []
     tiers.begin(everything)
     assert not tiers.PASSED.exists()
+    with pytest.raises(pytest.UsageError, match="--resume requires --tier all"):
+        tiers.begin(config("change", resume=True))
 
 
 def git(folder, *arguments):

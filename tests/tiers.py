@@ -1,10 +1,9 @@
 """Which tests a run takes: three tiers, and tests of programs whose files have not changed.
 
-The tier is the least of those below that takes a test. A test without a mark is fast; `slow` ones
-run for every change, `exhaustive` ones only with `--tier all`. A test that is marked with
-`watches(path, ...)` runs for a change only if one of these files or folders, or its own, differs
-from the main branch. With `--resume`, a run of everything leaves out what passed in the one that it
-continues.
+Tests without a mark run in every tier, `slow` ones for every change and with all, and `exhaustive`
+ones only with all. A test that is marked with `watches(path, ...)` never runs in the fast tier, and
+for a change only if one of these files or folders, or its own, differs from the main branch. With
+`--resume`, a run of everything leaves out what passed in the one that it continues.
 """
 
 import hashlib
@@ -51,25 +50,39 @@ def left_out(config, items):
 
 def begin(config):
     """Forget what passed before, unless a run continues."""
-    if config.getoption("tier") == "all" and not config.getoption("resume"):
+    if config.getoption("resume") and config.getoption("tier") != "all":
+        raise pytest.UsageError("--resume requires --tier all")
+    if _is_whole(config) and not config.getoption("resume"):
         PASSED.unlink(missing_ok=True)
 
 
 def keep(config, report):
-    """Remember a test that passed, or that cannot run here."""
-    if config.getoption("tier") == "all" and (
-        report.skipped or (report.when == "call" and report.passed)
-    ):
+    """Remember a test that passed and left everything as it was, or that cannot run here."""
+    if not _is_whole(config):
+        return
+    if report.skipped or (report.when == "call" and report.passed):
+        _ending.add(report.nodeid)
+    elif report.when == "teardown" and report.passed and report.nodeid in _ending:
         PASSED.parent.mkdir(exist_ok=True)
         with PASSED.open("a") as file:
             file.write(_record(report.nodeid) + "\n")
 
 
+_ending: set[str] = set()  # names of tests that passed or were skipped, before they are cleared up
+
+
+def _is_whole(config):
+    """Whether a run takes all tests, not only those of some files or names."""
+    chosen = any(config.getoption(name) for name in ("keyword", "markexpr", "collectonly"))
+    is_given = config.args_source is pytest.Config.ArgsSource.ARGS
+    return config.getoption("tier") == "all" and not chosen and not is_given
+
+
 def summary(config):
-    """Return what ran, and how to run the rest."""
+    """Return the tier of what ran, and how to run the others."""
     ran = config.getoption("tier")
     others = ", ".join(name for tier, name in TIERS.items() if tier != ran)
-    return f"These were {TIERS[ran]}. There are also {others}."
+    return f"Tier: {TIERS[ran]}. Others: {others}."
 
 
 def _is_unchanged(item):
@@ -112,14 +125,17 @@ def _passed():
 
 
 def _record(nodeid):
-    """Return a test's name, with a digest of its file and of all that it may test."""
-    return f"{_digest(nodeid.split('::')[0])} {nodeid}"
+    """Return a test's name, with a digest of everything that it may test."""
+    return f"{_digest()} {nodeid}"
 
 
 @cache
-def _digest(file):
+def _digest():
+    """Return a digest of all files of the checkout that git knows or might add."""
     found = hashlib.sha256(package_digest())
-    found.update((ROOT / file).read_bytes())
+    for name in sorted(_git("ls-files", "--cached", "--others", "--exclude-standard") or []):
+        if (ROOT / name).is_file():
+            found.update((ROOT / name).read_bytes())
     return found.hexdigest()[:16]
 
 
@@ -142,6 +158,7 @@ def thinned(*axes, whole=()):
     are in `whole`, which run with all others.
     """
     axes = [list(axis) for axis in axes]
+    assert all(value in axes[0] for value in whole), "whole must have values of the first axis"
     longest = max(map(len, axes))
     often = {tuple(number % len(axis) for axis in axes) for number in range(longest)}
     return [
@@ -160,6 +177,8 @@ def name_of(value):
 
 def few(values, often):
     """Return parameters, of which only those in `often` run for every change."""
+    values = list(values)
+    assert all(value in values for value in often), "often must have some of the values"
     return [
         pytest.param(
             *(value if isinstance(value, tuple) else (value,)),
