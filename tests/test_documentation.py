@@ -49,6 +49,11 @@ def test_tutorials_and_figures_run(program):
         ("text", "5.4 m of 300 channels", "expected"),
         ("text", "5.4 cm", "expected"),
         ("text about", "9.2 cm of 200 channels", None),
+        ("text about", "2.8 cm of 590 channels", None),
+        ("text about", "2.6 cm of 300 channels", "expected"),
+        ("text about", "5.4 cm of 700 channels", "expected"),
+        ("text about", "-5.4 cm of 300 channels", "expected"),
+        ("text about", "0 cm of 300 channels", "expected"),
         ("text about", "5.4 m of 300 channels", "expected"),
     ],
 )
@@ -58,6 +63,13 @@ def test_what_pages_say_is_printed_is_compared(kind, said, fault, tmp_path):
     done = run_page(page)
     assert (done.returncode != 0) == (fault is not None), done.stderr
     assert (fault or "") in done.stderr
+
+
+@pytest.mark.parametrize(("said", "is_right"), [("90 s, 3 m", True), ("90 s, 9 m", False)])
+def test_times_of_about_blocks_are_not_compared(said, is_right, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f'```python\nprint("2.1 s, 3 m")\n```\n\n```text about\n{said}\n```\n')
+    assert (run_page(page).returncode == 0) == is_right
 
 
 def test_a_page_that_shows_a_picture_must_make_it(tmp_path):

@@ -15,7 +15,12 @@ from studies.navigating import (
 from tiers import few
 
 import clsas
-from clsas.navigation.echoes import block_products, independent_echoes
+from clsas.navigation.echoes import (
+    block_products,
+    independent_echoes,
+    strongest,
+    without_highlights,
+)
 from clsas.navigation.micronavigation import micronavigate
 
 NEAR_M, FAR_M = 12.0, 16.0
@@ -109,6 +114,20 @@ def test_echoes_are_counted():
         samples[np.arange(count) * 97 + 20] = 1.0
         points = window(samples)
         assert independent_echoes(points, points, 400.0, 1.0) == pytest.approx(count, rel=0.5)
+
+
+@pytest.mark.parametrize("brightness_db", [23.0, 25.0, 27.0])
+def test_speckle_beside_a_bright_reflector_is_no_gap(brightness_db):
+    """Its dips lie below a thousandth of the reflector's power."""
+    for seed in range(5):
+        random = np.random.default_rng(seed)
+        white = random.standard_normal((400, 2)) @ [1, 1j] / np.sqrt(2)
+        speckle = np.convolve(white, np.hanning(5)[1:-1], "same")
+        speckle[200] += 10 ** (brightness_db / 20) * np.std(speckle)
+        one = window(speckle)
+        largest = strongest([one])
+        weakened = without_highlights(one, largest)
+        assert independent_echoes(one, weakened, 200.0, largest) > 150
 
 
 @pytest.mark.parametrize("lag", [0, 3, -2])
