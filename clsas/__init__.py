@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from clsas import plot
     from clsas.core.contrast import contrast, entropy
+    from clsas.core.findings import Finding
     from clsas.core.georeference import Georeference
     from clsas.core.grid import Grid
     from clsas.core.image import Image
@@ -64,7 +65,7 @@ if TYPE_CHECKING:
     from clsas.simulation.simulator import simulate, simulate_lines
     from clsas.sonar.beam import BeamWindow
     from clsas.sonar.density import density_compensated, density_weights
-    from clsas.sonar.sampling import Finding, check_sampling
+    from clsas.sonar.sampling import check_sampling
     from clsas.sonar.system import Pulse, Sonar
     from clsas.sonar.track import Pointing, Track, channels
 
@@ -159,6 +160,7 @@ __all__ = [
 
 _MODULES = {
     "core.contrast": "contrast entropy",
+    "core.findings": "Finding",
     "core.georeference": "Georeference",
     "core.grid": "Grid",
     "core.image": "Image",
@@ -215,7 +217,7 @@ _MODULES = {
     "simulation.simulator": "simulate simulate_lines",
     "sonar.beam": "BeamWindow",
     "sonar.density": "density_compensated density_weights",
-    "sonar.sampling": "Finding check_sampling",
+    "sonar.sampling": "check_sampling",
     "sonar.system": "Pulse Sonar",
     "sonar.track": "Pointing Track channels",
 }

@@ -35,8 +35,8 @@ from clsas.measures.tradeoff import summary
 from clsas.opencl.device import Device, KernelTimes, open_device
 from clsas.planning.request import WORST_TOLERANCE_DB
 from clsas.plans.factorization import UNREACHED, ExactImage
+from clsas.signal.doubts import warn_before_imaging
 from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
-from clsas.sonar.looking import warn_before_imaging
 
 _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is reported
 
@@ -231,7 +231,7 @@ def _exactly(
         warned = chosen.method.reason == UNREACHED
     preparation = prepare(lines, grid, device=device, beam=beam, **request)
     if chosen is None:  # otherwise the plan has warned
-        warn_before_imaging(lines, grid)
+        warn_before_imaging(lines, grid, beam)
         preparation.warn_of_ambiguity()
     interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
     return _Formed(

@@ -16,11 +16,11 @@ from clsas.exact.preparation import Preparation
 from clsas.exact.run import execute
 from clsas.opencl.device import Device, open_device
 from clsas.signal.ambiguity import BEST_DB, ambiguity
+from clsas.signal.doubts import warn_before_imaging
 from clsas.signal.refraction import Homogeneous, homogeneous
 from clsas.signal.spectrum import OUTSIDE, line_energy, measure_spectrum, occupied_band
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches
-from clsas.sonar.looking import warn_before_imaging
 from clsas.sonar.simplify import simplify
 
 BEST_ACCURACY_DB = BEST_DB
@@ -147,7 +147,7 @@ def backproject(
     )
     if accumulate is not None:
         check_accumulate(accumulate, placed(lines, grid), beam)
-    warn_before_imaging(lines, grid)
+    warn_before_imaging(lines, grid, beam)
     preparation.warn_of_ambiguity()
     image = execute(preparation, progress=progress)
     if accumulate is None:

@@ -17,10 +17,10 @@ from clsas.core.lines import RangeLines
 from clsas.exact.checks import check_numbers
 from clsas.exact.migration import migrate
 from clsas.exact.straight_track import Aspects, Band, StraightTrack, aspects_of, band_of, straighten
+from clsas.signal.doubts import warn_before_imaging
 from clsas.signal.refraction import homogeneous
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches, warn_unreached
-from clsas.sonar.looking import warn_before_imaging
 
 _STRAIGHT = 1e-3  # wavelengths, up to which errors of range cause no warning
 
@@ -148,7 +148,7 @@ def wavenumber(
         along = None if beam is None else beam.directions(lines)
         warn_unreached(lines, grid, beam, along)
         return Image(np.zeros(grid.shape, np.complex64), grid)
-    warn_before_imaging(lines, grid)
+    warn_before_imaging(lines, grid, beam)
     _warn_bent(lines, grid, track, aspects, band, motion_compensation)
     on_line = replace(track, along_m=track.along_m[visible], shift_m=track.shift_m[visible])
     return Image(migrate(lines.select(visible), on_line, aspects, band, workers), grid)

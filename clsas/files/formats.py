@@ -15,6 +15,7 @@ from clsas.files.full_matrix import full_matrix_lines
 from clsas.files.hdf5 import FileFormatError, Saved
 from clsas.files.phase_histories import FIELDS as PHASE_HISTORY
 from clsas.files.phase_histories import phase_history_lines
+from clsas.files.positions import checked
 
 SUFFIXES = (*hdf5.SUFFIXES, *cphd_writing.SUFFIXES)
 """Suffixes of files that `save` writes."""
@@ -88,7 +89,10 @@ def load(path: str | os.PathLike) -> Saved:
     if h5py.is_hdf5(path):
         with hdf5.opened(path) as content:
             foreign = "format" not in content.attrs and is_airsas(content)
-        return read_airsas(path) if foreign else hdf5.load(path)
+        if foreign:
+            return read_airsas(path)
+        found = hdf5.load(path)
+        return checked(path, found) if isinstance(found, RangeLines) else found
     raise FileFormatError(
         f"{path} is neither an HDF5 file, nor CPHD, nor a MATLAB file of version 5 to 7"
     )

@@ -10,6 +10,7 @@ import numpy as np
 from clsas.core.lines import RangeLines
 from clsas.files import matlab
 from clsas.files.hdf5 import FileFormatError
+from clsas.files.positions import checked
 from clsas.signal.compression import Window
 from clsas.signal.full_matrix import from_full_matrix
 
@@ -106,7 +107,7 @@ def full_matrix_lines(
         )
     carrier_hz = float(matlab.numbers(path, array, "centre_freq", 0))
     try:
-        return from_full_matrix(
+        lines = from_full_matrix(
             samples,
             np.stack([x_m, *others], axis=-1),
             sample_rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])),
@@ -119,3 +120,4 @@ def full_matrix_lines(
         )
     except (TypeError, ValueError) as error:
         raise type(error)(f"{os.fspath(path)}: {error}") from None
+    return checked(path, lines)

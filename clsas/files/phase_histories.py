@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
+from clsas.core import validate
 from clsas.core.lines import RangeLines
 from clsas.files import matlab
 from clsas.files.hdf5 import FileFormatError
@@ -17,6 +18,7 @@ from clsas.signal.compression import Window
 from clsas.signal.phase_history import from_phase_history
 
 FIELDS = ("fp", "freq", "x", "y", "z", "r0")
+_LOWEST_HZ = 1e6  # waves of 300 m: radars that look through ice or ground begin at 1 to 10 MHz
 
 
 def read_phase_history(
@@ -49,7 +51,7 @@ def read_phase_history(
     FileFormatError
         If the file is damaged, lacks a field, or its frequencies are not equally spaced.
     TypeError, ValueError
-        If an option is outside its limits.
+        If an option is outside its limits, or frequencies are below 1 MHz in any likely unit.
     OSError
         If the file cannot be read.
 
@@ -57,7 +59,8 @@ def read_phase_history(
     -----
     ClsasWarning
         If all pings have the same position, or the track turns back, so that pings may be out of
-        order.
+        order; if frequencies are in MHz or GHz, which are converted; or if positions or units
+        cannot be right.
 
     Notes
     -----
@@ -98,7 +101,7 @@ def phase_history_lines(
         )
     antenna_m = np.stack(antenna, axis=-1).astype(np.float64)
     try:
-        first_hz, step_hz = _equal_steps(frequency)
+        first_hz, step_hz = _in_hz(path, *_equal_steps(frequency), count, reference)
         lines = from_phase_history(
             samples,
             first_frequency_hz=first_hz,
@@ -123,6 +126,32 @@ def _equal_steps(frequency: NDArray) -> tuple[float, float]:
     if not step > 0 or not np.abs(exact - frequency).max() <= rounding:
         raise FileFormatError("must contain freq in equal, ascending steps")
     return float(exact[0]), step
+
+
+def _in_hz(
+    path: str | os.PathLike, first: float, step: float, count: int, reference: NDArray
+) -> tuple[float, float]:
+    """Return a frequency and a step in Hz, if they may be in MHz or GHz.
+
+    No radar images below 1 MHz. The unit is the smallest in which lines of one period, c/(2 step),
+    begin in front of the antenna.
+    """
+    last = first + (count - 1) * step
+    if last >= _LOWEST_HZ:
+        return first, step
+    nearest_m = float(reference.min())
+    for unit, name in ((1e6, "MHz"), (1e9, "GHz")):
+        if last * unit >= _LOWEST_HZ and speed_of_light / (4 * step * unit) <= nearest_m:
+            validate.warn(
+                f"{os.fspath(path)}: freq runs from {first:g} to {last:g}, which must be Hz but is "
+                f"taken as {name}: no radar images below 1 MHz, and in {name} its lines begin in "
+                "front of the antenna. Store freq in Hz"
+            )
+            return first * unit, step * unit
+    raise ValueError(
+        f"freq must be in Hz, got {first:g} to {last:g}: no radar images below 1 MHz. It may be in "
+        "MHz or GHz"
+    )
 
 
 def _reference_m(reference: NDArray, antenna_m: NDArray[np.float64]) -> NDArray[np.float64]:

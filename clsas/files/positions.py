@@ -1,22 +1,35 @@
-"""Warnings about the navigation of a recording after reading."""
+"""Warnings about a recording after reading."""
 
 from __future__ import annotations
 
 import os
 
 from clsas.core import validate
+from clsas.core.findings import warn_of
 from clsas.core.lines import RangeLines
 from clsas.core.pings import Transmissions
+from clsas.signal.doubts import doubts
+
+
+def checked(path: str | os.PathLike, lines: RangeLines) -> RangeLines:
+    """Return the lines after warning of what cannot be right about them.
+
+    The lines are returned unchanged, since much can be examined without a track.
+    """
+    warn_of(doubts(lines), f"{os.fspath(path)}: ")
+    return lines
 
 
 def checked_positions(path: str | os.PathLike, lines: RangeLines) -> RangeLines:
-    """Return the lines after warning of missing positions and of pings out of order.
+    """Return the lines of a recorder after warning of missing positions and of pings out of order.
 
-    The lines are returned unchanged, since much can be examined without a track.
+    Its pings are in the order of time, unlike those of lines in memory.
     """
     pings = Transmissions.of(lines)
     if pings.count < 2:
         return lines
+    if pings.usual_step_m:
+        checked(path, lines)
     if not pings.usual_step_m:
         validate.warn(
             f"{os.fspath(path)}: all {pings.count} pings have the same position. The navigation "

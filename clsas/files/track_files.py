@@ -9,10 +9,12 @@ from functools import partial
 import numpy as np
 
 from clsas.core import validate
+from clsas.core.findings import warn_of
 from clsas.core.georeference import Georeference
 from clsas.files.csv_columns import read_columns
 from clsas.files.mistakes import suggestion
 from clsas.files.tables import located
+from clsas.sonar.fixes import doubts_of_track
 from clsas.sonar.track import Track
 
 _POSITION = ("x_m", "y_m", "z_m")
@@ -60,6 +62,7 @@ def read_track(path: str | os.PathLike, georeference: Georeference | None = None
             roll_rad=np.radians(column.get("roll_deg", 0.0)),
             georeference=georeference,
         )
+        warn_of(doubts_of_track(positions, track.time_s), f"{path}: ")
         if set(column) & set(_VELOCITY):
             return replace(track, velocity_m_s=np.stack([column[v] for v in _VELOCITY], axis=-1))
         if track.pings > 1:

@@ -15,6 +15,7 @@ from scipy.ndimage import median_filter
 
 from clsas.core import decibels
 from clsas.core.conditioning import DEAD_DB, are_dead
+from clsas.core.findings import Finding
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.pings import STILL
 from clsas.inspection.phase_sign import CLEAR
@@ -29,8 +30,8 @@ from clsas.inspection.result import measured, runs
 from clsas.inspection.slips import POINTS, covered, likely_slip, ranges_m
 from clsas.signal.ambiguity import end_powers
 from clsas.signal.spectrum import NEEDED_OVERSAMPLING
-from clsas.sonar.looking import MIRRORED, behind
-from clsas.sonar.sampling import Finding, check_sampling
+from clsas.sonar.looking import behind
+from clsas.sonar.sampling import check_sampling
 
 _GAP = 1.75
 """Advance relative to that of the pings around, above which pings are missing. One missing ping
@@ -404,7 +405,7 @@ def check_side(recording: Recording) -> Iterator[Finding]:
     grid = recording.grid
     found = None if grid is None else behind(recording.lines, grid)
     if found is not None:
-        yield Finding("grid_behind", found.message, found.share, MIRRORED, found.remedy)
+        yield found
 
 
 def check_phase_sign(recording: Recording) -> Iterator[Finding]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core import validate
+from clsas.core.findings import Finding
 from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
@@ -17,7 +18,6 @@ from clsas.signal.compression import compress
 from clsas.signal.echoes import Echoes
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.looking import side_of
-from clsas.sonar.sampling import Finding
 
 _FARTHEST_M = 1e3 * validate.FARTHEST_M  # coordinates in mm are reported, not refused
 _SLOWEST_M_S = 1.0  # accepts a sound speed in km/s, so that the checks can report the slip

@@ -28,8 +28,8 @@ from clsas.planning.factorize import factorize
 from clsas.planning.planner import planned
 from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, Request, checked_pairs
 from clsas.plans.plan import Plan
+from clsas.signal.doubts import warn_before_imaging
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.looking import warn_before_imaging
 
 TOLERANCES_DB = (-20.0, -30.0, -40.0, -50.0, -60.0, -70.0)
 STAGES = (*(((2, 2),) * count for count in range(1, 6)), ((2, 4),) * 2)
@@ -127,7 +127,7 @@ def tradeoff(
         stages = [checked_pairs(each) for each in given]
     tolerances = _checked_tolerances(tolerances_db)
     device = open_device(device)
-    warn_before_imaging(lines, grid)
+    warn_before_imaging(lines, grid, beam)
     requests = _requests(
         tolerances, study, _feasible(lines, grid, beam) if stages is None else stages
     )

@@ -40,9 +40,9 @@ from clsas.mosaics.store import Store
 from clsas.mosaics.survey import open_survey
 from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import Device
+from clsas.signal.doubts import warn_before_imaging
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import warn_unreached
-from clsas.sonar.looking import warn_before_imaging
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -370,7 +370,7 @@ def mosaic(
     grid = placed(survey.geometry, grid)
     visibility = SurveyVisibility.of(survey, beam)
     if growth is None:
-        warn_before_imaging(survey.geometry, grid, survey.last_range_m)
+        warn_before_imaging(survey.geometry, grid, beam, last_range_m=survey.last_range_m)
     if growth is None and not visibility.channels(grid).any():
         warn_unreached(survey.geometry, grid, beam, visibility.along, survey.span_m)
     if given is not None and given is not beam:

@@ -21,9 +21,9 @@ from clsas.planning.former import Former, former
 from clsas.planning.planner import planned
 from clsas.planning.request import Request
 from clsas.plans.plan import Plan
+from clsas.signal.doubts import warn_before_imaging
 from clsas.signal.spectrum import FEW_CHANNELS, MEASURED_CHANNELS, power_outside
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.looking import warn_before_imaging
 
 Progress = Callable[[int, int], None]
 
@@ -155,7 +155,7 @@ class Imager:
             self.beam = plan.beam
             self._former = former(lines, grid, plan, self.device)
         if plan is None:  # otherwise clsas.plan has warned
-            warn_before_imaging(lines, grid)
+            warn_before_imaging(lines, grid, beam)
         self._lines_digest = self.plan.lines_digest if self.plan else lines_digest(lines)
         self._warned_of_band = False
         self._checked = weakref.ref(lines)

@@ -28,11 +28,11 @@ from clsas.planning.search import Allowed
 from clsas.planning.visibility_model import LinesModel, VisibilityModel, model_of
 from clsas.plans.factorization import UNREACHED
 from clsas.plans.plan import Plan
+from clsas.signal.doubts import warn_before_imaging
 from clsas.signal.refraction import Homogeneous, homogeneous
 from clsas.signal.spectrum import OUTSIDE
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches, warn_unreached
-from clsas.sonar.looking import warn_before_imaging
 from clsas.sonar.simplify import Model, simplify
 
 # `scripts/bench sensitivity` halves and doubles these; without a remark nothing changes.
@@ -185,7 +185,7 @@ def plan(
         depth=depth,
         full_model=full_model,
     )
-    warn_before_imaging(lines, grid)
+    warn_before_imaging(lines, grid, beam)
     return planned(request).plan
 
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.banks import warn_of_banks
+from clsas.core.findings import Finding
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, antennas_of, some_channels
@@ -69,48 +68,9 @@ class _Mirror:
         return _Mirror(point_m, normal, self.width_m)
 
 
-@dataclass(frozen=True, eq=False)
-class Behind:
-    """Part of a grid that lies behind the elements of all channels that reach it.
-
-    Attributes
-    ----------
-    share : float
-        Share of the pixels.
-    message : str
-        What is wrong.
-    remedy : str
-        What to do about it.
-    """
-
-    share: float
-    message: str
-    remedy: str
-
-
-def warn_behind(
-    lines: RangeLines, grid: Grid, last_range_m: NDArray[np.float64] | None = None
-) -> None:
-    """Warn if pixels lie behind the elements. Parameters are those of `behind`."""
-    found = behind(lines, grid, last_range_m)
-    if found is not None:
-        validate.warn(f"{found.message}. {found.remedy[0].upper()}{found.remedy[1:]}")
-
-
-def warn_before_imaging(
-    lines: RangeLines, grid: Grid, last_range_m: NDArray[np.float64] | None = None
-) -> None:
-    """Warn of several banks in one image, and of pixels behind the elements.
-
-    Parameters are those of `behind`.
-    """
-    warn_of_banks(lines)
-    warn_behind(lines, grid, last_range_m)
-
-
 def behind(
     lines: RangeLines, grid: Grid, last_range_m: NDArray[np.float64] | None = None
-) -> Behind | None:
+) -> Finding | None:
     """Return which part of a grid lies behind the elements, or None if hardly any does.
 
     A pixel counts if it lies behind the elements of every channel whose line reaches it, and its
@@ -235,7 +195,7 @@ def side_of(lines: RangeLines, direction: NDArray[np.float64]) -> str:
     return "starboard" if share < _LEAST_ACROSS else "both sides"
 
 
-def _described(lines: RangeLines, grid: Grid, mirror: _Mirror, share: float) -> Behind:
+def _described(lines: RangeLines, grid: Grid, mirror: _Mirror, share: float) -> Finding:
     """Return a part of a grid that lies behind the elements, in words."""
     part = "the whole grid lies" if share > 0.995 else f"{100 * share:.0f} % of the grid lies"
     opposite = {"port": "starboard", "starboard": "port"}
@@ -248,7 +208,7 @@ def _described(lines: RangeLines, grid: Grid, mirror: _Mirror, share: float) -> 
     remedy = f"keep the grid on the {side} side"
     if share >= 0.5:
         remedy = _mirrored(grid, mirror.rounded())
-    return Behind(share, message, remedy)
+    return Finding("grid_behind", message, share, MIRRORED, remedy)
 
 
 def _mirrored(grid: Grid, mirror: _Mirror) -> str:

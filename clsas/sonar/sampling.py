@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import banks, reprs, validate
+from clsas.core.findings import Finding
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
@@ -23,38 +24,6 @@ from clsas.sonar.track import Track, channels
 
 SLACK = 0.01
 """Relative excess of a spacing that is tolerated: a sway of centimetres changes it a little."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Problem that a check found in a survey or a recording.
-
-    Parameters
-    ----------
-    name : str
-        Name of the check that found it, such as "along_track_spacing", "ping_rate" or
-        "dead_channels".
-    message : str
-        Explanation, with numbers and units.
-    value, limit : float
-        Value found and value allowed, in SI units or decibels.
-    remedy : str
-        What to do about it.
-    where : tuple of int
-        Indices of the pings or channels concerned, from 0. The message states whether they are
-        pings or channels.
-
-    See Also
-    --------
-    check_sampling, inspect : Functions that return findings.
-    """
-
-    name: str
-    message: str
-    value: float
-    limit: float
-    remedy: str = ""
-    where: tuple[int, ...] = ()
 
 
 def check_sampling(

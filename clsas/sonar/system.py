@@ -20,6 +20,11 @@ PASSBAND = 0.8
 """Share of the sampled band that the receiver passes unchanged. Above it, the anti-alias filter
 falls smoothly to zero at half the sample rate."""
 
+# Length of a pulse, and cycles of its band within it, from which on together milliseconds are
+# taken for seconds. Pulses of 30 kHz last up to 20 ms (600 cycles), those of 1 kHz up to 4 s, and
+# those of radars far below a millisecond.
+_LONG_S, _MOST_PRODUCT = 0.1, 5000.0
+
 
 @dataclass(frozen=True)
 class Pulse:
@@ -89,6 +94,11 @@ class Pulse:
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
+        if duration >= _LONG_S and band * duration > _MOST_PRODUCT:
+            validate.warn(
+                f"duration_s is {duration:g} s, {band * duration:.3g} cycles of its band; pulses "
+                "of sonars last milliseconds. Give it in seconds, not in milliseconds"
+            )
 
     @classmethod
     def phase_code(

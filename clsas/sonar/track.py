@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from clsas.core import reprs, validate
+from clsas.core.findings import warn_of
 from clsas.core.georeference import Georeference
 from clsas.sonar import geographic_track
+from clsas.sonar.fixes import doubts_of_track
 from clsas.sonar.system import Sonar
 
 Motion = float | ArrayLike | Callable[[NDArray[np.float64]], ArrayLike]
@@ -104,6 +106,15 @@ class Track:
                 f"{wrong[0]} to the next ({how}; {len(wrong)} such steps): sort pings by time and "
                 "drop repeated ones"
             )
+        for name, most in (("yaw_rad", 2 * np.pi), ("pitch_rad", np.pi / 2), ("roll_rad", np.pi)):
+            angles = np.abs(getattr(self, name))
+            # Yaw may count several turns, but then it begins with the first.
+            found = float(angles.min() if name == "yaw_rad" else angles.max())
+            if found > most * (1 + 1e-6):
+                validate.warn(
+                    f"{name} is {found:.4g} rad, more than {np.degrees(most):.0f} degrees. If it "
+                    "is in degrees, convert it with numpy.radians"
+                )
 
     @property
     def pings(self) -> int:
@@ -236,6 +247,12 @@ class Track:
         ImportError
             If pyproj is not installed (extra `maps`).
 
+        Warns
+        -----
+        ClsasWarning
+            If fixes cannot be right: the track jumps, one fix is held over several pings, or
+            angles are rounded to float32.
+
         Notes
         -----
         Heights become z without regard to the curvature of the Earth, which drops by 8 mm within
@@ -258,6 +275,8 @@ class Track:
             for name, value in (("pitch_deg", pitch_deg), ("roll_deg", roll_deg))
         )
         track = cls(positions, time_s, (0, 0, 0), yaw_rad, -pitch, roll, frame)
+        degrees = np.stack([np.asarray(each, float) for each in (latitude_deg, longitude_deg)], 1)
+        warn_of(doubts_of_track(positions, track.time_s, degrees))
         if pings == 1:
             return track
         return replace(track, velocity_m_s=np.gradient(positions, track.time_s, axis=0))

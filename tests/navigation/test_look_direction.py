@@ -27,7 +27,7 @@ def check(corrected, lines):
     np.testing.assert_array_equal(corrected.look_direction, lines.look_direction)
     grid = clsas.Grid.plane((1, 2, 9), (-9, -8, 9))
     found = looking.behind(corrected, grid)
-    assert found.share == 1
+    assert found.value == 1
     assert found.remedy.endswith("--y=8:9:9")
 
 

@@ -11,6 +11,7 @@ from cases import along_x
 
 import clsas
 from clsas.core.validate import ClsasWarning
+from clsas.signal.doubts import warn_before_imaging
 from clsas.sonar import looking
 
 PORT = clsas.Grid.plane((-0.5, 0.5, 41), (19.5, 20.5, 41))
@@ -109,10 +110,10 @@ def test_a_wavenumber_image_warns_as_well(lines):
 def test_a_sonar_that_looks_to_starboard_warns_of_port():
     turned = geometry(along_x(50, 0.05), [0, -2.0, -0.5])
     assert np.linalg.norm(turned.look_direction, axis=1) == pytest.approx(1)
-    (message,) = heard(lambda: looking.warn_behind(turned, PORT))
+    (message,) = heard(lambda: warn_before_imaging(turned, PORT))
     assert "lies to port of the track, but the elements look to starboard" in message
     assert message.endswith("Use the mirrored grid, --x=-0.5:0.5:41 --y=-20.5:-19.5:41")
-    assert heard(lambda: looking.warn_behind(turned, STARBOARD)) == []
+    assert heard(lambda: warn_before_imaging(turned, STARBOARD)) == []
 
 
 def test_the_mirrored_grid_follows_from_the_track_and_keeps_height_and_step():
@@ -120,7 +121,7 @@ def test_the_mirrored_grid_follows_from_the_track_and_keeps_height_and_step():
     found = looking.behind(
         geometry(track_m, [0, 1, 0]), clsas.Grid.plane((1, 2, 5), (-14, -34, 101), -7.5)
     )
-    assert found.share == 1
+    assert found.value == 1
     assert found.remedy.endswith("use the mirrored grid, --x=1:2:5 --y=20:40:101 --z=-7.5")
 
 
@@ -159,7 +160,7 @@ def test_other_grids_are_mirrored_in_words(lines, kind):
     if kind == "points":
         grid = clsas.Grid.points(STARBOARD.positions_m().reshape(-1, 3))
     found = looking.behind(lines, grid)
-    assert found.share == 1
+    assert found.value == 1
     plane = r"the vertical plane through \(\S+ 0\) m with the normal \(-?0, 1\)$"
     assert re.search(f"^mirror the grid about {plane}", found.remedy)
 
@@ -171,9 +172,9 @@ def test_a_part_of_the_grid_is_reported_by_its_share(low_m, percent):
     if percent is None:  # less than is reported
         assert found is None
         return
-    assert 100 * found.share == pytest.approx(percent, abs=2)
-    assert f"{100 * found.share:.0f} % of the grid lies to starboard" in found.message
-    assert ("keep the grid on the port side" in found.remedy) == (found.share < 0.5)
+    assert 100 * found.value == pytest.approx(percent, abs=2)
+    assert f"{100 * found.value:.0f} % of the grid lies to starboard" in found.message
+    assert ("keep the grid on the port side" in found.remedy) == (found.value < 0.5)
 
 
 def ring(radius_m=20.0, outwards=False):
@@ -224,7 +225,7 @@ def test_a_leg_counts_only_where_its_lines_reach():
     lines = opposite_legs()
     near = replace(lines, samples=lines.samples[:, :1000])  # 50 m
     found = looking.behind(near, clsas.Grid.plane((-1, 1, 9), (-60, -55, 9)))
-    assert found.share == 1
+    assert found.value == 1
 
 
 def test_one_ping_of_an_array_has_no_track_but_sides():
@@ -237,7 +238,7 @@ def test_one_ping_of_an_array_has_no_track_but_sides():
     assert found.message.startswith("the whole grid lies behind the elements")
     assert found.remedy.endswith("--y=19.5:20.5:41")
     single = lines.select([0])
-    assert looking.behind(single, STARBOARD).share == 1
+    assert looking.behind(single, STARBOARD).value == 1
     assert looking.side_of(single, single.look_direction) == ""
 
 
