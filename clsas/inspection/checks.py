@@ -29,6 +29,7 @@ from clsas.inspection.recording import (
 from clsas.inspection.result import measured, runs
 from clsas.inspection.slips import POINTS, covered, likely_slip, ranges_m
 from clsas.signal.ambiguity import end_powers
+from clsas.signal.doubts import MOST_WAVELENGTHS, doubts
 from clsas.signal.spectrum import NEEDED_OVERSAMPLING
 from clsas.sonar.looking import behind
 from clsas.sonar.sampling import check_sampling
@@ -38,9 +39,6 @@ _GAP = 1.75
 doubles the advance."""
 _SCATTER = 5.0  # standard deviations of steps that a gap must also exceed, for noisy positions
 _AROUND = 31  # steps in the running median that gives the usual advance near a ping
-_MOST_WAVELENGTHS = 500.0
-"""Advance per receiver, in wavelengths, above which a unit must be wrong. Radar satellites, whose
-antennas are as long, reach 120. Positions in millimetres multiply it by 1000."""
 _LEAST_PER_WAVELENGTH = 50.0
 """Advances of a receiver per wavelength above which a unit must be wrong. Slow rails reach 20.
 Positions in kilometres multiply it by 1000, which finds advances of up to 20 wavelengths."""
@@ -144,7 +142,7 @@ def check_advance(recording: Recording) -> Iterator[Finding]:
         first_ping = first_ping[lines.bank_numbers[: pings.starts[1]] == lines.bank_numbers[0]]
     array_m = float(np.linalg.norm(np.ptp(first_ping, axis=0))) / 2
     least_m = wavelength_m / _LEAST_PER_WAVELENGTH
-    most_m = _MOST_WAVELENGTHS * wavelength_m * receivers
+    most_m = MOST_WAVELENGTHS * wavelength_m * receivers
     wavelength = measured(wavelength_m, "m")
     remedy = "check units: positions in metres (not millimetres), and ranges in metres"
     if 0 < usual_m < least_m * receivers - array_m:
@@ -161,7 +159,7 @@ def check_advance(recording: Recording) -> Iterator[Finding]:
         limit_m, limit = last_range_m, f"more than the last range of {measured(last_range_m, 'm')}"
     elif usual_m > most_m:
         limit_m = most_m
-        limit = f"more than {_MOST_WAVELENGTHS:g} wavelengths of {wavelength} per receiver"
+        limit = f"more than {MOST_WAVELENGTHS:g} wavelengths of {wavelength} per receiver"
     else:
         return
     message = f"pings are {measured(usual_m, 'm')} apart, {limit}"
@@ -427,6 +425,13 @@ def check_phase_sign(recording: Recording) -> Iterator[Finding]:
     yield Finding("phase_sign", message, sign.ratio, CLEAR, remedy)
 
 
+def check_doubts(recording: Recording) -> Iterator[Finding]:
+    """Yield what imagers warn of, unless another check describes it in more detail."""
+    detailed = ("advance", "held_fixes", "phase_sign")
+    found = doubts(recording.lines, recording.grid, recording.beam)
+    yield from (each for each in found if each.name not in detailed)
+
+
 CHECKS: tuple[Callable[[Recording], Iterator[Finding]], ...] = (
     # The track first, in the order of cause and effect.
     check_aperture,
@@ -434,6 +439,8 @@ CHECKS: tuple[Callable[[Recording], Iterator[Finding]], ...] = (
     check_halts,
     check_gaps,
     check_advance,
+    # What imagers warn of, too.
+    check_doubts,
     # Channels as they were recorded.
     check_dead,
     check_clipping,

@@ -37,7 +37,7 @@ from clsas.mosaics.provenance import inputs_of
 from clsas.mosaics.record import PatchIndex, Record
 from clsas.mosaics.scheduling import Run, form_patches, wait_for_first_file
 from clsas.mosaics.store import Store
-from clsas.mosaics.survey import open_survey
+from clsas.mosaics.survey import open_survey, warn_of_order
 from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import Device
 from clsas.signal.doubts import warn_before_imaging
@@ -370,7 +370,10 @@ def mosaic(
     grid = placed(survey.geometry, grid)
     visibility = SurveyVisibility.of(survey, beam)
     if growth is None:
-        warn_before_imaging(survey.geometry, grid, beam, last_range_m=survey.last_range_m)
+        lines = source if isinstance(source, RangeLines) else survey.geometry
+        warn_before_imaging(lines, grid, beam, last_range_m=survey.last_range_m)
+        if beam is not None and beam.along is None:
+            warn_of_order(survey)
     if growth is None and not visibility.channels(grid).any():
         warn_unreached(survey.geometry, grid, beam, visibility.along, survey.span_m)
     if given is not None and given is not beam:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from clsas.core import validate
 from clsas.core.digests import Without, digest
@@ -34,6 +35,9 @@ _LOOK = "look_direction"  # which only some files of a survey may state
 _NOT_IN_PARTS: Without = {RangeLines: ("samples", _LOOK, "georeference")}
 _SKIPPED = 64  # unused channels in a row that are read along: faster than a second read
 _GAP = 3.0  # a gap is a distance between pings of more than this many median distances
+# Files below which their order says little, distance to the next file over that to the nearest, and
+# share of files at the ends of passes: plain choices. Shuffled names reach 0.9.
+_LEAST_FILES, _OUT_OF_PLACE, _PASSES = 4, 3.0, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,6 +259,34 @@ def natural(name: str) -> tuple[list[int | str], str]:
     """
     parts = re.split(r"(\d+)", name)  # texts and digits in turn
     return [int(part) if n % 2 else part.casefold() for n, part in enumerate(parts)], name
+
+
+def warn_of_order(survey: Survey) -> None:
+    """Warn if the files of a survey, in the order of their names, do not follow the track.
+
+    Range lines have no times, so the names alone tell the order, and with it the direction of the
+    track. A file is out of place if the next one begins far away, and another one close by. On
+    parallel passes, the last file of each may look like that.
+    """
+    files = len(survey.files)
+    if files < _LEAST_FILES:
+        return
+    edges = np.array(survey.begins)
+    starts_m, ends_m = survey.geometry.tx_m[edges[:-1]], survey.geometry.tx_m[edges[1:] - 1]
+    steps_m = np.linalg.norm(starts_m[1:] - ends_m[:-1], axis=1)
+    away_m, which = cKDTree(starts_m).query(ends_m[:-1], k=2)
+    itself = which[:, 0] == np.arange(files - 1)
+    nearest_m = np.where(itself, away_m[:, 1], away_m[:, 0])
+    wrong = np.flatnonzero(steps_m > _OUT_OF_PLACE * nearest_m)
+    if wrong.size > _PASSES * files:
+        first = int(wrong[0])
+        validate.warn(
+            f"the files of the survey do not follow the track in the order of their names: after "
+            f"{wrong.size} of {files}, first {survey.files[first].name}, the next file begins "
+            f"{steps_m[first]:.3g} m away, and another one {nearest_m[first]:.3g} m. Only names "
+            "tell the order of pings, which a beam follows. Name the files in the order of time, "
+            "or give the direction of the track, BeamWindow(along=...)"
+        )
 
 
 def has_ended(source: str | os.PathLike) -> bool:

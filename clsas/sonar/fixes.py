@@ -99,8 +99,10 @@ def _of_held(count: str, share: float, always: bool) -> Finding:
 def _coarse(lines: RangeLines, wavelength_m: float) -> Iterator[Finding]:
     """Yield that positions are rounded to steps that are no small part of the wavelength."""
     least_m = _COARSE * wavelength_m
-    for values in np.hstack([lines.tx_m, lines.rx_m]).T:
-        step_m, how = _rounded_to(values, least_m)
+    # Elements of an array lie at round numbers by design, transmitters along a track do not.
+    columns = [(values, _DECIMALS) for values in lines.tx_m.T]
+    for values, decimals in [*columns, *((values, ()) for values in lines.rx_m.T)]:
+        step_m, how = _rounded_to(values, least_m, decimals)
         if step_m:
             step, wavelength = (
                 reprs.quantity(float(f"{each:.3g}"), "m") for each in (step_m, wavelength_m)
@@ -117,7 +119,9 @@ def _coarse(lines: RangeLines, wavelength_m: float) -> Iterator[Finding]:
             return
 
 
-def _rounded_to(values: NDArray[np.float64], least: float) -> tuple[float, str]:
+def _rounded_to(
+    values: NDArray[np.float64], least: float, decimals: tuple[float, ...] = ()
+) -> tuple[float, str]:
     """Return the step above `least` to which coordinates were rounded, and how; 0 if there is none.
 
     Equal steps are no rounding, even where pings were lost: a rail or a simulation has them.
@@ -126,7 +130,7 @@ def _rounded_to(values: NDArray[np.float64], least: float) -> tuple[float, str]:
     if len(unique) < LEAST_FIXES or 4 * len(unique) * counts.min() < len(values):
         return 0.0, ""  # a coordinate that hardly changes
     single = float(np.spacing(np.float32(np.abs(values).max())))
-    for step in (single, *_DECIMALS):
+    for step in (single, *decimals):
         numbers = (unique - unique[0]) / step  # also multiples if a lever arm was added
         if step <= least or np.abs(numbers - np.rint(numbers)).max() > _WHOLE:
             continue

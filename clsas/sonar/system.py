@@ -23,7 +23,7 @@ falls smoothly to zero at half the sample rate."""
 # Length of a pulse, and cycles of its band within it, from which on together milliseconds are
 # taken for seconds. Pulses of 30 kHz last up to 20 ms (600 cycles), those of 1 kHz up to 4 s, and
 # those of radars far below a millisecond.
-_LONG_S, _MOST_PRODUCT = 0.1, 5000.0
+_LONG_S, _MOST_PRODUCT = 0.1, 20_000.0
 
 
 @dataclass(frozen=True)
