@@ -91,8 +91,8 @@ def load(path: str | os.PathLike) -> Saved:
             foreign = "format" not in content.attrs and is_airsas(content)
         if foreign:
             return read_airsas(path)
-        found = hdf5.load(path)
-        return checked(path, found) if isinstance(found, RangeLines) else found
+        saved = hdf5.load(path)
+        return checked(path, saved) if isinstance(saved, RangeLines) else saved
     raise FileFormatError(
         f"{path} is neither an HDF5 file, nor CPHD, nor a MATLAB file of version 5 to 7"
     )

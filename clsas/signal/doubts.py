@@ -32,7 +32,7 @@ MOST_WAVELENGTHS = 500.0
 """Advance per receiver, in wavelengths, above which a unit must be wrong. Radar satellites, whose
 antennas are as long, reach 120. Positions in millimetres multiply it by 1000."""
 _SHORTEST = 0.5  # wavelengths: a shorter aperture resolves nothing, and the smallest arrays have 8
-_DENSEST = 1 / 50  # wavelengths between phase centres; slow rails reach 1/20
+_DENSEST = 1 / 200  # wavelengths between phase centres; slow rails reach 1/20, and slips 1/1000
 _SEARCHED = 4096  # phase centres whose spacing is measured
 # Widest beam that may be meant in radians, degrees; resolution along the track over the spacing of
 # pixels, and over what the aperture allows, from which on it is suspected. Radians mistaken for
@@ -120,10 +120,9 @@ def _units(lines: RangeLines, wavelength_m: float) -> Iterator[Finding]:
     if lines.channels < LEAST_FIXES or not extent_m:
         return
     wavelength = reprs.quantity(float(f"{wavelength_m:.3g}"), "m")
-    # Those closer than a hundredth of a wavelength are one: arrays repeat phase centres.
-    _, first = np.unique(
-        np.rint((centres_m - centres_m[0]) / (wavelength_m / 100)), axis=0, return_index=True
-    )
+    # Those closer than a thousandth of a wavelength are one: arrays repeat phase centres.
+    cells = np.rint((centres_m - centres_m[0]) / (1e-3 * wavelength_m))
+    _, first = np.unique(cells, axis=0, return_index=True)
     places_m = centres_m[first]
     usual_m = extent_m / lines.channels
     if len(places_m) > 2:

@@ -77,23 +77,20 @@ def _held(lines: RangeLines) -> Iterator[Finding]:
     pairs = np.ascontiguousarray(np.hstack([lines.tx_m, lines.rx_m]) + 0.0)  # without -0
     kinds = len(np.unique(pairs.view(f"V{pairs.itemsize * pairs.shape[1]}")))
     share = 1 - kinds / lines.channels
-    if share > _HELD:
-        yield _of_held(f"{lines.channels - kinds} of {lines.channels} channels", share, kinds == 1)
+    if share > _HELD and kinds > 1:  # a single position is no track, and may be meant
+        yield _of_held(f"{lines.channels - kinds} of {lines.channels} channels", share)
 
 
-def _of_held(count: str, share: float, always: bool) -> Finding:
-    message = (
+def _of_held(count: str, share: float) -> Finding:
+    return Finding(
+        "held_fixes",
         f"{count} have exactly the position of another one: either the navigation has fewer fixes "
-        "than there are pings, and each was held over several, or the platform stood still"
-    )
-    remedy = (
+        "than there are pings, and each was held over several, or the platform stood still",
+        share,
+        _HELD,
         "interpolate the navigation at the times of the pings, or leave out pings taken standing "
-        "still with lines.without_still_pings()"
+        "still with lines.without_still_pings()",
     )
-    if always:
-        message = f"{count} are at one position. The navigation seems to be missing"
-        remedy = "give the position of every ping; without them there is no aperture"
-    return Finding("held_fixes", message, share, _HELD, remedy)
 
 
 def _coarse(lines: RangeLines, wavelength_m: float) -> Iterator[Finding]:
@@ -135,12 +132,14 @@ def _rounded_to(
         if step <= least or np.abs(numbers - np.rint(numbers)).max() > _WHOLE:
             continue
         steps = np.diff(np.rint(numbers))
-        kinds, of_kind = np.unique(steps, return_counts=True)
-        if step != single:
-            if of_kind.max() < _REGULAR * len(steps):
-                return step, ""
-        elif np.ptp(counts) or (len(kinds) > 1 and (kinds[0] == 1 or (kinds % kinds[0]).any())):
-            return single, ", as single precision (float32) does with numbers of this size"
+        kinds, of_kind = np.unique(steps.astype(np.int64), return_counts=True)
+        if np.gcd.reduce(kinds) > 1 and not np.ptp(counts):
+            return 0.0, ""  # equal steps, some of which are lost
+        if step == single:
+            if len(kinds) > 1 or np.ptp(counts):
+                return single, ", as single precision (float32) does with numbers of this size"
+        elif of_kind.max() < _REGULAR * len(steps):
+            return step, ""
     return 0.0, ""
 
 
@@ -180,8 +179,8 @@ def doubts_of_track(
                 tuple(fast.tolist()),
             )
     held = int(np.count_nonzero(~moves))
-    if held > _HELD * count:
-        yield _of_held(f"{held} of {count} pings", held / count, not moves.any())
+    if held > _HELD * count and moves.any():
+        yield _of_held(f"{held} of {count} pings", held / count)
     if degrees is not None and (degrees == degrees.astype(np.float32)).all():
         step, how = max(_rounded_to(each, 1e-6) for each in degrees.T)
         if step:
