@@ -35,9 +35,10 @@ _LOOK = "look_direction"  # which only some files of a survey may state
 _NOT_IN_PARTS: Without = {RangeLines: ("samples", _LOOK, "georeference")}
 _SKIPPED = 64  # unused channels in a row that are read along: faster than a second read
 _GAP = 3.0  # a gap is a distance between pings of more than this many median distances
-# Files below which their order says little, distance to the next file over that to the nearest, and
-# share of files at the ends of passes: plain choices. Shuffled names reach 0.9.
-_LEAST_FILES, _OUT_OF_PLACE, _PASSES = 4, 3.0, 0.3
+# Files below which their order says little, and the share of those out of place that is reported:
+# plain choices. Shuffled names reach 0.9. A file is out of place if the next one begins so many
+# times farther away than the nearest, and that lies as near as adjacent files do.
+_LEAST_FILES, _REPORTED, _OUT_OF_PLACE, _ADJACENT = 4, 0.25, 2.0, 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,9 +265,8 @@ def natural(name: str) -> tuple[list[int | str], str]:
 def warn_of_order(survey: Survey) -> None:
     """Warn if the files of a survey, in the order of their names, do not follow the track.
 
-    Range lines have no times, so the names alone tell the order, and with it the direction of the
-    track. A file is out of place if the next one begins far away, and another one close by. On
-    parallel passes, the last file of each may look like that.
+    Range lines have no times, so the names alone give the order, and with it the direction of the
+    track.
     """
     files = len(survey.files)
     if files < _LEAST_FILES:
@@ -274,17 +274,21 @@ def warn_of_order(survey: Survey) -> None:
     edges = np.array(survey.begins)
     starts_m, ends_m = survey.geometry.tx_m[edges[:-1]], survey.geometry.tx_m[edges[1:] - 1]
     steps_m = np.linalg.norm(starts_m[1:] - ends_m[:-1], axis=1)
-    away_m, which = cKDTree(starts_m).query(ends_m[:-1], k=2)
-    itself = which[:, 0] == np.arange(files - 1)
-    nearest_m = np.where(itself, away_m[:, 1], away_m[:, 0])
-    wrong = np.flatnonzero(steps_m > _OUT_OF_PLACE * nearest_m)
-    if wrong.size > _PASSES * files:
+    # The nearest beginning of another file. One before, of a single ping, is near in any order.
+    away_m, which = cKDTree(starts_m).query(ends_m[:-1], k=3)
+    number = np.arange(files - 1)[:, None]
+    single = np.append(True, (starts_m == ends_m).all(axis=1))[: files - 1, None]
+    other = np.argmax((which != number) & ((which != number - 1) | ~single), axis=1)
+    nearest_m = away_m[number[:, 0], other]
+    near = nearest_m < _ADJACENT * np.median(nearest_m)
+    wrong = np.flatnonzero(near & (steps_m > _OUT_OF_PLACE * nearest_m))
+    if wrong.size > _REPORTED * files:
         first = int(wrong[0])
         validate.warn(
             f"the files of the survey do not follow the track in the order of their names: after "
             f"{wrong.size} of {files}, first {survey.files[first].name}, the next file begins "
             f"{steps_m[first]:.3g} m away, and another one {nearest_m[first]:.3g} m. Only names "
-            "tell the order of pings, which a beam follows. Name the files in the order of time, "
+            "give the order of pings, which a beam follows. Name the files in the order of time, "
             "or give the direction of the track, BeamWindow(along=...)"
         )
 

@@ -89,13 +89,17 @@ def doubts(
     wrong_units = list(_speed(lines)) or list(_units(lines, wavelength_m))
     yield from wrong_units
     yield from doubts_of_fixes(lines, None if wrong_units or not lines.carrier_hz else wavelength_m)
-    yield from _samples(lines)
+    wrong_samples = list(_samples(lines))
+    yield from wrong_samples
     if grid is None or wrong_units:
         return
     if beam is not None and lines.channels > 1:
         yield from _beam(lines, grid, beam, wavelength_m)
     last_m = lines.last_range_m if last_range_m is None else last_range_m
-    yield from list(_end_fire(lines, grid, last_m)) or _focus(lines, grid)
+    wrong_way = list(_end_fire(lines, grid, last_m))
+    yield from wrong_way
+    if not wrong_way and not wrong_samples:  # which blur the image, too
+        yield from _focus(lines, grid)
 
 
 def _speed(lines: RangeLines) -> Iterator[Finding]:
@@ -339,7 +343,12 @@ def _focused(
     arc_m = points_m[np.abs(away_m - far_m) <= 2 * spread]
     if not len(arc_m):
         return None
-    course = np.linalg.svd(centres_m[near] - centres_m[near].mean(axis=0))[2][0]
+    _, sizes_m, axes = np.linalg.svd(
+        centres_m[near] - centres_m[near].mean(axis=0), full_matrices=False
+    )
+    if sizes_m[1] > _STRAIGHT * sizes_m[0]:  # an error across the track would blur the point, too
+        return None
+    course = axes[0]
     best_m = arc_m[:1]
     while True:
         for _ in range(2):  # moves them to the range of the echo
@@ -363,8 +372,8 @@ def _focused(
     if not extent:
         return None
     cells = min(2 * (2 * step_m / wavelength_m + 4), 128)
-    offsets_m = np.linspace(-1, 1, int(8 * cells) + 1) * cells * wavelength_m / extent
-    linear = np.exp(2j * np.pi / wavelength_m * np.outer(offsets_m, directions - directions.mean()))
+    errors_m = np.linspace(-1, 1, int(8 * cells) + 1) * cells * wavelength_m / extent
+    linear = np.exp(2j * np.pi / wavelength_m * np.outer(errors_m, directions - directions.mean()))
     cycles = 2 / wavelength_m * range_m
     aligned = np.exp(2j * np.pi * (cycles - np.rint(cycles)))
     sums = [np.abs(linear @ (each * aligned)).max() for each in (found, found.conj())]

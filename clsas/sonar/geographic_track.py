@@ -66,6 +66,13 @@ def poses(
     frame = georeference or georeference_of(latitude, longitude, height, heading)
     positions_m = frame.from_geographic(latitude, longitude, height)
     on_map = heading - frame.convergence_deg(latitude, longitude)
+    lost = np.flatnonzero(~np.isfinite(positions_m.sum(axis=1) + on_map))
+    if lost.size:
+        raise ValueError(
+            f"latitude_deg and longitude_deg must lie on one map, but those of ping {lost[0]}, "
+            f"{latitude[lost[0]]:g} and {longitude[lost[0]]:g}, are on another side of the Earth: "
+            "probably a wrong fix"
+        )
     of_x_axis = 90.0 if frame.heading_deg is None else frame.heading_deg
     yaw = np.radians((of_x_axis - on_map + 180) % 360 - 180)
     return positions_m, yaw, frame

@@ -59,6 +59,30 @@ def test_a_point_of_a_phase_history_focuses(tmp_path, nested, kind, offset_m):
     assert image.pixels[20, 20] == pytest.approx(lines.channels, rel=5e-3)
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("GHz", 1e9), ("MHz", 1e6)])
+@pytest.mark.parametrize("first_hz", [9.3e9, 0.42e9, 16e9])
+def test_frequencies_in_ghz_or_mhz_are_converted_with_a_warning(tmp_path, unit, factor, first_hz):
+    history = phase_history(kind=np.float64)
+    frequency = first_hz + 1.5e6 * np.arange(128)
+    antenna_m = np.stack([history[axis][0] for axis in "xyz"], axis=1)
+    range_m = np.linalg.norm(POINT_M - antenna_m, axis=1) - history["r0"][0]
+    history["fp"] = np.exp(-4j * np.pi / speed_of_light * np.outer(frequency, range_m))
+    path = save(tmp_path / "pass.mat", history | {"freq": frequency / factor})
+    with pytest.warns(ClsasWarning, match=f"taken as {unit}"):
+        lines = clsas.load(path)
+    assert lines.carrier_hz == pytest.approx(frequency.mean())
+    image = clsas.backproject(lines, clsas.Grid.points([POINT_M]), accuracy_db=-60)
+    assert abs(image.pixels[0]) == pytest.approx(lines.channels, rel=0.01)
+
+
+def test_frequencies_of_an_unclear_unit_are_refused(tmp_path):
+    """Without reference ranges, MHz and GHz are equally likely."""
+    history = phase_history(kind=np.float64)
+    changed = {"freq": history["freq"] / 1e9, "r0": 0 * history["r0"]}
+    with pytest.raises(ValueError, match=r"pass\.mat: freq must be in Hz, got 9\.3 to 9\.49"):
+        clsas.load(save(tmp_path / "pass.mat", history | changed))
+
+
 def test_windows_are_passed_on(tmp_path):
     path = save(tmp_path / "pass.mat", phase_history())
     plain, windowed = (read_phase_history(path, window=name) for name in ("none", "hamming"))

@@ -11,10 +11,22 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.georeference import Georeference
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
+from clsas.core.lines import RangeLines
 from clsas.core.sound_speed import SoundSpeed
+from clsas.core.validate import ClsasWarning
 from clsas.exact.backprojection import backproject
 from clsas.files.hdf5 import FileFormatError, load, save
-from clsas.mosaics.survey import END, files_of, has_ended, largest_gap_m, open_files, open_survey
+from clsas.mosaics.mosaic import mosaic
+from clsas.mosaics.survey import (
+    END,
+    files_of,
+    has_ended,
+    largest_gap_m,
+    open_files,
+    open_survey,
+    warn_of_order,
+)
+from clsas.sonar.beam import BeamWindow
 
 GRID = Grid.plane((-3, 3, 61), (30, 90, 121))
 TRACK = along_x(120, 0.05)
@@ -223,3 +235,40 @@ def test_errors(folder, tmp_path):
     empty.mkdir()
     with pytest.raises(ValueError, match=r"must contain range lines, but .*empty has no file"):
         open_survey(empty)
+
+
+def survey_of_files(tmp_path, position_m, order):
+    """Two pings per file, whose names follow `order`."""
+    for number, name in enumerate(order):
+        at_m = position_m[2 * number : 2 * number + 2]
+        lines = RangeLines(np.ones((2, 4), complex), 20.0, 0.05, at_m, at_m, 100e3, 1500.0)
+        save(tmp_path / f"ping_{name}.h5", lines)
+    return open_survey(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "order", [np.arange(24)[::-1], np.random.default_rng(1).permutation(24), np.arange(24) * 7 % 24]
+)
+def test_names_that_contradict_the_track_are_warned_of(order, tmp_path):
+    survey = survey_of_files(tmp_path, along_x(48, 0.05), order)
+    with pytest.warns(ClsasWarning, match="do not follow the track in the order of their names"):
+        warn_of_order(survey)
+
+
+def test_nothing_is_said_of_files_in_order_or_of_parallel_passes(tmp_path):
+    passes = [along_x(8, 0.05, y=10.0 * row)[:: (-1) ** row] for row in range(6)]
+    there = [along_x(12, 0.05, y=10.0 * row) for row in range(4)]
+    for number, position_m in enumerate((along_x(48, 0.05), *map(np.concatenate, (passes, there)))):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        warn_of_order(survey_of_files(folder, position_m, np.arange(24)))
+
+
+@pytest.mark.slow
+def test_mosaics_of_folders_warn_of_their_order_only_under_a_beam(tmp_path):
+    survey_of_files(tmp_path, along_x(48, 0.05), np.random.default_rng(2).permutation(24))
+    grid = Grid.plane((-0.1, 0.1, 5), (20.05, 20.1, 5))
+    mosaic(tmp_path, grid)
+    mosaic(tmp_path, grid, beam=BeamWindow(20.0, along=[1, 0, 0]))
+    with pytest.warns(ClsasWarning, match="do not follow the track"):
+        mosaic(tmp_path, grid, beam=BeamWindow(20.0))

@@ -61,6 +61,44 @@ def test_headings_in_radians_and_swapped_angles_are_refused():
         clsas.Track.from_geographic(latitude, longitude, 0.0, 400.0, time_s)
 
 
+def with_value(values, numbers, value):
+    values = np.array(values)
+    values[numbers] = value
+    return values
+
+
+@pytest.mark.parametrize("longitude", [5.4, -47.3])
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda each: with_value(each, 7, 0.0), "ping 7 is at latitude 0, longitude 0"),
+        (lambda each: with_value(each, 30, each[30] + 0.01), r"jumps at 2 of 39 steps, by up to"),
+        (lambda each: np.where(np.arange(40) < 25, each, each - 0.003), "jumps at 1 of 39 steps"),
+        (lambda each: each[np.arange(40) // 10 * 10], "36 of 40 pings have exactly the position"),
+        (lambda each: each.astype(np.float32), "are rounded to .* as single precision"),
+    ],
+)
+def test_fixes_that_cannot_be_right_are_warned_of_once(change, said, longitude):
+    at = [change(each) for each in course(30.0, pings=40, longitude=longitude)]
+    with pytest.warns(clsas.ClsasWarning, match=said) as caught:
+        clsas.Track.from_geographic(*at, -10.0, 30.0, 0.2 * np.arange(40))
+    assert len(caught) == 1
+
+
+def test_a_fix_on_the_other_side_of_the_earth_is_refused():
+    latitude, longitude = (with_value(each, 7, 0.0) for each in course(30.0, longitude=179.0))
+    with pytest.raises(ValueError, match="those of ping 7, 0 and 0, are on another side"):
+        clsas.Track.from_geographic(latitude, longitude, -10.0, 30.0, 0.2 * np.arange(20))
+
+
+def test_nothing_is_said_of_noisy_fixes_lost_pings_and_digits_as_receivers_write_them():
+    random = np.random.default_rng(0)
+    kept = np.sort(random.permutation(200)[:150])
+    latitude, longitude = (each[kept] for each in course(70.0, pings=200, step_m=0.15))
+    latitude = (latitude + 3e-7 * random.normal(size=150)).round(8)
+    clsas.Track.from_geographic(latitude, longitude.round(8), -10.0, 70.0, 0.1 * kept)
+
+
 def test_a_track_across_the_date_line_lies_together():
     track = clsas.Track.from_geographic(
         *course(90.0, longitude=179.9999), 0.0, 90.0, np.arange(20.0)

@@ -3,6 +3,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import fresnel
 
+from clsas.core.validate import ClsasWarning
 from clsas.sonar.system import BARKER_13, Pulse, Sonar, element_pattern, line_array
 
 CHIRP = Pulse(carrier_hz=1e6, bandwidth_hz=100e3, duration_s=1e-3)
@@ -181,3 +182,14 @@ def test_a_pulse_keeps_plain_numbers():
     for name in ("carrier_hz", "bandwidth_hz", "duration_s", "taper"):
         assert type(getattr(pulse, name)) is float
     assert Pulse.phase_code(1e5, 1e-3, np.array([1, -1])).code == (1, -1)
+
+
+@pytest.mark.parametrize(("duration_s", "bandwidth_hz"), [(2.0, 30e3), (1.0, 60e3), (20.0, 4e3)])
+def test_durations_in_milliseconds_are_warned_of(duration_s, bandwidth_hz):
+    with pytest.warns(ClsasWarning, match="in seconds, not in milliseconds"):
+        Pulse(100e3, bandwidth_hz, duration_s)
+
+
+def test_nothing_is_said_of_long_pulses_of_low_frequency_or_of_radar():
+    for given in ((1e3, 500.0, 4.0), (100e3, 60e3, 20e-3), (9.6e9, 1.2e9, 50e-6)):
+        Pulse(*given)

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from clsas.core.geometry import bistatic_range_m, legs_m
+from clsas.core.validate import ClsasWarning
 from clsas.sonar.system import Pulse, Sonar
 from clsas.sonar.track import Pointing, Track, channels
 
@@ -222,3 +223,16 @@ def test_channels_and_axes_of_other_types():
         channels(sonar, track, motion_in_flight=1)
     with pytest.raises(TypeError, match="track must be of type Track, got Sonar"):
         Pointing.broadside().axes(sonar)
+
+
+@pytest.mark.parametrize(
+    "angles", [{"yaw_rad": 90.0}, {"yaw_rad": -135}, {"pitch_rad": [0, 2.5, 1]}, {"roll_rad": 4.0}]
+)
+def test_angles_in_degrees_are_warned_of(angles):
+    with pytest.warns(ClsasWarning, match="If it is in degrees, convert it with numpy.radians"):
+        Track(np.zeros((3, 3)), [0, 1, 2], **angles)
+
+
+def test_nothing_is_said_of_several_turns_or_of_a_sonar_upside_down():
+    time_s = np.arange(50.0)
+    Track(np.zeros((50, 3)), time_s, yaw_rad=time_s, pitch_rad=0.3, roll_rad=np.pi)
