@@ -88,9 +88,10 @@ def backproject(
     -----
     ClsasWarning
         If no pixel lies in the beam and within the range of any line, so that the image is zero. If
-        pixels lie behind the elements, where they can only show mirror images. If the image may
-        miss `accuracy_db`, because the grid reaches ends of lines that do not fade,
-        or because the band of the lines fills the whole sampled band.
+        pixels lie behind the elements, where they can only show mirror images. If lines, grid or
+        beam cannot be right, such as positions in millimetres. If the image may miss `accuracy_db`,
+        because the grid reaches ends of lines that do not fade, or because the band of the lines
+        fills the whole sampled band.
 
     See Also
     --------

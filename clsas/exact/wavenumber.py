@@ -71,7 +71,7 @@ def wavenumber(
     ClsasWarning
         If the track is not straight and monostatic. The warning names the remaining range errors.
         If the lines do not contribute to the image, or pixels lie behind the elements, where they
-        can only show mirror images.
+        can only show mirror images. If lines, grid or beam cannot be right.
 
     See Also
     --------

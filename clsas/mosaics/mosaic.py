@@ -315,8 +315,10 @@ def mosaic(
     -----
     ClsasWarning
         If no channel receives from the grid, or pixels lie behind the elements, where they can only
-        show mirror images. A source that grows is not checked. If the image of a folder that may
-        grow differs by more than was asked from that of the same pings in one file.
+        show mirror images; if the geometry of the lines, or samples in memory, cannot be right; if
+        a beam is given and the names of files do not follow the track; or if the image of a folder
+        that may grow differs by more than was asked from that of the same pings in one file. A
+        source that grows is not checked.
 
     See Also
     --------

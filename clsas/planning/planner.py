@@ -118,7 +118,8 @@ def plan(
         If the image may miss the tolerance, because the grid reaches ends of lines that do not
         fade, or because the lines' band fills the whole sampled band; if no pixel lies within the
         range of any line and the beam, so that the image will be zero; if pixels lie behind the
-        elements, where they can only show mirror images; or if the costs stored for the device
+        elements, where they can only show mirror images; if lines, grid or beam cannot be
+        right, such as positions in millimetres; or if the costs stored for the device
         cannot be read, or measured ones cannot be stored.
 
     See Also
