@@ -24,9 +24,10 @@ _STRAY = 20.0
 # Speed between two fixes over the usual one. Noise that hides the motion entirely reaches 7, since
 # the median distance is then that of the noise. Wrong fixes reach thousands.
 _FASTER = 10.0
-_HELD = 0.1
+_HELD = 0.2
 """Share of pings at a position that occurred before, above which fixes are held. Closed tracks
-repeat one. A halt of one ping in ten raises the level of what it sees by 1 dB."""
+repeat one position, and fixes held over two pings half of all. A halt of one ping in five raises
+what it sees by 2 dB."""
 # Step of rounded positions over the wavelength, above which they are too coarse. Rounding to an
 # eighth shifts two-way phases by 0.45 rad rms, which takes 1 dB off a point; to half, 14 dB.
 _COARSE = 0.125

@@ -66,7 +66,7 @@ def with_fix(position_m, numbers, fix_m):
         (with_fix(ahead(), [5, 6, 80], [[0, 3e3, 0], [0, 3e3, 0.1], [900, 0, 0]]), ["stray_fixes"]),
         (with_fix(ahead(), 119, [0, 12, 0]), ["stray_fixes"]),
         (ahead()[PINGS // 10 * 10], ["held_fixes"]),
-        (ahead()[np.minimum(PINGS, 95)], ["held_fixes"]),
+        (ahead()[np.minimum(PINGS, 85)], ["held_fixes"]),
         ((ahead() + UTM_M).astype(np.float32), ["coarse_fixes"]),
         ((ahead(0.11, 90) + UTM_M).astype(np.float32), ["coarse_fixes"]),
         ((ahead(1.037, 30) + UTM_M).astype(np.float32), ["coarse_fixes"]),
