@@ -64,7 +64,8 @@ class BeamWindow:
         For "inverse": element length L, metres. The weights may amplify by 40 dB at most.
     along : array_like, [3] or [channels, 3], optional
         Direction of the track, as a vector of any length. The default is the direction of a smooth
-        curve through the phase centres of the lines; see `directions`.
+        curve through the phase centres of the lines, in any order; see `directions`. Shuffled
+        pings do not tell forward from backward, which matters to a beam with a squint.
     track_pings : int, optional
         Number of pings over which the direction of the track is smoothed, at least 5. The default
         is a quarter of all pings, and at most 101.

@@ -14,6 +14,9 @@ MOST_TRACK_PINGS = 101
 _SMOOTHED_SHARE = 4  # by default a cubic is fitted to a quarter of the pings
 _NEW_LEG = 10.0  # step between pings, in median steps, from which on a new leg of the track begins
 _SHORTEST_LEG = 5  # pings: those that a cubic needs, and one more
+_JUMPS = 0.05  # share of steps to other places from which on pings are out of order; of legs of 20
+_WINDING = 4.0  # length of a track over its extent up to which the order is not questioned
+_MOST_SORTED = 20_000  # pings, which take 2 s
 
 
 def track_directions(lines: RangeLines, pings: int | None = None) -> NDArray[np.float64]:
@@ -21,7 +24,8 @@ def track_directions(lines: RangeLines, pings: int | None = None) -> NDArray[np.
 
     Local cubics are fitted to the mean phase centres of the pings by least squares (Savitzky and
     Golay 1964). Their tangents are interpolated to each channel. Legs of a track that are far apart
-    are smoothed separately.
+    are smoothed separately. Channels may be in any order: if pings jump, each follows the nearest
+    one, in the direction in which most of them advance.
 
     Parameters
     ----------
@@ -35,6 +39,15 @@ def track_directions(lines: RangeLines, pings: int | None = None) -> NDArray[np.
     ValueError
         If there is only one ping, or the platform stands still.
     """
+    if (order := _along_track(lines)) is not None:
+        found = np.empty((lines.channels, 3))
+        found[order] = _directions(lines.without_samples().select(order), pings)
+        return found
+    return _directions(lines, pings)
+
+
+def _directions(lines: RangeLines, pings: int | None) -> NDArray[np.float64]:
+    """Return the direction of the track at every channel, whose order follows the track."""
     channels_m = lines.phase_centres_m
     count = len(lines.ping_starts)
     if count < 2:
@@ -61,6 +74,33 @@ def track_directions(lines: RangeLines, pings: int | None = None) -> NDArray[np.
     at_m = travelled_m[ping] + np.einsum("ci,ci->c", ahead_m, tangent[ping])
     found = np.stack([np.interp(at_m, travelled_m, each) for each in tangent.T], axis=-1)
     return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def _along_track(lines: RangeLines) -> NDArray[np.int64] | None:
+    """Return the order in which channels follow the track; None if theirs does."""
+    centres_m = lines.ping_centres_m
+    steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
+    if steps_m.sum() <= _WINDING * np.linalg.norm(np.ptp(centres_m, axis=0)):
+        return None
+    pings_m, ping = np.unique(lines.tx_m, axis=0, return_inverse=True)
+    if not 2 * _SHORTEST_LEG < len(pings_m) <= _MOST_SORTED:
+        return None
+    ping = ping.ravel()
+    from scipy.spatial import cKDTree  # slow to import
+
+    apart_m = np.median(cKDTree(pings_m).query(pings_m, k=2)[0][:, 1])
+    if np.mean(steps_m > _NEW_LEG * apart_m) <= _JUMPS:
+        return None
+    rank = np.empty(len(pings_m), np.int64)
+    left_m = pings_m.copy()
+    at = int(np.argmax(np.linalg.norm(pings_m - pings_m.mean(axis=0), axis=1)))  # an end
+    for number in range(len(pings_m)):
+        rank[at] = number
+        here_m, left_m[at] = pings_m[at], np.inf
+        at = int(np.argmin(np.sum((left_m - here_m) ** 2, axis=1)))
+    if np.count_nonzero(np.diff(rank[ping]) < 0) > np.count_nonzero(np.diff(rank[ping]) > 0):
+        rank = rank.max() - rank
+    return np.argsort(rank[ping], kind="stable")
 
 
 def _legs(centres_m: NDArray[np.float64]) -> list[NDArray[np.float64]]:

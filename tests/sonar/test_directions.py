@@ -5,7 +5,7 @@ from scipy.signal import savgol_filter
 
 from clsas.core.lines import RangeLines
 from clsas.sonar.beam import BeamWindow
-from clsas.sonar.directions import _tangents
+from clsas.sonar.directions import _tangents, track_directions
 
 X = (1.0, 0, 0)
 DEGREE = np.pi / 180
@@ -71,3 +71,49 @@ def test_tangents_are_those_of_a_savitzky_golay_filter(pings, span):
     window = min(2 * (span // 2) + 1, pings - 1 + pings % 2)
     expected = savgol_filter(centres_m, window, min(3, window - 1), deriv=1, axis=0, mode="interp")
     np.testing.assert_allclose(_tangents(centres_m, span), expected, atol=1e-12)
+
+
+def shuffled(count):
+    return np.random.default_rng(5).permutation(count)
+
+
+def by_name(count):
+    """Order of files ping_1, ping_10, ping_100, ping_2, ... whose numbers count as letters."""
+    return np.array(sorted(range(count), key=lambda number: f"ping_{number + 1}"))
+
+
+def swaying(count=240):
+    x_m = np.linspace(-4, 4, count)
+    return np.column_stack([x_m, 0.05 * np.sin(3 * x_m), 0 * x_m])
+
+
+def arc(count=240):
+    angle = np.linspace(0, 4, count)
+    return 10 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+
+
+def two_legs():
+    return np.concatenate([swaying(120), swaying(120)[::-1] + [0, 3, 0]])
+
+
+@pytest.mark.parametrize("reordered", [shuffled, by_name])
+@pytest.mark.parametrize("track", [swaying, arc, two_legs])
+@pytest.mark.parametrize("receivers", [1, 4])
+def test_channels_may_be_in_any_order(track, reordered, receivers):
+    tx_m = np.repeat(track(), receivers, axis=0)
+    rx_m = tx_m + np.tile(0.01 * np.arange(receivers)[:, None] * [1, 0, 0], (len(track()), 1))
+    order = reordered(len(tx_m))
+    expected, found = (
+        track_directions(
+            RangeLines(
+                np.ones((len(some), 2), complex), 5.0, 0.1, tx_m[some], rx_m[some], 1e5, 1500.0
+            )
+        )
+        for some in (np.arange(len(tx_m)), order)
+    )
+    along = np.einsum("ci,ci->c", found, expected[order])
+    # A shuffled track may as well run backwards.
+    np.testing.assert_allclose(along, along[0], atol=1e-5)
+    assert abs(along[0]) == pytest.approx(1, abs=1e-5)
+    if reordered is by_name and receivers == 1:
+        assert along[0] > 0
