@@ -18,8 +18,9 @@ LEAST_FIXES = 16
 """Fewest positions that show what is usual: a plain choice."""
 _NEIGHBOURS = 4  # a group of up to so many stray fixes is found
 _USUAL = 0.9  # quantile of distances that stands for a moving platform, which may also stand still
-# Distance of a stray fix from its neighbours, over that quantile. Legs of the random scenes reach
-# 2, and a track that has lost ten pings in a row 3; half of it would report dozens of lost pings.
+# Distance of a stray fix to its fourth neighbour, over that quantile. Ends of tracks reach 2, and a
+# few pings beside ten lost ones 7. Half of it would report pings beside fifteen lost ones, and
+# twice as much no jump of less than 80 advances.
 _STRAY = 20.0
 # Speed between two fixes over the usual one. Noise that hides the motion entirely reaches 7, since
 # the median distance is then that of the noise. Wrong fixes reach thousands.
