@@ -251,7 +251,13 @@ def _end_fire(lines: RangeLines, grid: Grid, last_m: NDArray[np.float64]) -> Ite
     _, sizes_m, axes = np.linalg.svd(away_m, full_matrices=False)
     if len(sizes_m) < 2 or not sizes_m[0] or sizes_m[1] > _STRAIGHT * sizes_m[0]:
         return
-    look_m = grid.spread(8)[:, None] - centres_m
+    points_m = grid.spread(8)
+    ahead_m, passed_m = (
+        (each - centres_m.mean(axis=0)) @ axes[0] for each in (points_m, centres_m)
+    )
+    if ahead_m.min() <= passed_m.max() and ahead_m.max() >= passed_m.min():
+        return  # the track passes some pixels
+    look_m = points_m[:, None] - centres_m
     distance_m = np.linalg.norm(look_m, axis=-1)
     reached = (distance_m >= lines.first_range_m[some]) & (distance_m <= last_m[some])
     reached &= distance_m > 0
@@ -361,6 +367,7 @@ def _focused(
         arc_m = best_m + np.linspace(-spread, spread, 17)[:, None] * course
         spread /= 6
     range_m, found = (each[0] for each in at(best_m, near))
+    found = found / (np.abs(found).max() or np.float32(1))  # squares stay within floating point
     level = np.abs(found)
     total, square = float(level.sum()), float((level**2).sum())
     if not total or total**2 < _LEAST_PHASED * square:

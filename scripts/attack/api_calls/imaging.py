@@ -219,11 +219,12 @@ def imaging(folder: Path) -> dict[str, Call]:
                 "tx_m": tx_m,
                 "rx_m": tx_m,
                 "sound_speed_m_s": 3e8,
+                "band_hz": (9e9, 9.006e9),
                 "window": "hann",
                 "oversampling": 2.0,
                 "sign": -1,
             },
-            accepts={"samples": ("an Image",)},
+            accepts={"samples": ("an Image",), "band_hz": optional},
         ),
         "from_full_matrix": Call(
             clsas.from_full_matrix,
