@@ -48,7 +48,7 @@ _PHASED = 128  # channels whose phases show whether a point is in focus
 _LEAST_PHASED = 32  # as many equal ones: chance then reaches 0.46 for any of a thousand directions
 # Sum of phasors over the sum of their magnitudes: of a point in focus, of one that shows how lines
 # should be read, and by how much more it must be. A step of c/fs leaves up to 0.7 of a point.
-_FOCUS, _CLEAR, _SHARPER = 0.7, 0.8, 1.25
+_FOCUS, _CLEAR, _SHARPER = 0.7, 0.9, 1.25
 _BLUR = 100.0  # aperture over its resolution by which the wrong sign blurs a point
 _ARC = 64  # grid points along either side among which the brightest echo is searched
 
