@@ -38,6 +38,8 @@ def block_means(
         Mean of a block without weight.
     """
     weights = weights.astype(values.real.dtype)
-    total = block_sums(np.where(weights > 0, weights * values, values.dtype.type(0)), down, across)
+    weighed = weights * values
+    weighed[weights == 0] = 0  # whatever the value is
+    total = block_sums(weighed, down, across)
     count = block_sums(weights, down, across)
     return np.divide(total, count, out=np.full_like(total, empty), where=count > 0)
