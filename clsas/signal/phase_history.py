@@ -126,6 +126,7 @@ def from_phase_history(
     reference_m = validate.array(
         "reference_range_m", reference_range_m, np.float64, (channels,), broadcast=True
     )
+    weigh = band_window(window, 1.0)
     band_hz = _bands(band_hz, first_hz, step_hz, count)
     validate.memory("oversampling", 8 * channels * oversampling * count)
     length = fft.next_fast_len(math.ceil(oversampling * count))
@@ -137,14 +138,20 @@ def from_phase_history(
     farthest_m = float(np.abs(reference_m).max() - offset_m[0])
     validate.phase(carrier_hz, speed, farthest_m)
     _warn_of_slips(first_hz, step_hz * (count - 1), reference_m)
-    weights = _weights(window, band_hz, first_hz, step_hz, count)
+    centre = (band_hz.mean(axis=1) - first_hz) / step_hz
+    width = np.ptp(band_hz, axis=1) / step_hz
 
     lines = np.empty((channels, length), np.complex64)
     rows = max(1, _BLOCK // length)
     for first in range(0, channels, rows):
         block = slice(first, first + rows)
         spectrum = samples[block].astype(np.complex128)
-        spectrum = (spectrum if sign == -1 else spectrum.conj()) * weights[block]
+        place = (np.arange(count) - centre[block, None]) / width[block, None]
+        weights = np.where(np.abs(place) <= 0.5 + 1e-9, weigh(np.clip(place, -0.5, 0.5)), 0.0)
+        total = weights.sum(axis=1, keepdims=True)
+        if not np.abs(total).min() > 0:
+            raise ValueError(f"window must have a sum other than 0, got {validate.shown(window)}")
+        spectrum = (spectrum if sign == -1 else spectrum.conj()) * (weights / total)
         if equal:
             part = fft.fftshift(length * fft.ifft(spectrum, length, workers=-1), axes=1)
         else:
@@ -202,25 +209,6 @@ def _bands(
             f"{sampled_hz[narrow[0], 0]:g} to {sampled_hz[narrow[0], 1]:g} Hz"
         )
     return band
-
-
-def _weights(
-    window: Window,
-    band_hz: NDArray[np.float64],
-    first_hz: NDArray[np.float64],
-    step_hz: NDArray[np.float64],
-    count: int,
-) -> NDArray[np.float64]:
-    """Return weights of the frequencies of every channel, 0 outside its band, with the sum 1."""
-    weigh = band_window(window, 1.0)
-    low_hz, high_hz = band_hz.T
-    centre, width = ((low_hz + high_hz) / 2 - first_hz) / step_hz, (high_hz - low_hz) / step_hz
-    place = (np.arange(count) - centre[:, None]) / width[:, None]
-    weights = np.where(np.abs(place) <= 0.5 + 1e-9, weigh(np.clip(place, -0.5, 0.5)), 0.0)
-    total = weights.sum(axis=1, keepdims=True)
-    if not np.abs(total).min() > 0:
-        raise ValueError(f"window must have a sum other than 0, got {validate.shown(window)}")
-    return weights / total
 
 
 def _frequencies(name: str, value: ArrayLike, channels: int) -> NDArray[np.float64]:
