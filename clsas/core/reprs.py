@@ -57,6 +57,11 @@ def quantity(value: float, unit: str) -> str:
     return f"{value:.{digits}g} {unit}".rstrip()
 
 
+def measured(value: float, unit: str, digits: int = 4) -> str:
+    """Return a measured value to some significant digits, with a prefixed unit that suits it."""
+    return quantity(float(f"{value:.{digits}g}"), unit)
+
+
 def with_deviation(value: float, deviation: float, unit: str) -> str:
     """Return a value and its standard deviation, rounded alike, such as "4.00 ± 0.15 mm"."""
     if not 0 < deviation < math.inf:

@@ -18,6 +18,7 @@ from clsas.core.conditioning import DEAD_DB, are_dead
 from clsas.core.findings import Finding
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.pings import STILL
+from clsas.core.reprs import measured
 from clsas.inspection.phase_sign import CLEAR
 from clsas.inspection.recording import (
     CONSTANT_DB,
@@ -26,7 +27,7 @@ from clsas.inspection.recording import (
     Recording,
     constant_share,
 )
-from clsas.inspection.result import measured, runs
+from clsas.inspection.result import runs
 from clsas.inspection.slips import POINTS, covered, likely_slip, ranges_m
 from clsas.signal.ambiguity import end_powers
 from clsas.signal.doubts import MOST_WAVELENGTHS, doubts

@@ -179,26 +179,27 @@ class Inspection:
         low_hz, high_hz = self.band_hz
         speed = "unknown: the lines have neither times nor velocities"
         if self.speed_m_s is not None:
-            speed = measured(self.speed_m_s, "m/s")
+            speed = reprs.measured(self.speed_m_s, "m/s")
         carrier = "0: the lines still have their carrier"
         if self.carrier_hz:
             carrier = reprs.quantity(self.carrier_hz, "Hz")
-        band = f"{measured(high_hz - low_hz, 'Hz')} about {measured((low_hz + high_hz) / 2, 'Hz')}"
-        length = measured((self.length - 1) * self.range_step_m, "m")
-        advance = f"{measured(self.advance_m, 'm')} per ping"
+        middle = reprs.measured((low_hz + high_hz) / 2, "Hz")
+        band = f"{reprs.measured(high_hz - low_hz, 'Hz')} about {middle}"
+        length = reprs.measured((self.length - 1) * self.range_step_m, "m")
+        advance = f"{reprs.measured(self.advance_m, 'm')} per ping"
         rows = [
             ("channels", f"{self.channels} in {self.pings} pings"),
             ("geometry", f"{self.geometry}{array}"),
-            ("track", f"{measured(self.track_m, 'm')} long, {advance}"),
+            ("track", f"{reprs.measured(self.track_m, 'm')} long, {advance}"),
             ("depth (z)", _span(*self.depths_m)),
             ("speed", speed),
             ("looks", self._looks()),
             ("carrier", carrier),
-            ("measured band", f"{band}, wavelength {measured(self.wavelength_m, 'm')}"),
+            ("measured band", f"{band}, wavelength {reprs.measured(self.wavelength_m, 'm')}"),
             ("oversampling", f"{self.oversampling:.3g}"),
             (
                 "samples",
-                f"{self.length} per line, {measured(self.range_step_m, 'm')} apart: {length}",
+                f"{self.length} per line, {reprs.measured(self.range_step_m, 'm')} apart: {length}",
             ),
             ("first range", _span(*self.first_range_m)),
             ("last range", _span(*self.last_range_m)),
@@ -237,11 +238,6 @@ def runs(indices: Iterable[int]) -> str:
         parts.append(f"{first}" if first == last else f"{first}-{last}")
     rest = len(parts) - _MOST_RUNS
     return ", ".join(parts[:_MOST_RUNS]) + (f" and {rest} more runs" if rest > 0 else "")
-
-
-def measured(value: float, unit: str) -> str:
-    """Return a measured value to four digits, with a prefixed unit that suits it."""
-    return reprs.quantity(float(f"{value:.4g}"), unit)
 
 
 def _span(low_m: float, high_m: float) -> str:

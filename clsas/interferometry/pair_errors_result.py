@@ -119,7 +119,7 @@ class PairErrors:
         estimated = zip(self.unknowns, self.values.tolist(), self.sd.tolist(), strict=True)
         found = [in_words(name, value, sd) for name, value, sd in estimated]
         found += [f"{name} held" for name in self.held]
-        residual = reprs.quantity(float(f"{self.residual_m:.3g}"), "m")
+        residual = reprs.measured(self.residual_m, "m", 3)
         return [*found, f"residual {residual} rms at {self.samples:.0f} independent places"]
 
     @property

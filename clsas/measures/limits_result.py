@@ -212,4 +212,4 @@ def shown(value: float, unit: str) -> str:
         return f"{value:.1f} dB"
     if unit == "m" and abs(value) >= 10e3:
         return f"{value / 1e3:.4g} km"
-    return reprs.quantity(float(f"{value:.4g}"), unit)
+    return reprs.measured(value, unit)

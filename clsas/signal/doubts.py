@@ -14,12 +14,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import reprs
 from clsas.core.banks import warn_of_banks
 from clsas.core.findings import Finding, warn_of
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
+from clsas.core.reprs import measured
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.fixes import LEAST_FIXES, doubts_of_fixes
 from clsas.sonar.looking import behind
@@ -123,7 +123,7 @@ def _units(lines: RangeLines, wavelength_m: float) -> Iterator[Finding]:
     extent_m = float(np.linalg.norm(np.ptp(centres_m, axis=0)))
     if lines.channels < LEAST_FIXES or not extent_m:
         return
-    wavelength = reprs.quantity(float(f"{wavelength_m:.3g}"), "m")
+    wavelength = measured(wavelength_m, "m", 3)
     # Those closer than a thousandth of a wavelength are one: arrays repeat phase centres.
     cells = np.rint((centres_m - centres_m[0]) / (1e-3 * wavelength_m))
     _, first = np.unique(cells, axis=0, return_index=True)
@@ -140,7 +140,7 @@ def _units(lines: RangeLines, wavelength_m: float) -> Iterator[Finding]:
         yield Finding(
             "advance",
             f"all {lines.channels} phase centres lie within "
-            f"{reprs.quantity(float(f'{extent_m:.3g}'), 'm')}, less than half the wavelength of "
+            f"{measured(extent_m, 'm', 3)}, less than half the wavelength of "
             f"{wavelength}: this is too little for an aperture",
             extent_m,
             _SHORTEST * wavelength_m,
@@ -149,7 +149,7 @@ def _units(lines: RangeLines, wavelength_m: float) -> Iterator[Finding]:
     elif usual_m < _DENSEST * wavelength_m:
         yield Finding(
             "advance",
-            f"phase centres are {reprs.quantity(float(f'{usual_m:.3g}'), 'm')} apart, less than "
+            f"phase centres are {measured(usual_m, 'm', 3)} apart, less than "
             f"1/{1 / _DENSEST:g} of the wavelength of {wavelength}",
             usual_m,
             _DENSEST * wavelength_m,
@@ -158,7 +158,7 @@ def _units(lines: RangeLines, wavelength_m: float) -> Iterator[Finding]:
     elif usual_m > MOST_WAVELENGTHS * wavelength_m:
         yield Finding(
             "advance",
-            f"phase centres are {reprs.quantity(float(f'{usual_m:.3g}'), 'm')} apart, more than "
+            f"phase centres are {measured(usual_m, 'm', 3)} apart, more than "
             f"{MOST_WAVELENGTHS:g} wavelengths of {wavelength}",
             usual_m,
             MOST_WAVELENGTHS * wavelength_m,
@@ -199,7 +199,7 @@ def _beam(
             yield Finding(
                 "beam",
                 f"the beam of {beam.width_deg:g} degrees resolves "
-                f"{reprs.quantity(float(f'{cell_m:.3g}'), 'm')} along the track, "
+                f"{measured(cell_m, 'm', 3)} along the track, "
                 f"{cell_m / pitch_m:.3g} times the spacing of the pixels",
                 cell_m,
                 _COARSER * pitch_m,

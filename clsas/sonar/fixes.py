@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import reprs
 from clsas.core.findings import Finding
 from clsas.core.lines import RangeLines
+from clsas.core.reprs import measured
 
 LEAST_FIXES = 16
 """Fewest positions that show what is usual: a plain choice."""
@@ -65,8 +65,8 @@ def _stray(fixes_m: NDArray[np.float64], of_channels_m: NDArray[np.float64]) -> 
     yield Finding(
         "stray_fixes",
         f"{stray.size} of {len(fixes_m)} positions lie far from all others, the farthest "
-        f"{reprs.quantity(float(f'{away_m[worst]:.3g}'), 'm')} away at ({place}) m, where "
-        f"{reprs.quantity(float(f'{limit_m / _STRAY:.3g}'), 'm')} is usual: probably wrong fixes "
+        f"{measured(away_m[worst], 'm', 3)} away at ({place}) m, where "
+        f"{measured(limit_m / _STRAY, 'm', 3)} is usual: probably wrong fixes "
         "of the navigation",
         float(away_m[worst]),
         limit_m,
@@ -103,9 +103,7 @@ def _coarse(lines: RangeLines, wavelength_m: float) -> Iterator[Finding]:
     for values, decimals in [*columns, *((values, ()) for values in lines.rx_m.T)]:
         step_m, how = _rounded_to(values, least_m, decimals)
         if step_m:
-            step, wavelength = (
-                reprs.quantity(float(f"{each:.3g}"), "m") for each in (step_m, wavelength_m)
-            )
+            step, wavelength = (measured(each, "m", 3) for each in (step_m, wavelength_m))
             yield Finding(
                 "coarse_fixes",
                 f"positions are rounded to {step}{how}, but should be known to an eighth of the "
@@ -173,7 +171,7 @@ def doubts_of_track(
             yield Finding(
                 "jumps",
                 f"the track jumps at {fast.size} of {count - 1} steps, by up to "
-                f"{reprs.quantity(float(f'{steps_m[worst]:.4g}'), 'm')} after ping {worst}: a "
+                f"{measured(steps_m[worst], 'm')} after ping {worst}: a "
                 f"speed of {speed_m_s[worst]:.4g} m/s, where {usual_m_s:.3g} m/s is usual; {cause}",
                 float(speed_m_s[worst]),
                 _FASTER * usual_m_s,
@@ -189,7 +187,7 @@ def doubts_of_track(
             yield Finding(
                 "coarse_fixes",
                 f"latitudes and longitudes are rounded to {step:.2g} degrees, "
-                f"{reprs.quantity(float(f'{111e3 * step:.2g}'), 'm')} on the ground{how}",
+                f"{measured(111e3 * step, 'm', 2)} on the ground{how}",
                 step,
                 1e-6,
                 "keep latitudes and longitudes in float64",

@@ -200,7 +200,7 @@ def _spacing_limit(
         element_length_m = survey.element_length_m
     if element_length_m is not None:
         length = validate.positive("element_length_m", element_length_m, "m")
-        reason = f", half the element length of {_rounded(length)}"
+        reason = f", half the element length of {reprs.measured(length, 'm')}"
         return _SpacingLimit(wavelength, length / 2, reason, of_element=True)
     if beam is not None:
         low, high = np.sin(np.radians(beam.squint_deg + np.array([-0.5, 0.5]) * beam.width_deg))
@@ -278,19 +278,14 @@ def _check_spacing(found: Spacing, ranges: NDArray | None) -> list[Finding]:
     return [
         Finding(
             "along_track_spacing",
-            f"phase centres are up to {_rounded(spacing)} apart along the track, but should be at "
-            f"most {_rounded(limit)} apart{reason}{where}",
+            f"phase centres are up to {reprs.measured(spacing, 'm')} apart along the track, but "
+            f"should be at most {reprs.measured(limit, 'm')} apart{reason}{where}",
             spacing,
             limit,
             "survey more slowly, ping faster or use a narrower beam; for lines that are already "
             "recorded, image with a beam (beam=clsas.BeamWindow) that leaves grating lobes out",
         )
     ]
-
-
-def _rounded(length_m: float) -> str:
-    """Return a length with four digits and its unit."""
-    return reprs.quantity(float(f"{length_m:.4g}"), "m")
 
 
 def _check_ping_rate(sonar: Sonar, track: Track, ranges: NDArray) -> list[Finding]:
