@@ -28,14 +28,14 @@ def checked_positions(path: str | os.PathLike, lines: RangeLines) -> RangeLines:
     pings = Transmissions.of(lines)
     if pings.count < 2:
         return lines
-    if pings.usual_step_m:
-        checked(path, lines)
     if not pings.usual_step_m:
         validate.warn(
             f"{os.fspath(path)}: all {pings.count} pings have the same position. The navigation "
             "seems to be missing; without it the lines form no aperture"
         )
-    elif (turns := pings.turns).size:
+        return lines
+    checked(path, lines)
+    if (turns := pings.turns).size:
         validate.warn(
             f"{os.fspath(path)}: the track turns back {turns.size} "
             f"time{'s' * (turns.size > 1)} (first after ping {turns[0]}), so pings may be out of "

@@ -98,12 +98,12 @@ def beam_of_growing(beam: BeamWindow) -> BeamWindow:
 def warn_of_window(beam: BeamWindow, geometry: RangeLines, request: dict[str, Any]) -> None:
     """Warn if a growing survey's image differs from that of the same pings in one file.
 
-    The direction of the track is smoothed over another number of pings. The difference is the rms
-    of that of the weights, relative to their own.
+    `beam` is that of the file, whose direction follows the track over another number of pings.
+    The difference is the rms of that of the weights, relative to their own.
     """
-    growing = beam_of_growing(beam)
-    if growing is beam or len(geometry.ping_starts) < 2:
+    if len(geometry.ping_starts) < 2:
         return
+    growing = beam_of_growing(beam)
     sine = np.linalg.norm(np.cross(beam.directions(geometry), growing.directions(geometry)), axis=1)
     power = shift_error(beam, float(np.sqrt(np.mean(sine**2))), geometry)
     ways = request.get("tolerance_db"), request.get("tolerance_wavelengths")

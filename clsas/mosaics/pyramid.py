@@ -65,17 +65,16 @@ def levels(pixels: NDArray[np.complex64], factors: tuple[int, ...]) -> dict[int,
     height = factors[-1] * max(_BAND // factors[-1], 1)
     for first in range(0, len(pixels), height):
         band = pixels[first : first + height]
-        level, factor = Level(np.abs(band), band), 1
-        while True:
+        level = Level(np.abs(band), band)
+        for factor in (1 << power for power in range(factors[-1].bit_length())):
+            if factor > 1:
+                rows, columns = (
+                    covered(0, of_level, factor // 2, of_band)
+                    for of_level, of_band in zip(level.amplitude.shape, band.shape, strict=True)
+                )
+                level = coarser(level, rows, columns)
             if factor in bands:
                 bands[factor].append(level)
-            if factor == factors[-1]:
-                break
-            weights = [
-                covered(0, of_level, factor, of_band)
-                for of_level, of_band in zip(level.amplitude.shape, band.shape, strict=True)
-            ]
-            level, factor = coarser(level, weights[0], weights[1]), 2 * factor
     return {
         factor: Level(
             np.concatenate([each.amplitude for each in found]),

@@ -26,9 +26,9 @@ from clsas.sonar.visibility import sines
 BEST_DB = -85.0
 """Smallest relative rms error of an image that single precision allows."""
 
-_CLOSE_DB = (
-    2.5  # margin by which a request may be out of reach: images at `BEST_DB` err by 3 dB less
-)
+# Margin by which a request may be out of reach without a warning: images at `BEST_DB` err by 3 dB
+# less.
+_CLOSE_DB = 2.5
 # Error power near an end over the power of the end, measured on noise in 40 to 90 % of the band.
 _AT_END = 0.03
 _END = 4  # samples whose mean power is taken as that of an end: the taps on one side of a filter

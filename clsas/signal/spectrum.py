@@ -187,17 +187,16 @@ def _occupied_band(
     least, *_, most = _OUTSIDE_BAND
     noise = np.clip(_NOISE_LEFT * count * smoothed.min(), least, most)
     starts, half = np.arange(count), (count + 1) // 2  # the lowest frequency has the index `half`
-    gap = 0.0
+    gap, widest = 0.0, count / NEEDED_OVERSAMPLING
     for outside in (noise, *(each for each in _OUTSIDE_BAND if each > noise)):
         ends = np.searchsorted(held, held[:count] + (1 - outside) * held[count])
         bins = ends - starts
-        most = count / NEEDED_OVERSAMPLING
-        mixed = (bins <= most) & (ends <= np.where(starts < half, half, half + count))
+        mixed = (bins <= widest) & (ends <= np.where(starts < half, half, half + count))
         if mixed.any():
             first = int(np.argmin(np.where(mixed, bins, count)))
             break
         first = int(np.argmin(bins))
-        if bins[first] <= most:
+        if bins[first] <= widest:
             length = int(_COMPETING * (count - bins[first]))
             within = held[first + length : ends[first] + 1] - held[first : ends[first] + 1 - length]
             if length and within.size and within.min() <= outside * held[count]:
