@@ -27,6 +27,7 @@ _GROUPS = 4  # groups of channels, spread evenly along the lines
 # Points along either side of the grid: first without and with a beam, whose coverage may vary, and
 # then if those find little power.
 _FEW, _SOME, _MANY = 8, 16, 48
+_PAIRS_AT_ONCE = 1 << 16  # of points and channels; bounds memory
 _DARKEST = 1e-8  # least ratio returned, far below what any image resolves
 _DARK = 0.5  # ratio above which images are not dark; sampling alone changes it by 1 dB
 
@@ -92,29 +93,41 @@ def _of_groups(
     """Return the power of sums over groups [groups, channels], relative to that of their terms."""
     channels = groups.ravel()
     part = lines.select(channels)
+    coherent = passed = 0.0
+    at_once = max(_PAIRS_AT_ONCE // len(channels), 1)
+    for first in range(0, len(points_m), at_once):
+        some_m = points_m[first : first + at_once]
+        values = _received(part, some_m, spectrum)
+        if beam is not None and along is not None:
+            values *= _weights(lines, channels, some_m, beam, along)
+        sums = values.reshape(len(some_m), *groups.shape).sum(axis=-1)
+        coherent += float(np.vdot(sums, sums).real)
+        passed += float(np.vdot(values, values).real)
+    return coherent / passed if passed else 1.0
+
+
+def _received(
+    lines: RangeLines, points_m: NDArray[np.float64], spectrum: Spectrum
+) -> NDArray[np.complex128]:
+    """Return s_i(rho_i) exp(j 2 k rho_i) of all channels at points, [points, channels]."""
     range_m = pairwise_range_m(
-        points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
+        points_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
     )
-    sample = (range_m - part.first_range_m) / part.range_step_m
+    sample = (range_m - lines.first_range_m) / lines.range_step_m
     lower = np.floor(sample)
-    inside = (lower >= 0) & (lower < part.length - 1)
+    inside = (lower >= 0) & (lower < lines.length - 1)
     index = np.where(inside, lower, 0).astype(np.int64)
     # Linear interpolation about the centre of the band.
     between = sample - lower
     turns = spectrum.centre * between
-    line = np.arange(len(channels))
-    values = (1 - between) * part.samples[line, index]
-    values = values + between * part.samples[line, index + 1] * np.exp(
+    channel = np.arange(lines.channels)
+    values = (1 - between) * lines.samples[channel, index]
+    values = values + between * lines.samples[channel, index + 1] * np.exp(
         -2j * np.pi * spectrum.centre
     )
-    turns += part.carrier_cycles_per_m * range_m
+    turns += lines.carrier_cycles_per_m * range_m
     values *= np.exp(2j * np.pi * (turns - np.rint(turns)))
-    values *= inside
-    if beam is not None and along is not None:
-        values *= _weights(lines, channels, points_m, beam, along)
-    sums = values.reshape(len(points_m), *groups.shape).sum(axis=-1)
-    passed = float(np.vdot(values, values).real)
-    return float(np.vdot(sums, sums).real) / passed if passed else 1.0
+    return values * inside
 
 
 def _weights(
