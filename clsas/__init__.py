@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from clsas.core.lines import RangeLines
     from clsas.core.sound_speed import SoundSpeed
     from clsas.core.validate import ClsasWarning
-    from clsas.exact.backprojection import backproject
     from clsas.exact.wavenumber import wavenumber
     from clsas.files.airsas import read_airsas
     from clsas.files.cphd import read_cphd
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from clsas.files.phase_histories import read_phase_history
     from clsas.files.sound_speed_files import read_sound_speed
     from clsas.files.xarrays import to_xarray
+    from clsas.imaging import Imager, backproject, factorize, plan
     from clsas.inspection.inspection import inspect
     from clsas.inspection.result import Inspection, PhaseSign
     from clsas.interferometry.heights import heights
@@ -50,9 +50,6 @@ if TYPE_CHECKING:
     from clsas.navigation.known_points import Calibration, calibrate_track
     from clsas.navigation.micronavigation import Micronavigation, micronavigate
     from clsas.opencl.device import DeviceError, list_devices
-    from clsas.planning.factorize import factorize
-    from clsas.planning.imager import Imager
-    from clsas.planning.planner import plan
     from clsas.plans.plan import Plan
     from clsas.processing.chain import Processed, process
     from clsas.signal.band_parts import sub_bands
@@ -168,7 +165,6 @@ _MODULES = {
     "core.lines": "RangeLines",
     "core.sound_speed": "SoundSpeed",
     "core.validate": "ClsasWarning",
-    "exact.backprojection": "backproject",
     "exact.wavenumber": "wavenumber",
     "plans.plan": "Plan",
     "files.airsas": "read_airsas",
@@ -180,6 +176,7 @@ _MODULES = {
     "files.phase_histories": "read_phase_history",
     "files.sound_speed_files": "read_sound_speed",
     "files.xarrays": "to_xarray",
+    "imaging": "Imager backproject factorize plan",
     "inspection.inspection": "inspect",
     "inspection.result": "Inspection PhaseSign",
     "interferometry.heights": "heights",
@@ -203,9 +200,6 @@ _MODULES = {
     "navigation.known_points": "Calibration calibrate_track",
     "navigation.micronavigation": "Micronavigation micronavigate",
     "opencl.device": "DeviceError list_devices",
-    "planning.factorize": "factorize",
-    "planning.imager": "Imager",
-    "planning.planner": "plan",
     "processing.chain": "Processed process",
     "signal.band_parts": "sub_bands",
     "signal.compression": "compress",

@@ -28,14 +28,14 @@ from clsas.cli.parameters import HDF5
 from clsas.cli.wording import command
 from clsas.core import validate
 from clsas.core.image import holds_any
-from clsas.exact.backprojection import prepare
-from clsas.exact.run import execute
+from clsas.exact.decision import ACCURACY_DB
 from clsas.files.scene_tables import PLAN_KEYS
+from clsas.forming import SceneImager, scene_of_plan
 from clsas.measures.tradeoff import summary
 from clsas.opencl.device import Device, KernelTimes, open_device
 from clsas.planning.request import WORST_TOLERANCE_DB
-from clsas.plans.factorization import UNREACHED, ExactImage
-from clsas.signal.doubts import warn_before_imaging
+from clsas.plans.factorization import ExactImage
+from clsas.scene import Scene
 from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 
 _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is reported
@@ -223,22 +223,27 @@ def _exactly(
     progress: Callable[[int, int], None] | None,
 ) -> _Formed:
     """Form an exact image, because it was requested or because a plan chose it."""
-    why, warned = "", False
-    if chosen is not None and isinstance(chosen.method, ExactImage):
-        request = {"accuracy_db": chosen.method.accuracy_db}
+    why = ""
+    how: clsas.Plan | ExactImage
+    if chosen is not None:  # the plan has warned
+        scene, how = scene_of_plan(lines, grid, chosen), chosen
         if chosen.tolerance_db is not None:
             why = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; "
-        warned = chosen.method.reason == UNREACHED
-    preparation = prepare(lines, grid, device=device, beam=beam, **request)
-    if chosen is None:  # otherwise the plan has warned
-        warn_before_imaging(lines, grid, beam)
-        preparation.warn_of_ambiguity()
-    interpolator, ratio = preparation.interpolator, preparation.resampling.ratio
+    else:
+        method = ExactImage(**{"accuracy_db": ACCURACY_DB, **request})
+        is_fixed = None not in (method.taps, method.upsampling)
+        scene, how = Scene.of(lines, grid, beam, None if is_fixed else method.accuracy_db), method
+        scene.warn("accuracy_db", 0.0 if is_fixed else method.accuracy_db)
+    imager = SceneImager(
+        scene, how, device, warned=chosen is not None and not scene.is_reached, keep=False
+    )
+    assert imager.decision is not None
+    interpolator, ratio = imager.decision.interpolator, imager.decision.resampling.ratio
     return _Formed(
-        execute(preparation, progress=progress, warned=warned),
+        imager.form(lines, progress),
         f"{why}{interpolator.taps} taps on lines upsampled {ratio:.3g} times",
-        preparation.predicted_error_db,
-        preparation.left_out,
+        imager.decision.error_db(scene),
+        scene.left_out,
         {
             "method": "exact",
             "taps": interpolator.taps,

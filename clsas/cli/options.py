@@ -12,7 +12,7 @@ import click
 
 from clsas.cli.parameters import AXIS, INPUT, PERCENTILES, RATIO, STAGES, Output
 from clsas.core import validate
-from clsas.exact.backprojection import BEST_ACCURACY_DB
+from clsas.exact.decision import BEST_ACCURACY_DB
 from clsas.files.hdf5 import SUFFIXES
 from clsas.planning.request import (
     BEST_TOLERANCE_DB,

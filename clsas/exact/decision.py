@@ -8,22 +8,29 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.core import validate
+from clsas.core.decibels import in_db, power
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, fastest, some_channels
 from clsas.core.wavelengths import cycles_per_m_at, wavelength_m
-from clsas.exact.checks import check_distances
 from clsas.exact.groups import Groups, GroupsEstimate
 from clsas.exact.layout import GEOMETRY_ERROR, Conditions, allowed, estimate_layout, lay_out
 from clsas.exact.lookup import lookup_cost
 from clsas.exact.tiles import Tiles
 from clsas.opencl import phases
 from clsas.opencl.device import Device
+from clsas.scene import Scene
 from clsas.signal import interpolation
-from clsas.signal.ambiguity import Ambiguity
+from clsas.signal.ambiguity import BEST_DB
 from clsas.signal.interpolation import Interpolator, Resampling
 from clsas.signal.spectrum import Spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
+
+ACCURACY_DB = -60.0
+"""Accuracy of exact images by default."""
+BEST_ACCURACY_DB = BEST_DB
+"""Best accuracy that may be requested; float32 does not allow a better one."""
 
 # Channels, and pixels along either side of the grid, for which the beam's fullness is evaluated.
 _SAMPLED_CHANNELS = 256
@@ -54,42 +61,45 @@ class Decision:
     phase_terms: int
     one_cubic: bool
 
+    def error_db(self, scene: Scene) -> float:
+        """Return the relative rms error of the image, of the lines and of what is left out, dB."""
+        of_passed = power(self.interpolator.error_db) / scene.ambiguity.least_brightness
+        return in_db(of_passed + scene.ambiguity.error_power + scene.left_out_error)
+
 
 def decide(
-    lines: RangeLines,
-    grid: Grid,
-    *,
+    scene: Scene,
     device: Device,
     accuracy_db: float,
-    spectrum: Spectrum,
-    left_open: Ambiguity,
-    beam: BeamWindow | None = None,
-    along: NDArray[np.float64] | None = None,
+    *,
     taps: int | None = None,
     upsampling: float | None = None,
-    left_out_error: float = 0.0,
     estimate: bool = False,
     windows: int = 1,
 ) -> Decision:
-    """Decide how to form an exact image.
+    """Decide how to form the exact image of a scene.
 
     Parameters
     ----------
-    lines, grid, device, accuracy_db, beam, taps, upsampling
-        As for `clsas.backproject`. With both `taps` and `upsampling`, `accuracy_db` has no effect.
-    spectrum, left_open : Spectrum, Ambiguity
-        Spectrum and ambiguity measured from the lines.
-    along : float64 [channels, 3], optional
-        Unit directions of the track, for a beam.
-    left_out_error : float
-        Error power of the effects that the model leaves out.
+    scene : Scene
+    device : Device
+    accuracy_db : float
+        Allowed relative rms error, dB. With both `taps` and `upsampling` it has no effect.
+    taps, upsampling
+        As for `clsas.backproject`.
     estimate : bool
-        If True, groups are estimated instead of gathered, which would take longest.
+        If True, groups are estimated instead of gathered, which would take longest, and
+        `accuracy_db` is what the effects left out leave of the allowed error.
     windows : int
         Number of windows of estimated groups; see `Groups.windows`.
     """
+    lines, beam, spectrum, ambiguity = scene.lines, scene.beam, scene.spectrum, scene.ambiguity
+    grid = scene.grid
+    if not scene.is_reached and not estimate:
+        # Nothing is formed, but to lay out distant pixels would take long.
+        grid = Grid.points(grid.spread(1))
     fixed = taps is not None and upsampling is not None
-    accuracy_db = left_open.of_passed_db(accuracy_db)
+    accuracy_db = ambiguity.of_passed_db(accuracy_db)
     geometry_error = GEOMETRY_ERROR if fixed else allowed(accuracy_db)
     phase_terms = phases.TERMS[-1]
     if not fixed:
@@ -101,7 +111,7 @@ def decide(
         error=geometry_error,
         speed_ratio=fastest(lines),
         beam=beam,
-        fullness=fullness_of(lines, grid, beam, along),
+        fullness=fullness_of(lines, grid, beam, scene.along),
     )
     layout: Tiles | Groups | GroupsEstimate
     if estimate:
@@ -110,7 +120,7 @@ def decide(
         layout = lay_out(grid, conditions)
     interpolator = interpolation.choose(
         spectrum,
-        left_open.rest_db(accuracy_db, left_out_error),
+        ambiguity.rest_db(accuracy_db, 0.0 if estimate else scene.left_out_error),
         taps=taps,
         upsampling=upsampling,
         other_error=math.hypot(geometry_error, phases.error(phase_terms)),
@@ -123,6 +133,17 @@ def decide(
         check_distances(conditions.antennas_m, layout)
         one_cubic = _one_cubic_serves(lines, layout, conditions)
     return Decision(layout, interpolator, resampling, phase_terms, one_cubic)
+
+
+def check_distances(antennas_m: NDArray[np.float64], layout: Tiles | Groups) -> None:
+    """Raise ValueError for distances so large that their squares overflow float32."""
+    points_m = np.concatenate([antennas_m, layout.centres_m(slice(None))])
+    extent_m = float(np.ptp(points_m, axis=0).max())
+    if extent_m > validate.FARTHEST_M:
+        raise ValueError(
+            f"lines and grid must lie within {validate.FARTHEST_M:g} m of each other, "
+            f"got {extent_m:g} m"
+        )
 
 
 def antennas_of(lines: RangeLines, beam: BeamWindow | None) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.wavelengths import wavelength_m
-from clsas.exact.preparation import Preparation
+from clsas.exact.decision import Decision
 from clsas.signal.ray_delays import delays_s
 from clsas.signal.readout import interpolated
 from clsas.signal.spectrum import measure_spectrum
@@ -30,20 +30,27 @@ _SUM_ERROR = 1e-12  # relative error of non-uniform FFTs
 
 
 def same_interpolator(
-    preparation: Preparation, points_m: ArrayLike, *, progress: Progress = None
+    lines: RangeLines,
+    decision: Decision,
+    points_m: ArrayLike,
+    *,
+    beam: BeamWindow | None = None,
+    progress: Progress = None,
 ) -> NDArray[np.complex128]:
-    """Return the image of a preparation at some points, as the device forms it but in float64.
+    """Return the image of a decision at some points, as the device forms it but in float64.
 
     The image of the device differs by rounding, by the expansion of the geometry, and by short
     polynomials for sine and cosine (`clsas.opencl.phases`).
 
     Parameters
     ----------
-    preparation : Preparation
-        Lines, their interpolation and the beam, from `clsas.exact.backprojection.prepare`. The
-        device is not used.
+    lines : RangeLines
+    decision : Decision
+        Interpolation of the lines.
     points_m : array_like, [..., 3]
         Positions, metres.
+    beam : BeamWindow, optional
+        Weights of the channels by aspect angle.
     progress : callable, optional
         Called as progress(channels done, channels).
 
@@ -56,15 +63,14 @@ def same_interpolator(
     TypeError, ValueError
         If an argument is of a wrong kind or shape, or a position is not finite.
     """
-    validate.instance("preparation", preparation, Preparation)
-    resampling, interpolator = preparation.resampling, preparation.interpolator
+    resampling, interpolator = decision.resampling, decision.interpolator
 
     def evaluate(
         samples: NDArray[np.complex128], position: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
         return interpolated(samples, position, interpolator, resampling)
 
-    return _sum_channels(preparation.lines, points_m, evaluate, progress, preparation.beam)
+    return _sum_channels(lines, points_m, evaluate, progress, beam)
 
 
 def ideal(
@@ -153,7 +159,7 @@ def sampled_error_db(
         Image to measure.
     reference : callable
         Function of positions [n, 3], metres, that returns the correct pixels there, complex [n].
-        Examples are `functools.partial(same_interpolator, preparation)` and
+        Examples are `functools.partial(same_interpolator, lines, decision)` and
         `functools.partial(ideal, lines)`.
     pixels : int
         Number of pixels to compare. If the image has fewer, all of them are compared.

@@ -1,26 +1,23 @@
-"""Run of an exact image that was prepared, on its device."""
+"""Run of an exact image on its device, by the decision that was made for its scene."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
 from clsas.exact.blocks import band_parts, blocks_of
 from clsas.exact.buffers import block_buffers, is_bistatic, part_buffers
-from clsas.exact.checks import check_numbers
-from clsas.exact.groups import Groups
+from clsas.exact.decision import Decision
+from clsas.exact.groups import Groups, GroupsEstimate
 from clsas.exact.kept import Kept
 from clsas.exact.lookup import lookup_options
-from clsas.exact.preparation import Preparation
 from clsas.exact.references import geometry_rows, references_of
 from clsas.exact.tiles import Tiles, item_pixels
 from clsas.opencl.buffers import (
@@ -34,50 +31,44 @@ from clsas.opencl.buffers import (
     slices,
     upsampled_lines,
 )
-from clsas.opencl.kernels import Kernel
+from clsas.opencl.device import Device
+from clsas.scene import Scene
 from clsas.sonar.beam import INTERVALS, normalising
-from clsas.sonar.coverage import warn_unreached
 from clsas.sonar.visibility import BeamTrack
 
 _SINE_ROUNDING = 1e-5  # upper bound on the device's rounding error of a sine
 _MOST_KEPT_BYTES = 256 << 20  # of references that are kept: more than 20 million of 12 bytes each
 
 
-def execute(
-    preparation: Preparation,
-    *,
-    progress: Callable[[int, int], None] | None = None,
-    warned: bool = False,
-) -> Image:
-    """Return the one image that was prepared; see `ExactImager`."""
-    imager = ExactImager(preparation, warned=warned, most_kept_bytes=0)
-    return imager.form(preparation.lines, progress)
-
-
 class ExactImager:
-    """Imager that forms exact images of any samples of the lines for which it was prepared.
+    """Imager that forms exact images of any samples of a scene.
 
     Parameters
     ----------
-    preparation : Preparation
-    warned : bool
-        True if the user has already been warned that no line contributes to the image.
-    most_kept_bytes : int
-        Largest memory of the references that are kept for the next image.
+    scene : Scene
+    decision : Decision
+    device : Device
+    keep : bool
+        Whether references are kept for the next image, if they are not too large.
     """
 
     def __init__(
         self,
-        preparation: Preparation,
+        scene: Scene,
+        decision: Decision,
+        device: Device,
         *,
-        warned: bool = False,
-        most_kept_bytes: int = _MOST_KEPT_BYTES,
+        keep: bool = True,
     ) -> None:
-        self.preparation, self._warned = preparation, warned
-        self._kept = Kept(most_kept_bytes)
+        assert not isinstance(decision.layout, GroupsEstimate)
+        self.scene, self.decision, self.device = scene, decision, device
+        self.layout: Tiles | Groups = decision.layout
+        self.kept = Kept(_MOST_KEPT_BYTES if keep else 0)
 
-    def form(self, lines: RangeLines, progress: Callable[[int, int], None] | None = None) -> Image:
-        """Return the image of lines of the same geometry.
+    def form(
+        self, lines: RangeLines, progress: Callable[[int, int], None] | None = None
+    ) -> NDArray[np.complex64]:
+        """Return the pixels of the image of lines of the scene, as they are imaged.
 
         The image is formed band by band, each band from blocks of channels, and each block in jobs
         for some of the parts. The host prepares a job while the device runs the one before. With a
@@ -87,47 +78,25 @@ class ExactImager:
         ----------
         lines : RangeLines
         progress : callable, optional
-            Called as progress(pairs done, pairs).
+            Called as progress(pairs of a part and a channel that are done, pairs).
         """
-        validate.progress(progress)
-        p = self.preparation
-        if p.water is not None:
-            lines = p.water.lines(lines)
-        if lines.samples is not p.lines.samples:
-            check_numbers(lines, p.beam)
-            p = replace(p, lines=replace(p.lines, samples=lines.samples))
-        layout, device, grid = p.layout, p.device, p.given_grid or p.grid
-        if not p.is_reached:
-            self._warn_unreached(lines)
-            return Image(np.zeros(grid.shape, np.complex64), grid)
+        layout, device, beam = self.layout, self.device, self.scene.beam
         pixels = np.empty(layout.parts * layout.part_pixels, np.complex64)
-        normalise = p.beam is not None and p.beam.normalise
-        try:
-            run = _Run(p, self._kept, progress)
-            at_once = band_parts(device, layout.part_pixels, layout.across, normalise)
-            for band in slices(slice(0, layout.parts), at_once):
-                part = slice(band.start * layout.part_pixels, band.stop * layout.part_pixels)
-                buffers = pixel_buffers(part.stop - part.start, p.beam)
-                on_device = {name: device.zeros(buffer.nbytes) for name, buffer in buffers.items()}
-                for channels in slices(slice(0, p.lines.channels), run.blocks.channels_at_once):
-                    run.add(channels, band, on_device)
-                cl.enqueue_copy(device.queue, pixels[part], on_device["pixels"])
-                if normalise:
-                    sums = np.empty_like(pixels[part])
-                    cl.enqueue_copy(device.queue, sums, on_device["weight_sums"])
-                    pixels[part] *= normalising(sums.real, p.lines.channels)
-        finally:
-            device.finish()  # an interrupted run leaves nothing in use
-        image = Image(layout.collect(pixels), grid)
-        if not holds_any(image.pixels):
-            self._warn_unreached(lines)
-        return image
-
-    def _warn_unreached(self, lines: RangeLines) -> None:
-        """Warn once that no line adds anything to the image, unless all samples are zero."""
-        if not self._warned and lines.samples.any():
-            self._warned, p = True, self.preparation
-            warn_unreached(lines, p.given_grid or p.grid, p.beam, p.along)
+        normalise = beam is not None and beam.normalise
+        run = _Run(self, lines, progress)
+        at_once = band_parts(device, layout.part_pixels, layout.across, normalise)
+        for band in slices(slice(0, layout.parts), at_once):
+            part = slice(band.start * layout.part_pixels, band.stop * layout.part_pixels)
+            buffers = pixel_buffers(part.stop - part.start, beam)
+            on_device = {name: device.zeros(buffer.nbytes) for name, buffer in buffers.items()}
+            for channels in slices(slice(0, lines.channels), run.blocks.channels_at_once):
+                run.add(channels, band, on_device)
+            cl.enqueue_copy(device.queue, pixels[part], on_device["pixels"])
+            if normalise:
+                sums = np.empty_like(pixels[part])
+                cl.enqueue_copy(device.queue, sums, on_device["weight_sums"])
+                pixels[part] *= normalising(sums.real, lines.channels)
+        return layout.collect(pixels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,61 +129,60 @@ class _Job:
 
 
 class _Run:
-    """Running image: its preparation, kernels and buffers, and the number of pairs done."""
+    """Running image: its lines, kernels and buffers, and the number of pairs done."""
 
     def __init__(
         self,
-        preparation: Preparation,
-        kept: Kept,
+        imager: ExactImager,
+        lines: RangeLines,
         progress: Callable[[int, int], None] | None,
     ) -> None:
-        p = self.p = preparation
-        self.kept = kept
-        self.tiled = isinstance(p.layout, Tiles)
-        self.bistatic = is_bistatic(p.lines)
-        self.origin_m = p.layout.centres_m(slice(0, 1))[0]
+        scene, decision, device = imager.scene, imager.decision, imager.device
+        self.scene, self.lines, self.decision, self.device = scene, lines, decision, device
+        self.layout, self.kept, self.progress = imager.layout, imager.kept, progress
+        resampling, taps = decision.resampling, decision.interpolator.taps
+        self.samples_per_m = resampling.samples_per_m(lines)
+        self.cycles_per_sample = resampling.cycles_per_m(lines) / self.samples_per_m
+        self.bistatic = is_bistatic(lines)
+        self.origin_m = self.layout.centres_m(slice(0, 1))[0]
         self.blocks = blocks_of(
-            p.device,
-            p.lines,
-            p.resampling,
-            p.interpolator.taps,
-            radius_m=p.layout.radius_m,
-            part_pixels=p.layout.part_pixels,
-            tiled=self.tiled,
-            beam=p.beam,
+            device,
+            lines,
+            resampling,
+            taps,
+            radius_m=self.layout.radius_m,
+            part_pixels=self.layout.part_pixels,
+            tiled=isinstance(self.layout, Tiles),
+            beam=scene.beam,
         )
-        moving = p.lines.rx_velocity_m_s is not None
-        paths = {"BISTATIC": int(self.bistatic), "MOVING": int(moving)}
-        self.kernel = self._kernel(paths)
-        if self.tiled:
-            self.expand = expansion_kernel(p.device, p.beam, **paths)
-        # While one set of buffers is in use on the device, the other is filled.
-        self.line_slots = itertools.cycle([Slot(p.device), Slot(p.device)])
-        self.part_slots = itertools.cycle([Slot(p.device), Slot(p.device)])
-        self.filter = filter_table(p.device, p.interpolator.coefficients)
-        self.phase_polynomials = phase_polynomials(p.device, p.phase_terms)
-        self.beam = beam_table(p.device, p.beam, p.lines)
-        self.corner = p.device.upload(np.zeros(2, np.int32))
-        self.at_nodes_m: dict[tuple[int, int], NDArray[np.float64]] = {}
-        self.progress = progress
-        self.done = 0
-
-    def _kernel(self, paths: dict[str, int]) -> Kernel:
-        """Return the backprojection kernel; `paths` are its options BISTATIC and MOVING."""
-        p, device = self.p, self.p.device
+        paths = {
+            "BISTATIC": int(self.bistatic),
+            "MOVING": int(lines.rx_velocity_m_s is not None),
+        }
         options = {
             "WIDTH": device.info.width,
-            "TAPS": p.interpolator.taps,
-            "BEAM": 0 if p.beam is None else INTERVALS,
-            "ONE_CUBIC": int(p.one_cubic),
-            "NORMALISE": int(p.beam is not None and p.beam.normalise),
-            "PHASE_TERMS": p.phase_terms,
+            "TAPS": taps,
+            "BEAM": 0 if scene.beam is None else INTERVALS,
+            "ONE_CUBIC": int(decision.one_cubic),
+            "NORMALISE": int(scene.beam is not None and scene.beam.normalise),
+            "PHASE_TERMS": decision.phase_terms,
         }
-        options |= lookup_options(device, p.layout, p.lines, p.samples_per_m, p.interpolator.taps)
-        if not isinstance(p.layout, Tiles):
-            return device.kernel("backproject_points", **options, **paths)
-        tile = {"TILE_ROWS": p.layout.side, "TILE_COLUMNS": p.layout.side}
-        return device.kernel("backproject_tiles", **options, **tile)
+        options |= lookup_options(device, self.layout, lines, self.samples_per_m, taps)
+        if isinstance(self.layout, Tiles):
+            tile = {"TILE_ROWS": self.layout.side, "TILE_COLUMNS": self.layout.side}
+            self.kernel = device.kernel("backproject_tiles", **options, **tile)
+            self.expand = expansion_kernel(device, scene.beam, **paths)
+        else:
+            self.kernel = device.kernel("backproject_points", **options, **paths)
+        # While one set of buffers is in use on the device, the other is filled.
+        self.line_slots = itertools.cycle([Slot(device), Slot(device)])
+        self.part_slots = itertools.cycle([Slot(device), Slot(device)])
+        self.filter = filter_table(device, decision.interpolator.coefficients)
+        self.phase_polynomials = phase_polynomials(device, decision.phase_terms)
+        self.beam = beam_table(device, scene.beam, lines)
+        self.corner = device.upload(np.zeros(2, np.int32))
+        self.at_nodes_m: dict[tuple[int, int], NDArray[np.float64]] = {}
+        self.done = 0
 
     def add(self, channels: slice, band: slice, pixels: dict[str, Any]) -> None:
         """Add some channels to the pixels of a band of parts, and to the sums of their weights."""
@@ -235,35 +203,39 @@ class _Run:
             if of_parts.any():
                 job = self._job(lines, some, geometry, line_slot, parts, of_parts, band)
                 job.slot.busy = line_slot.busy = self._launch(job, pixels)
-                self.p.device.queue.flush()
+                self.device.queue.flush()
             self._report((parts.stop - parts.start) * count)
 
     def _ranges(self, channels: slice, band: slice) -> NDArray[np.int32]:
         """Return the first channel and the end of those that each part of a band needs."""
-        p = self.p
-        if p.beam is None or p.along is None:
+        beam, along = self.scene.beam, self.scene.along
+        if beam is None or along is None:
             every = np.array([0, channels.stop - channels.start], np.int32)
             return np.tile(every, (band.stop - band.start, 1))
-        low, high = p.beam.limits
+        low, high = beam.limits
         limits = low - _SINE_ROUNDING, high + _SINE_ROUNDING
-        track = BeamTrack(limits, p.lines.phase_centres_m[channels], p.along[channels])
-        return track.spans(p.layout.boxes(band)).ranges
+        track = BeamTrack(limits, self.lines.phase_centres_m[channels], along[channels])
+        return track.spans(self.layout.boxes(band)).ranges
 
     def _upload_lines(self, channels: slice) -> tuple[RangeLines, dict[str, Any], Slot]:
         """Start copying upsampled lines and their antennas' geometry to the device.
 
         Returns the lines, the kernels' arguments for the geometry, and the slot with the buffers.
         """
-        p, blocks = self.p, self.blocks
-        lines = p.lines.select(channels)
+        blocks, along = self.blocks, self.scene.along
+        lines = self.lines.select(channels)
         slot = next(self.line_slots)
         slot.wait()
-        slot.make(block_buffers(p.lines, lines.channels, blocks, p.beam))
+        slot.make(block_buffers(self.lines, lines.channels, blocks, self.scene.beam))
         samples = upsampled_lines(
-            lines.samples, p.resampling, p.device.info.width, blocks.margin, blocks.pitch
+            lines.samples,
+            self.decision.resampling,
+            self.device.info.width,
+            blocks.margin,
+            blocks.pitch,
         )
         slot.fill("samples", samples)
-        directions = None if p.along is None else p.along[channels] * self.beam.per_sine
+        directions = None if along is None else along[channels] * self.beam.per_sine
         rows = geometry_rows(lines, self.origin_m, bistatic=self.bistatic, directions=directions)
         slot.fill("geometry", rows)
         return lines, {"geometry": slot["geometry"], "geometry_pitch": rows.shape[1]}, slot
@@ -281,7 +253,7 @@ class _Run:
         """Start copying the centres, ranges and references of some parts to the device."""
         slot = next(self.part_slots)
         slot.wait()
-        layout = self.p.layout
+        layout = self.layout
         count = int((ranges[:, 1] - ranges[:, 0]).max())
         slot.make(part_buffers(len(ranges), layout.part_pixels, count, self.blocks))
         centres_m = layout.centres_m(parts)
@@ -293,7 +265,7 @@ class _Run:
                 centres_m,
                 lines,
                 ranges,
-                self.p.resampling,
+                self.decision.resampling,
                 self.blocks,
                 self._correction_m(channels, parts),
             ),
@@ -303,7 +275,7 @@ class _Run:
         return _Job(
             line_slot,
             slot,
-            geometry | {"centres": slot["centres"], "samples_per_m": self.p.samples_per_m},
+            geometry | {"centres": slot["centres"], "samples_per_m": self.samples_per_m},
             {
                 "ranges": slot["ranges"],
                 "first_range": 0,
@@ -315,10 +287,10 @@ class _Run:
 
     def _correction_m(self, channels: slice, parts: slice) -> NDArray[np.float64] | None:
         """Return the corrections of ranges for some parts, [parts, channels], if there are any."""
-        corrections = None if self.p.water is None else self.p.water.corrections
+        corrections = self.scene.water.corrections
         if corrections is None:
             return None
-        layout, key = self.p.layout, (parts.start, parts.stop)
+        layout, key = self.layout, (parts.start, parts.stop)
         assert isinstance(layout, Groups)
         if key not in self.at_nodes_m:  # along exact rays, once for all blocks of channels
             self.at_nodes_m[key] = corrections.at(layout.middle_pixels(parts))
@@ -326,20 +298,20 @@ class _Run:
 
     def _launch(self, job: _Job, pixels: dict[str, Any]) -> cl.Event:
         """Run the kernels of a job; `pixels` are the pixel and weight buffers of its band."""
-        p, layout = self.p, self.p.layout
+        layout, device = self.layout, self.device
         if isinstance(layout, Tiles):
             size, positions = self._expand(job, layout)
         else:
             offset_m = layout.offset_m[job.parts]
             job.slot.fill("offsets", offset_m.reshape(-1, 3).T)
-            size = (p.device.in_whole_groups(len(offset_m)),)
+            size = (device.in_whole_groups(len(offset_m)),)
             positions = job.geometry | {
                 "offsets": job.slot["offsets"],
                 "points": len(offset_m) * layout.part_pixels,
                 "groups": len(offset_m),
                 "first_group": job.first_part,
             }
-        return p.device.run(
+        return device.run(
             self.kernel,
             size,
             lines=job.line_slot["samples"],
@@ -348,7 +320,7 @@ class _Run:
             reference_sample=job.slot["sample"],
             reference_fraction=job.slot["fraction"],
             reference_phase=job.slot["phase"],
-            cycles_per_sample=p.cycles_per_m / p.samples_per_m,
+            cycles_per_sample=self.cycles_per_sample,
             filter=self.filter,
             phase_polynomials=self.phase_polynomials,
             **positions,
@@ -362,7 +334,7 @@ class _Run:
 
         Returns the global size of the backprojection kernel, and its arguments for the tiles.
         """
-        p, device = self.p, self.p.device
+        grid, device = self.scene.grid, self.device
         count = job.parts.stop - job.parts.start
         pitch = job.ranges["channel_pitch"]
         expansions = job.slot["expansions"]
@@ -371,8 +343,8 @@ class _Run:
             (pitch // device.info.width, count),
             **job.geometry,
             **job.ranges,
-            column_step=p.grid.column_step_m,
-            row_step=p.grid.row_step_m,
+            column_step=grid.column_step_m,
+            row_step=grid.row_step_m,
             drift=(0.0, 0.0),
             **self.beam.origin,
             expansions=expansions,
@@ -391,4 +363,4 @@ class _Run:
     def _report(self, pairs: int) -> None:
         self.done += pairs
         if self.progress is not None:
-            self.progress(self.done, self.p.layout.parts * self.p.lines.channels)
+            self.progress(self.done, self.layout.parts * self.lines.channels)

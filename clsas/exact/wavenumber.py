@@ -14,9 +14,9 @@ from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.exact.checks import check_numbers
 from clsas.exact.migration import migrate
 from clsas.exact.straight_track import Aspects, Band, StraightTrack, aspects_of, band_of, straighten
+from clsas.scene import check_numbers
 from clsas.signal.doubts import warn_before_imaging
 from clsas.signal.refraction import homogeneous
 from clsas.sonar.beam import BeamWindow

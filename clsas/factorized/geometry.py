@@ -15,10 +15,11 @@ from clsas.aperture.mean_track import MeanTrack
 from clsas.aperture.phase_rates import drift, own_drift
 from clsas.aperture.predicted_channels import BEAM_MARGIN
 from clsas.core.lines import RangeLines, some_channels
+from clsas.core.surface import Surface
 from clsas.core.wavelengths import band_wavelength_m
-from clsas.factorized.surface import Surface
 from clsas.factorized.tree import Division
 from clsas.plans.factorization import Factorization
+from clsas.scene import Scene
 from clsas.signal.ray_corrections import Corrections
 from clsas.sonar.beam import BeamWindow
 
@@ -105,37 +106,29 @@ class Geometry:
 
 
 def geometry_of(
-    lines: RangeLines,
-    surface: Surface,
-    factorization: Factorization,
-    beam: BeamWindow | None,
-    track: MeanTrack | None = None,
-    corrections: Corrections | None = None,
+    scene: Scene, factorization: Factorization, track: MeanTrack | None = None
 ) -> Geometry:
     """Return the geometry of a factorized image.
 
     Parameters
     ----------
-    lines : RangeLines
-    surface : Surface
+    scene : Scene
     factorization : Factorization
-    beam : BeamWindow or None
     track : MeanTrack, optional
         The mean track of the lines, with the shape that the factorization names, if it is known.
-    corrections : Corrections, optional
-        Corrections of ranges along exact rays.
 
     Raises
     ------
     ValueError
         If the lines have no such mean track.
     """
+    lines, surface, beam = scene.lines, scene.surface, scene.beam
     resampling, division = factorization.resampling, Division(surface, factorization.sides)
     wavelength_m = band_wavelength_m(lines, resampling.centre_cycles_per_sample)
     track = track or _mean_track(lines, factorization, wavelength_m)
     directions = along = nearest_m = None
-    if beam is not None:
-        directions = directions_of(beam, beam.directions(lines), track)
+    if beam is not None and scene.along is not None:
+        directions = directions_of(beam, scene.along, track)
         along = directions.at(track.samples)
         root_m = division.centres_m(0, division.roots)
         nearest_m = float(cdist(root_m, lines.phase_centres_m).min())
@@ -173,7 +166,7 @@ def geometry_of(
         on_track=on_track,
         ramps=bool(ramps),
         slack=2 * off_m / max(slowest_m, 1e-9),
-        corrections=corrections,
+        corrections=scene.water.corrections,
     )
 
 

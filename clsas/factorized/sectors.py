@@ -16,17 +16,14 @@ from clsas.aperture.nearest import NearestBeams
 from clsas.aperture.phase_rates import PhaseBoxes, cycles_per_extent, stretches
 from clsas.aperture.virtual_channels import ChannelRanges, VirtualChannels
 from clsas.core.geometry import pairwise_range_m
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, antennas_of
+from clsas.core.lines import antennas_of
 from clsas.factorized import visibility
 from clsas.factorized.geometry import Geometry, geometry_of
 from clsas.factorized.leaf_groups import LeafGroups, leaf_groups
-from clsas.factorized.surface import Surface, surface_of
 from clsas.factorized.tree import channel_ranges
 from clsas.opencl.buffers import MARGIN
 from clsas.plans.factorization import Factorization
-from clsas.signal.ray_corrections import Corrections
-from clsas.sonar.beam import BeamWindow
+from clsas.scene import Scene
 
 _FAR = 1 << 28  # samples; beyond the end of any line, and within int32
 _MOST_KEPT_BYTES = 128 << 20  # kept of sectors, and of groups, for the next image
@@ -280,37 +277,23 @@ class Roots:
 
     Parameters
     ----------
-    lines : RangeLines
-    grid : Grid
+    scene : Scene
     factorization : Factorization
-    beam : BeamWindow or None
-    track, surface : optional
-        Results of planning: see `geometry_of`.
-    corrections : Corrections, optional
-        Corrections of ranges along exact rays.
+    track : MeanTrack, optional
+        The mean track, if planning has found it.
     """
 
     def __init__(
-        self,
-        lines: RangeLines,
-        grid: Grid,
-        factorization: Factorization,
-        beam: BeamWindow | None,
-        *,
-        track: MeanTrack | None = None,
-        surface: Surface | None = None,
-        corrections: Corrections | None = None,
+        self, scene: Scene, factorization: Factorization, track: MeanTrack | None = None
     ) -> None:
-        self._given = lines, grid, factorization, beam, track, surface, corrections
+        self._scene, self._factorization, self._track = scene, factorization, track
         self._sectors: list[Sector] | None = None
         self._groups: LeafGroups | None = None
 
     @functools.cached_property
     def geometry(self) -> Geometry:
         """Geometry of lines and roots."""
-        lines, grid, factorization, beam, track, surface, corrections = self._given
-        surface = surface or surface_of(grid)
-        return geometry_of(lines, surface, factorization, beam, track, corrections)
+        return geometry_of(self._scene, self._factorization, self._track)
 
     def sectors(self, first: int, most: int) -> Iterator[Sector]:
         """Yield all roots in sectors: a first one of `first` roots, then up to `most` in each.

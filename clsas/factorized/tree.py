@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.aperture.virtual_channels import ChannelRanges, VirtualChannels
-from clsas.factorized.surface import Surface
+from clsas.core.surface import Surface
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from clsas.core import validate
-from clsas.exact.backprojection import BEST_ACCURACY_DB
+from clsas.exact.decision import BEST_ACCURACY_DB
 from clsas.files.georeference_table import GeoreferenceTable
 from clsas.files.grid_tables import GridTable
 from clsas.files.process_tables import ProcessTable

@@ -16,10 +16,10 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.validate import ClsasWarning
-from clsas.exact.backprojection import backproject
-from clsas.exact.checks import check_numbers
+from clsas.imaging import backproject
 from clsas.inspection.result import PhaseSign
 from clsas.opencl.device import Device
+from clsas.scene import check_numbers
 
 CLEAR = 1.5
 """Least ratio of the two sharpnesses that determines the sign. In speckle it reaches 1.1."""

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
+from clsas.imaging import Imager
 from clsas.opencl.device import Device
-from clsas.planning.imager import Imager
 from clsas.signal.refraction import homogeneous
 from clsas.sonar.beam import BeamWindow
 

@@ -18,8 +18,8 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.sound_speed import SoundSpeed
 from clsas.core.wavelengths import band_wavelength_m
-from clsas.exact.backprojection import prepare
-from clsas.exact.run import execute
+from clsas.forming import form
+from clsas.imaging import plan
 from clsas.measures.assessment_result import Assessment, Effect
 from clsas.measures.effects import (
     BEAM,
@@ -32,12 +32,10 @@ from clsas.measures.effects import (
 )
 from clsas.opencl.device import Device, open_device
 from clsas.planning.costs import Costs
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
 from clsas.planning.prediction import half_precision_error
 from clsas.planning.request import TOLERANCE_DB, checked_tolerance_db
-from clsas.plans.factorization import Factorization
 from clsas.plans.plan import Plan
+from clsas.scene import Scene
 from clsas.signal.compression import Window
 from clsas.signal.compression import check_options as check_compression
 from clsas.signal.refraction import homogeneous
@@ -318,19 +316,10 @@ class _Image:
 
     def form(self, device: Device) -> None:
         """Form the image."""
-        method = self.plan.method
-        if isinstance(method, Factorization):
-            factorize(self.lines, self.grid, self.plan, device=device)
-            return
-        preparation = prepare(
-            self.lines,
-            self.grid,
-            device=device,
-            accuracy_db=method.accuracy_db,
-            beam=self.beam,
-            full_model=self.full_model,
-        )
-        execute(preparation)
+        allowed_db = None if self.full_model else self.plan.tolerance_db
+        left_out = self.plan.left_out
+        scene = Scene.of(self.lines, self.grid, self.beam, allowed_db, left_out=left_out)
+        form(scene, self.plan, device)
 
 
 def _images(survey: Survey, planned: Callable[..., Plan]) -> dict[str, _Image]:

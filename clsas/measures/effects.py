@@ -14,8 +14,8 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
+from clsas.core.surface import surface_of
 from clsas.core.wavelengths import band_wavelength_m, cycles_per_m_at, wavelength_m
-from clsas.factorized.surface import surface_of
 from clsas.signal.ambiguity import ends_error
 from clsas.signal.refraction import Homogeneous
 from clsas.signal.spectrum import measure_spectrum

@@ -18,13 +18,14 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
-from clsas.exact.backprojection import ACCURACY_DB, form_exactly
+from clsas.exact.decision import ACCURACY_DB
+from clsas.forming import form_exactly
+from clsas.imaging import factorize
 from clsas.measures.cuts import Cut
 from clsas.measures.quality import measure_point
 from clsas.measures.shadows import DARKEST, dark_level_db
 from clsas.measures.tradeoff_result import Response, Row, Tradeoff
 from clsas.opencl.device import Device, open_device
-from clsas.planning.factorize import factorize
 from clsas.planning.planner import planned
 from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, Request, checked_pairs
 from clsas.plans.plan import Plan
@@ -234,9 +235,11 @@ def _planned(
         start = time.perf_counter()
         asked = Request(
             lines, grid, tolerance_db=request.tolerance_db, stages=request.stages,
-            taps=request.taps, depth=request.depth, beam=beam, device=device,
+            taps=request.taps, depth=request.depth, beam=beam,
         )  # fmt: skip
-        chosen = planned(asked).plan
+        scene = asked.scene()
+        scene.warn("tolerance_db", asked.tolerance_db, doubts=False)
+        chosen, _ = planned(scene, asked, device)
         plan_seconds = time.perf_counter() - start
         if request.taps is not None and chosen.is_exact:
             continue
@@ -248,7 +251,8 @@ def _exactly(
     accuracy_db: float, lines: RangeLines, grid: Grid, beam: BeamWindow | None, device: Device
 ) -> _Candidate:
     """Return the exact image as a candidate."""
-    chosen = planned(Request(lines, grid, stages=[], beam=beam, device=device)).plan
+    asked = Request(lines, grid, stages=[], beam=beam)
+    chosen, _ = planned(asked.scene(), asked, device)
     row = replace(_row("exact", "exact", chosen, 0.0), predicted_error_db=accuracy_db)
     form = partial(form_exactly, lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
     return _Candidate(row, form)

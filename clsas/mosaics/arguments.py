@@ -12,7 +12,7 @@ import numpy as np
 
 from clsas.core import validate
 from clsas.core.lines import RangeLines
-from clsas.exact.backprojection import BEST_ACCURACY_DB
+from clsas.exact.decision import BEST_ACCURACY_DB
 from clsas.mosaics.documents import is_there, read_document
 from clsas.mosaics.provenance import REQUESTS, beam_json
 from clsas.mosaics.scheduling import Growth

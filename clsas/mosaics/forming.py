@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from clsas.core.grid import Grid
 from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
-from clsas.exact.backprojection import prepare
-from clsas.exact.run import execute
+from clsas.forming import SceneImager, form
 from clsas.mosaics.devices import process_device, thread_device
 from clsas.mosaics.patches import PatchWindow, host_bytes
 from clsas.mosaics.provenance import REQUESTS, beam_json
@@ -26,10 +25,11 @@ from clsas.mosaics.store import Store
 from clsas.mosaics.survey import Survey, largest_gap_m, open_files
 from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import Device
-from clsas.planning.former import former
 from clsas.planning.planner import planned
 from clsas.planning.request import Request, tolerance_in_db
+from clsas.plans.factorization import ExactImage
 from clsas.plans.plan import Plan
+from clsas.scene import Scene
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches
 
@@ -212,16 +212,20 @@ def _formed(
     patch_bytes = host_bytes(lines.channels, lines.length, grid.size)
     accuracy_db = job.accuracy_db(lines.channels * grid.size)
     if accuracy_db is not None:
-        preparation = prepare(lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
-        preparation.warn_of_ambiguity()
-        error_db = max(accuracy_db, preparation.predicted_error_db)
+        scene = Scene.of(lines, grid, beam, accuracy_db)
+        scene.warn("accuracy_db", accuracy_db, doubts=False)
+        # The record reports if the patch is zero.
+        imager = SceneImager(scene, ExactImage(accuracy_db), device, warned=True, keep=False)
+        assert imager.decision is not None
+        error_db = max(accuracy_db, imager.decision.error_db(scene))
         how = {"predicted_error_db": error_db, "memory_bytes": patch_bytes}
-        return execute(preparation, warned=True), how  # the record reports if the patch is zero
+        return imager.form(lines), how
     before = time.perf_counter()
     available = min(job.memory_bytes - patch_bytes, device.info.memory_bytes // 2)
-    request = Request(lines, grid, **job.request, beam=beam, device=device, memory_bytes=available)
-    found = planned(request)
-    chosen = found.plan
+    request = Request(lines, grid, **job.request, beam=beam, memory_bytes=available)
+    scene = request.scene()
+    scene.warn("tolerance_db", request.tolerance_db, doubts=False)
+    chosen, track = planned(scene, request, device)
     how = {
         "plan_seconds": time.perf_counter() - before,
         "predicted_error_db": chosen.predicted_error_db,
@@ -229,8 +233,7 @@ def _formed(
         "memory_bytes": patch_bytes + int(chosen.memory_bytes),
         "plan": json.loads(_without_directions(chosen).to_json()),
     }
-    imager = former(lines, grid, chosen, device, known=found.known, warned=True)
-    return imager.form(lines), how
+    return form(scene, chosen, device, track=track, warned=True), how
 
 
 def _check_memory(job: Job, lines: RangeLines, grid: Grid) -> None:

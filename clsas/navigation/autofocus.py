@@ -24,6 +24,8 @@ from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
+from clsas.forming import form, scene_of_plan
+from clsas.imaging import plan
 from clsas.navigation.autofocus_result import Autofocus
 from clsas.navigation.checks import (
     check_navigation,
@@ -45,8 +47,6 @@ from clsas.navigation.responses import (
 )
 from clsas.navigation.speed_check import check_speed
 from clsas.opencl.device import Device, open_device
-from clsas.planning.former import former
-from clsas.planning.planner import plan
 from clsas.signal.readout import Readout
 from clsas.signal.refraction import homogeneous
 from clsas.sonar.beam import BeamWindow
@@ -405,7 +405,7 @@ class _Focus:
 
     def _form(self, moved_m: NDArray[np.float64]) -> Image:
         lines = self._lines(moved_m)
-        return former(lines, self.grid, self.plan, self.device).form(lines)
+        return form(scene_of_plan(lines, self.grid, self.plan), self.plan, self.device)
 
     def _lines(self, moved_m: NDArray[np.float64]) -> RangeLines:
         vectors_m = self.passage.vectors_m(moved_m)

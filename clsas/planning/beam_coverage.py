@@ -107,10 +107,10 @@ def _turns_between_channels(model: VisibilityModel) -> bool:
     They do at a kink of the track, where the beam may swing past a point within a few channels, and
     where a track leads back beside itself.
     """
-    assert model.channels_along is not None
+    assert model.scene.along is not None
     order = np.argsort(model.track.coordinate, kind="stable")
     strip = model.track.strip_of(model.track.coordinate[order])
-    turned = np.linalg.norm(np.diff(model.channels_along[order], axis=0), axis=1)
+    turned = np.linalg.norm(np.diff(model.scene.along[order], axis=0), axis=1)
     turned = turned[np.diff(strip) == 0]
     return bool(turned.max(initial=0.0) > _MOST_TURNED * _width(model))
 
@@ -182,6 +182,6 @@ def _points_m(model: VisibilityModel) -> NDArray[np.float64]:
 @shared
 def _sines_of_channels(model: VisibilityModel) -> NDArray[np.float64]:
     """Return sines of the aspect angle at points all over the grid, [channels, points]."""
-    assert model.channels_along is not None
+    assert model.scene.along is not None
     some = some_channels(model.lines.channels)
-    return sines(_points_m(model), model.lines.phase_centres_m[some], model.channels_along[some])
+    return sines(_points_m(model), model.lines.phase_centres_m[some], model.scene.along[some])

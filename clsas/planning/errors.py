@@ -229,8 +229,8 @@ def beam_weights(
     Arguments and shapes are those of `phase_error`.
     """
     assert model.directions is not None
-    assert model.channels_along is not None
-    part, along = channels.part, model.channels_along[channels.index]
+    assert model.scene.along is not None
+    part, along = channels.part, model.scene.along[channels.index]
     directions = model.directions.at(part.coordinate, part.across)
     virtual = [sines(*each, directions) for each in zip(points_m, virtual_m, strict=True)]
     real = [sines(each, channels.phase_centres_m, along) for each in points_m]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 
 from clsas.exact.blocks import Blocks, band_parts, blocks_of
 from clsas.exact.buffers import block_buffers, part_buffers
@@ -13,9 +12,10 @@ from clsas.exact.groups import Groups, GroupsEstimate
 from clsas.exact.tiles import STACK, Tiles
 from clsas.opencl.buffers import beam_buffers, pixel_buffers, total_bytes
 from clsas.opencl.device import Device
-from clsas.planning.visibility_model import LinesModel, VisibilityModel
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.planning.work import backprojecting, upsampling
 from clsas.plans.predictions import Work
+from clsas.scene import Scene
 
 WORTHWHILE_CHANNELS = 30
 """Fewest channels per pixel with which factorized images were faster than exact ones at -40 dB.
@@ -70,31 +70,26 @@ class Exact:
         return Work(call=1.0) + lines + pixels
 
 
-def expect(model: LinesModel, accuracy_db: float, device: Device) -> Exact:
-    """Return the prediction of an exact image, by the same decision that forms it."""
-    lines, beam = model.lines, model.beam
-    decided = partial(
-        decide,
-        lines,
-        model.grid,
-        device=device,
-        accuracy_db=accuracy_db,
-        spectrum=model.spectrum,
-        left_open=model.ambiguity,
-        beam=beam,
-        along=model.channels_along,
-        estimate=True,
-    )
-    decision = decided()
+def expect(
+    scene: Scene, accuracy_db: float, device: Device, model: VisibilityModel | None
+) -> Exact:
+    """Return the prediction of an exact image, by the same decision that forms it.
+
+    `model` is that of the scene, in which the part that a beam covers is known.
+    """
+    lines, beam = scene.lines, scene.beam
+    decision = decide(scene, device, accuracy_db, estimate=True)
     layout, interpolator, resampling = decision.layout, decision.interpolator, decision.resampling
     tiled = isinstance(layout, Tiles)
     largest = decision
-    if not tiled and model.grid.points_m is not None:
+    if not tiled and scene.grid.points_m is not None:
         # Points may lie far apart: samples are then looked up more slowly, in longer lines.
-        others = [decided(windows=each) for each in (STACK, 0)]
+        others = [
+            decide(scene, device, accuracy_db, estimate=True, windows=each) for each in (STACK, 0)
+        ]
         largest = max((decision, *others), key=lambda each: each.resampling.length)
     share = most = 1.0
-    if beam is not None and isinstance(model, VisibilityModel):
+    if beam is not None and model is not None:
         share, most = model.visible_share(model.small), model.visible_share(_LARGE, most=True)
     blocks = blocks_of(
         device,
@@ -116,23 +111,23 @@ def expect(model: LinesModel, accuracy_db: float, device: Device) -> Exact:
         visible_channels=share * lines.channels,
         taps=interpolator.taps,
         samples=resampling.length,
-        memory_bytes=_memory_bytes(model, device, blocks, layout, most),
+        memory_bytes=_memory_bytes(scene, device, blocks, layout, most),
     )
 
 
 def _memory_bytes(
-    model: LinesModel,
+    scene: Scene,
     device: Device,
     blocks: Blocks,
     layout: Tiles | Groups | GroupsEstimate,
     most: float,
 ) -> int:
-    """Return the device memory that `clsas.exact.run.execute` needs.
+    """Return the device memory that `clsas.exact.run` needs.
 
     There are two sets of the buffers of parts, blocks and bands if there are two jobs. `most` is
     the largest fraction of the channels whose beam touches a part.
     """
-    lines, beam = model.lines, model.beam
+    lines, beam = scene.lines, scene.beam
     parts, part_pixels = layout.parts, layout.part_pixels
     normalise = beam is not None and beam.normalise
     of_band = min(band_parts(device, part_pixels, layout.across, normalise), parts)
@@ -155,13 +150,13 @@ def _memory_bytes(
     return sum(total_bytes(buffers) for buffers in lists)
 
 
-def worthwhile(model: LinesModel, exact: Exact) -> str:
+def worthwhile(model: VisibilityModel | None, exact: Exact) -> str:
     """Return how many channels receive from a pixel, and from how many a factorization pays.
 
     The sentence is "" for grids off a plane, and for several passes and other dense apertures: the
     rule was not measured for them.
     """
-    if not isinstance(model, VisibilityModel) or not model.surface.is_plane or model.track.is_dense:
+    if model is None or not model.surface.is_plane or model.track.is_dense:
         return ""
     return (
         f"About {exact.visible_channels:.0f} channels receive from each pixel; factorization "

@@ -10,7 +10,6 @@ import numpy as np
 
 from clsas.aperture.predicted_channels import StageChannels
 from clsas.core.decibels import in_db, power
-from clsas.core.digests import grid_digest, lines_digest
 from clsas.factorized.buffers import CHUNK, Level
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
@@ -28,11 +27,12 @@ from clsas.planning.exact_image import Exact
 from clsas.planning.memory import BufferSizes, batches_within
 from clsas.planning.range_extents import half_line_lengths
 from clsas.planning.stretches import stretch_of
-from clsas.planning.visibility_model import LinesModel, VisibilityModel
+from clsas.planning.visibility_model import VisibilityModel
 from clsas.planning.work import adding_in_rows, backprojecting_leaves, combining, upsampling
 from clsas.plans.factorization import ExactImage, Factorization
 from clsas.plans.plan import Plan
 from clsas.plans.predictions import ErrorBudget, Prediction, Stage, Work
+from clsas.scene import Scene
 
 HALF_ROUNDING = 4e-8
 """Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms."""
@@ -57,8 +57,6 @@ class Conditions:
     costs : Costs
     memory_bytes : int
         Device memory that may be used.
-    corrected : bool
-        True if ranges are corrected along exact rays.
     """
 
     tolerance_db: float | None
@@ -66,7 +64,6 @@ class Conditions:
     device: Device
     costs: Costs
     memory_bytes: int
-    corrected: bool = False
 
 
 def predicted_plan(
@@ -107,7 +104,7 @@ def predicted_plan(
         most_channels=tuple(math.ceil(_ROOM * each.most) for each in channels),
         bands=tuple(each.bands for each in channels),
         line_pitch=padded_length(lines.resampling),
-        corrected=conditions.corrected,
+        corrected=model.scene.water.corrections is not None,
         filtered=lines.upsampler is not None,
         half_precision=half_precision,
     )
@@ -137,15 +134,15 @@ def predicted_plan(
         roots_at_once=batches.at_once,
         roots_prepared=batches.prepared,
     )
-    return _plan(model, image, conditions, batches.memory_bytes, stages, work, errors)
+    return _plan(model.scene, image, conditions, batches.memory_bytes, stages, work, errors)
 
 
-def exact_plan(model: LinesModel, conditions: Conditions, reason: str) -> Plan:
+def exact_plan(scene: Scene, conditions: Conditions, reason: str) -> Plan:
     """Return the plan of the exact image; `reason` is that of `ExactImage`."""
     exact = conditions.exact
     image = ExactImage(accuracy_db=exact.accuracy_db, reason=reason)
     errors = ErrorBudget(exact=power(exact.accuracy_db))
-    plan = _plan(model, image, conditions, exact.memory_bytes, [], exact.work, errors)
+    plan = _plan(scene, image, conditions, exact.memory_bytes, [], exact.work, errors)
     return replace(plan, prediction=replace(plan.prediction, error_db=exact.accuracy_db))
 
 
@@ -171,7 +168,7 @@ def half_precision_error(stages: int) -> float:
 
 
 def _plan(
-    model: LinesModel,
+    scene: Scene,
     image: Factorization | ExactImage,
     conditions: Conditions,
     memory_bytes: int,
@@ -195,9 +192,9 @@ def _plan(
         tolerance_db=conditions.tolerance_db,
         method=image,
         prediction=prediction,
-        beam=model.beam,
-        lines_digest=model.from_cache("lines", lambda: lines_digest(model.lines)),
-        grid_digest=model.from_cache("grid", lambda: grid_digest(model.grid)),
+        beam=scene.beam,
+        lines_digest="",  # the planner completes the plan that it chooses
+        grid_digest="",
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field
@@ -12,9 +11,9 @@ from clsas.core import validate
 from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
-from clsas.opencl.device import Device
 from clsas.planning.costs import Costs
 from clsas.planning.search import MOST_STAGES, Allowed
+from clsas.scene import Scene
 from clsas.sonar.beam import BeamWindow
 
 BEST_TOLERANCE_DB = -75.0
@@ -34,7 +33,7 @@ class Request:
 
     Attributes
     ----------
-    lines, grid, beam, device, costs, full_model
+    lines, grid, beam, costs, full_model
         As given.
     tolerance_db : float or None
         The tolerance, also if it was given in wavelengths; None if stages were given.
@@ -50,7 +49,6 @@ class Request:
     tolerance_wavelengths: InitVar[float | None] = None
     stages: Sequence[tuple[int, int]] | None = None
     beam: BeamWindow | None = None
-    device: Device | str | int | None = None
     memory_bytes: int | None = None
     costs: Costs | None = None
     taps: InitVar[tuple[int, int] | None] = None
@@ -89,12 +87,10 @@ class Request:
         if self.memory_bytes is not None:
             self._set("memory_bytes", validate.count("memory_bytes", self.memory_bytes))
 
-    def with_scene(self, lines: RangeLines, grid: Grid, beam: BeamWindow | None) -> Request:
-        """Return the same request for another scene, which is not checked again."""
-        other = copy.copy(self)
-        for name, value in (("lines", lines), ("grid", grid), ("beam", beam)):
-            other._set(name, value)
-        return other
+    def scene(self) -> Scene:
+        """Return the scene, without effects whose errors lie far below the tolerance."""
+        allowed_db = None if self.full_model else self.tolerance_db
+        return Scene.of(self.lines, self.grid, self.beam, allowed_db)
 
     def _set(self, name: str, value: object) -> None:
         """Replace an argument by its checked value."""

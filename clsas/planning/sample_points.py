@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.factorized.surface import LEAST_SIDE, Surface
+from clsas.core.surface import LEAST_SIDE, Surface
 
 _FRACTIONS = (0.02, 0.25, 0.5, 0.75, 0.98)  # of the rows and columns
 _WEIGHTS = np.array([0.135, 0.24, 0.25, 0.24, 0.135])  # of these fractions in means over the grid

@@ -30,12 +30,13 @@ from clsas.planning.search import Allowed
 from clsas.planning.timed_images import (
     TimedImage,
     exact_image,
+    noise,
     planned_image,
-    scene,
     square,
     with_relief,
 )
-from clsas.planning.visibility_model import VisibilityModel
+from clsas.planning.visibility_model import model_of
+from clsas.scene import Scene
 from clsas.signal import interpolation
 from clsas.signal.interpolation import Resampling
 from clsas.signal.spectrum import OUTSIDE
@@ -249,12 +250,14 @@ class _Images:
 
 def _built(device: Device, side: int) -> tuple[_Images, float]:
     """Return images of `side` pixels along a side, formed once, and the time that this took."""
-    lines, grid = scene(_CHANNELS, _LARGER * side)
+    lines, grid = noise(_CHANNELS, _LARGER * side)
     exact = exact_image(device, lines, square(side))
     points = exact_image(device, lines, with_relief(square(3 * side // 4)))
-    model = VisibilityModel.of(lines, grid, None, OUTSIDE * power(_TOLERANCE_DB))
+    scene = Scene.of(lines, grid, None, None)
+    model = model_of(scene, OUTSIDE * power(_TOLERANCE_DB))
+    assert model is not None
     room = device.info.memory_bytes // 2
-    competing = expect(model, _TOLERANCE_DB, device)
+    competing = expect(scene, _TOLERANCE_DB, device, model)
     conditions = Conditions(_TOLERANCE_DB, competing, device.for_stages(), _PLANNED_WITH, room)
     found = fastest(model, conditions, math.inf, _ALLOWED).plan
     assert found is not None  # the scene is made so

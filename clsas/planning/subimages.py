@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.core.surface import Surface, within_roots
 from clsas.exact.tiles import item_pixels
-from clsas.factorized.surface import Surface, within_roots
 
 Side = tuple[int, int]
 """Rows and columns of a subimage."""

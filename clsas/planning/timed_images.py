@@ -12,14 +12,13 @@ import numpy as np
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
-from clsas.exact.backprojection import form_exactly
+from clsas.forming import form, form_exactly, scene_of_plan
 from clsas.opencl.device import Device
 from clsas.planning.costs import Costs
 from clsas.planning.exact_image import Exact, expect
-from clsas.planning.former import former
-from clsas.planning.visibility_model import VisibilityModel
 from clsas.plans.plan import Plan
 from clsas.plans.predictions import Work
+from clsas.scene import Scene
 
 _SOUND_M_S = 1500.0
 _CARRIER_HZ, _SAMPLE_RATE_HZ, _BAND = 120e3, 37.5e3, 0.8
@@ -99,12 +98,12 @@ class TimedImage:
 
 
 def square(pixels: int) -> Grid:
-    """Return a square grid beside the track of `scene`."""
+    """Return a square grid beside the track of `noise`."""
     half_m = _PIXEL_M * pixels / 2
     return Grid.plane((-half_m, half_m, pixels), (_NEAREST_M, _NEAREST_M + 2 * half_m, pixels))
 
 
-def scene(channels: int, pixels: int) -> tuple[RangeLines, Grid]:
+def noise(channels: int, pixels: int) -> tuple[RangeLines, Grid]:
     """Return lines of noise from a straight track, and a square grid beside it.
 
     Times do not depend on samples, and noise takes a hundredth of the time of a simulation. The
@@ -140,11 +139,11 @@ def with_relief(grid: Grid) -> Grid:
 
 def exact_image(device: Device, lines: RangeLines, grid: Grid) -> TimedImage:
     """Return an exact image to be timed."""
-    expected = expect(VisibilityModel.of(lines, grid, None), EXACT_DB, device)
-    form = partial(form_exactly, lines, grid, device=device, accuracy_db=EXACT_DB)
-    return TimedImage(form, expected)
+    expected = expect(Scene.of(lines, grid, None, None), EXACT_DB, device, None)
+    exactly = partial(form_exactly, lines, grid, device=device, accuracy_db=EXACT_DB)
+    return TimedImage(exactly, expected)
 
 
 def planned_image(device: Device, lines: RangeLines, grid: Grid, chosen: Plan) -> TimedImage:
     """Return an image by a plan to be timed as a first one: nothing is kept from run to run."""
-    return TimedImage(lambda: former(lines, grid, chosen, device).form(lines), chosen)
+    return TimedImage(lambda: form(scene_of_plan(lines, grid, chosen), chosen, device), chosen)

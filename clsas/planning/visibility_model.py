@@ -16,8 +16,8 @@ from clsas.aperture.dense_tracks import Shape, mean_track_of, simplest_track
 from clsas.aperture.mean_track import MeanTrack
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
+from clsas.core.surface import LEAST_SIDE, Surface
 from clsas.core.wavelengths import band_wavelength_m, cycles_per_m_at
-from clsas.factorized.surface import LEAST_SIDE, Surface, surface_of
 from clsas.planning.caching import cached, shared
 from clsas.planning.sample_points import (
     over_points,
@@ -26,65 +26,21 @@ from clsas.planning.sample_points import (
     trapezoidal_weights,
 )
 from clsas.planning.subimages import SMALL, Side, Subimages
-from clsas.signal.ambiguity import Ambiguity, ambiguity
-from clsas.signal.spectrum import Spectrum, line_energy, measure_spectrum
+from clsas.scene import Scene
+from clsas.signal.spectrum import Spectrum
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility
 
 _DENSE = 65  # points along either side, for the least distance; half moves errors by 0.05 dB
 _NEAREST_CHANNELS = 4096  # of a dense aperture, for the least distance
 _MOST_OUTSIDE = 1e-6  # share of power above the highest frequency; half or twice: no change
-_AMBIGUITY = "ambiguity"  # key of the cached value that does not depend on the mean track
 
 
 _Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True, eq=False)
-class LinesModel:
-    """Lines, grid and beam of an image, with the properties of the lines that planning needs.
-
-    Attributes
-    ----------
-    lines, grid, beam
-        What is imaged.
-    spectrum : Spectrum
-        Spectrum of the lines, with the weight that frequencies have in the image.
-    channel_power : float64 [channels]
-        Energy of each line over the mean of all.
-    highest_cycles_per_m, rms_cycles_per_m : float
-        Phase per metre of range, cycles: at the band's edge, and rms about the band's centre.
-    channels_along : float64 [channels, 3] or None
-        Unit directions of the track at the channels; None without a beam.
-    """
-
-    lines: RangeLines
-    grid: Grid
-    beam: BeamWindow | None
-    spectrum: Spectrum
-    channel_power: NDArray[np.float64]
-    highest_cycles_per_m: float
-    rms_cycles_per_m: float
-    channels_along: NDArray[np.float64] | None
-    _cache: dict[Hashable, Any] = field(default_factory=dict, kw_only=True)
-
-    def from_cache(self, key: Hashable, find: Callable[[], _Value]) -> _Value:
-        """Return the value cached under a key; `find` computes it the first time."""
-        if key not in self._cache:
-            self._cache[key] = find()
-        value: _Value = self._cache[key]
-        return value
-
-    @property
-    def ambiguity(self) -> Ambiguity:
-        """Errors that the lines themselves cause, whatever the method."""
-        given = self.lines, self.grid, self.spectrum, self.channel_power
-        beam = self.beam, self.channels_along
-        return self.from_cache(_AMBIGUITY, lambda: ambiguity(*given, *beam))
-
-
-@dataclass(frozen=True, eq=False)
-class VisibilityModel(LinesModel):
+class VisibilityModel:
     """Geometry between mean track and grid, sampled at 25 grid points: what a beam touches.
 
     Errors and costs of candidates are evaluated on these samples. There is such a model only if
@@ -92,6 +48,11 @@ class VisibilityModel(LinesModel):
 
     Attributes
     ----------
+    scene : Scene
+    channel_power : float64 [channels]
+        Energy of each line over the mean of all.
+    highest_cycles_per_m, rms_cycles_per_m : float
+        Phase per metre of range, cycles: at the band's edge, and rms about the band's centre.
     limits : (low, high) or None
         Sines of the aspect angle between which channels are used for a subimage; None without a
         beam.
@@ -110,6 +71,10 @@ class VisibilityModel(LinesModel):
         and the sample points alone.
     """
 
+    scene: Scene
+    channel_power: NDArray[np.float64]
+    highest_cycles_per_m: float
+    rms_cycles_per_m: float
     limits: tuple[float, float] | None
     shape: Shape
     track: MeanTrack
@@ -117,26 +82,34 @@ class VisibilityModel(LinesModel):
     points_m: NDArray[np.float64]
     distances_m: NDArray[np.float64]
     root: Side | None = None
+    _cache: dict[Hashable, Any] = field(default_factory=dict)
 
-    @classmethod
-    def of(
-        cls,
-        lines: RangeLines,
-        grid: Grid,
-        beam: BeamWindow | None,
-        outside: float = _MOST_OUTSIDE,
-    ) -> VisibilityModel:
-        """Return the model with the simplest mean track: see `model_of`.
+    @property
+    def lines(self) -> RangeLines:
+        """Lines that are imaged."""
+        return self.scene.lines
 
-        Raises
-        ------
-        ValueError
-            If all channels lie at one place.
-        """
-        model = model_of(lines, grid, beam, outside)
-        if not isinstance(model, cls):
-            raise ValueError("lines must have channels at more than one place")
-        return model
+    @property
+    def grid(self) -> Grid:
+        """Pixels of the image."""
+        return self.scene.grid
+
+    @property
+    def beam(self) -> BeamWindow | None:
+        """Weights of the channels."""
+        return self.scene.beam
+
+    @property
+    def spectrum(self) -> Spectrum:
+        """Spectrum of the lines."""
+        return self.scene.spectrum
+
+    def from_cache(self, key: Hashable, find: Callable[[], _Value]) -> _Value:
+        """Return the value cached under a key; `find` computes it the first time."""
+        if key not in self._cache:
+            self._cache[key] = find()
+        value: _Value = self._cache[key]
+        return value
 
     def with_shape(self, shape: Shape) -> VisibilityModel | None:
         """Return this model with a mean track of another shape; None if channels have none."""
@@ -144,10 +117,7 @@ class VisibilityModel(LinesModel):
         track = mean_track_of(self.lines, shape, wavelength_m)
         if track is None:
             return None
-        kept: dict[Hashable, Any] = {
-            key: self._cache[key] for key in (_AMBIGUITY,) if key in self._cache
-        }
-        return replace(self, shape=shape, track=track, _cache=kept)
+        return replace(self, shape=shape, track=track, _cache={})
 
     def with_limits(self, low: float, high: float) -> VisibilityModel:
         """Return this model with a narrower beam: sines of the aspect angle where it ends."""
@@ -160,7 +130,7 @@ class VisibilityModel(LinesModel):
     @property
     def surface(self) -> Surface:
         """Positions of the grid's pixels."""
-        return self.subimages.surface
+        return self.scene.surface
 
     @property
     def nearest_m(self) -> float:
@@ -201,9 +171,9 @@ class VisibilityModel(LinesModel):
     @shared
     def directions(self) -> BeamDirections | None:
         """Unit directions of the beam anywhere on the track; None without a beam."""
-        if self.beam is None or self.channels_along is None:
+        if self.beam is None or self.scene.along is None:
             return None
-        return directions_of(self.beam, self.channels_along, self.track)
+        return directions_of(self.beam, self.scene.along, self.track)
 
     @property
     @shared
@@ -271,43 +241,31 @@ class VisibilityModel(LinesModel):
         return float(self.visible(self.small)[:, ends].sum(axis=1).mean())
 
 
-def model_of(
-    lines: RangeLines, grid: Grid, beam: BeamWindow | None, outside: float = _MOST_OUTSIDE
-) -> LinesModel:
-    """Return a `VisibilityModel` with the simplest mean track.
+def model_of(scene: Scene, outside: float = _MOST_OUTSIDE) -> VisibilityModel | None:
+    """Return the model with the simplest mean track; None if all channels lie at one place.
 
-    If all channels lie at one place, return a plain `LinesModel`: nothing is sampled then, so that
-    an image of one channel costs no more. `outside` is the share of the lines' power that may lie
-    above `highest_cycles_per_m`.
+    `outside` is the share of the lines' power that may lie above `highest_cycles_per_m`.
     """
-    energy = line_energy(lines.samples)
-    spectrum = measure_spectrum(lines, grid, energy)
+    lines, spectrum = scene.lines, scene.spectrum
+    shape, track = simplest_track(lines, band_wavelength_m(lines, spectrum.centre))
+    if track is None:
+        return None
     occupied = spectrum.frequency[np.cumsum(spectrum.share) < 1 - min(outside, _MOST_OUTSIDE)]
     half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
     centre = cycles_per_m_at(lines, spectrum.centre)
     mean_square = spectrum.share @ spectrum.frequency**2
-    shape, track = simplest_track(lines, band_wavelength_m(lines, spectrum.centre))
-    model = LinesModel(
-        lines,
-        grid,
-        beam,
-        spectrum,
+    energy = scene.line_energy
+    return VisibilityModel(
+        scene,
         channel_power=energy / max(float(energy.mean()), 1e-300) if energy.any() else 1 + energy,
         highest_cycles_per_m=float(abs(centre) + half_band),
         rms_cycles_per_m=float(np.sqrt(mean_square)) / lines.range_step_m,
-        channels_along=None if beam is None else beam.directions(lines),
-    )
-    if track is None:
-        return model
-    surface = surface_of(grid)
-    return VisibilityModel(
-        **vars(model),
-        limits=None if beam is None else beam.limits,
+        limits=None if scene.beam is None else scene.beam.limits,
         shape=shape,
         track=track,
-        subimages=Subimages(surface),
-        points_m=sample_points_m(surface),
-        distances_m=_distances_m(lines, surface, track),
+        subimages=Subimages(scene.surface),
+        points_m=sample_points_m(scene.surface),
+        distances_m=_distances_m(lines, scene.surface, track),
     )
 
 

@@ -29,10 +29,14 @@ class ExactImage:
         Relative rms error of interpolation, dB.
     reason : str
         Reason why the image is not factorized, in words; "" if an exact image was requested.
+    taps, upsampling
+        Interpolation of the lines; None to choose the fastest: see `clsas.backproject`.
     """
 
     accuracy_db: Number
     reason: str = ""
+    taps: int | None = None
+    upsampling: float | None = None
     kind: Literal["exact"] = "exact"
 
     sides: ClassVar[tuple[Size, ...]] = ()

@@ -17,11 +17,11 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.core.validate import warn
-from clsas.exact.backprojection import backproject, form_exactly
 from clsas.files.hdf5 import save
 from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS
+from clsas.imaging import backproject, factorize, plan
 from clsas.inspection.inspection import inspect
 from clsas.interferometry.heights import heights
 from clsas.interferometry.pair_errors import pair_errors
@@ -34,10 +34,7 @@ from clsas.navigation.autofocus import autofocus
 from clsas.navigation.known_points import calibrate_track
 from clsas.navigation.micronavigation import micronavigate
 from clsas.opencl.device import Device
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
 from clsas.planning.request import TOLERANCE_DB
-from clsas.plans.factorization import ExactImage
 from clsas.processing import numbers
 from clsas.processing.record import StepRecord
 from clsas.processing.tracks import csv_of_track
@@ -431,13 +428,7 @@ def _formed(
         image = backproject(lines, grid, **request, beam=beam, device=job.device, progress=progress)
         return image, None
     chosen = plan(lines, grid, **request, beam=beam, device=job.device)
-    if isinstance(chosen.method, ExactImage):
-        image = form_exactly(
-            lines, grid, accuracy_db=chosen.method.accuracy_db, beam=beam, device=job.device,
-            progress=progress,
-        )  # fmt: skip
-    else:
-        image = factorize(lines, grid, chosen, device=job.device, progress=progress)
+    image = factorize(lines, grid, chosen, device=job.device, progress=progress)
     return image, chosen.predicted_error_db
 
 

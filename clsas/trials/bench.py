@@ -16,8 +16,8 @@ from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.exact import reference
-from clsas.exact.backprojection import form_exactly, prepare
-from clsas.exact.run import execute
+from clsas.forming import SceneImager, form_exactly
+from clsas.imaging import Imager, factorize, plan
 from clsas.interferometry.heights import heights
 from clsas.interferometry.refinement import PASSES
 from clsas.interferometry.result import Heights
@@ -25,9 +25,8 @@ from clsas.measures.tradeoff import REFERENCE_DB
 from clsas.mosaics.mosaic import mosaic
 from clsas.mosaics.store import Record
 from clsas.opencl.device import Device, open_device
-from clsas.planning.factorize import factorize
-from clsas.planning.imager import Imager
-from clsas.planning.planner import plan
+from clsas.plans.factorization import ExactImage
+from clsas.scene import Scene
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 from clsas.trials import cases, dunes, wreck
@@ -83,16 +82,18 @@ def run(
     for repeat in range(repeats + 1):
         with device.profile() as times:
             start = time.perf_counter()
-            preparation = prepare(lines, grid, device=device, accuracy_db=accuracy_db)
-            image = execute(preparation)
+            scene = Scene.of(lines, grid, None, accuracy_db)
+            imager = SceneImager(scene, ExactImage(accuracy_db), device, keep=False)
+            image = imager.form(lines)
             seconds.append(time.perf_counter() - start)
         kernel_seconds.append(times["backproject_tiles"].total_s)
         if progress is not None:
             progress(repeat + 1, repeats + 1)
     del seconds[0], kernel_seconds[0]
-    pairs = lines.channels * grid.size
+    assert imager.decision is not None
+    decision, pairs = imager.decision, lines.channels * grid.size
     flops = (
-        flops_per_pair(preparation.interpolator.taps, preparation.phase_terms)
+        flops_per_pair(decision.interpolator.taps, decision.phase_terms)
         * pairs
         / min(kernel_seconds)
     )
@@ -103,8 +104,8 @@ def run(
         "channels": lines.channels,
         "pixels": list(grid.shape),
         "accuracy_db": accuracy_db,
-        "taps": preparation.interpolator.taps,
-        "upsampling": round(preparation.resampling.ratio, 3),
+        "taps": decision.interpolator.taps,
+        "upsampling": round(decision.resampling.ratio, 3),
         "seconds": _statistics(seconds)
         | {"included": "all of clsas.backproject, from choosing the interpolation to readback"},
         "gbp_per_s": pairs / statistics.median(seconds) / 1e9,
@@ -112,9 +113,9 @@ def run(
         "kernel_gbp_per_s": pairs / min(kernel_seconds) / 1e9,
         "gflop_per_s": flops / 1e9,
         "share_of_peak": flops / peak_flops(device),
-        "predicted_error_db": preparation.interpolator.error_db,
+        "predicted_error_db": decision.interpolator.error_db,
         "rounding_error_db": reference.sampled_error_db(
-            image, partial(reference.same_interpolator, preparation), pixels=_PIXELS
+            image, partial(reference.same_interpolator, lines, decision), pixels=_PIXELS
         ),
         "true_error_db": reference.sampled_error_db(
             image, partial(reference.ideal, lines), pixels=_PIXELS

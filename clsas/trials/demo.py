@@ -16,9 +16,9 @@ from clsas import plot
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.exact.backprojection import form_exactly
 from clsas.files.hdf5 import save
 from clsas.files.scene_files import SceneFile, built_in_scene, read_scene
+from clsas.forming import form_exactly
 from clsas.measures.quality import PointResponse, measure_point
 from clsas.measures.resolution import expected_resolution_m
 from clsas.opencl.device import Device, open_device

@@ -11,13 +11,11 @@ from typing import Any
 
 from clsas.core import validate
 from clsas.core.image import Image
-from clsas.exact.backprojection import backproject
 from clsas.exact.wavenumber import wavenumber
+from clsas.imaging import backproject, factorize, plan
 from clsas.mosaics.mosaic import mosaic
 from clsas.opencl.device import Device, DeviceInfo, open_device
 from clsas.planning.costs import Costs
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
 from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import extremes

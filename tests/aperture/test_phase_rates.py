@@ -18,7 +18,7 @@ from clsas.aperture.phase_rates import (
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
-from clsas.factorized.surface import surface_of
+from clsas.core.surface import surface_of
 
 CARRIER = 120e3
 WAVELENGTH = 1500.0 / CARRIER

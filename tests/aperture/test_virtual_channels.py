@@ -5,7 +5,7 @@ from factorizing import CARRIER, SPEED, arc, made, near, straight, swaying
 from clsas.aperture.mean_track import mean_track
 from clsas.aperture.phase_rates import PhaseBoxes, cycles_per_extent
 from clsas.aperture.virtual_channels import interpolated_channels, summed_neighbours
-from clsas.factorized.surface import surface_of
+from clsas.core.surface import surface_of
 from clsas.factorized.tree import Division
 from clsas.signal import interpolation
 from clsas.signal.spectrum import Spectrum

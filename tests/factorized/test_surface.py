@@ -3,7 +3,7 @@ import pytest
 from factorizing import around
 
 from clsas.core.grid import Grid
-from clsas.factorized.surface import LEAST_SIDE, surface_of
+from clsas.core.surface import LEAST_SIDE, surface_of
 
 SIDES = ((16, 4), (32, 8), (32, 64), (128, 128))
 

@@ -7,7 +7,7 @@ from clsas.aperture.beam_directions import directions_of
 from clsas.aperture.mean_track import mean_track
 from clsas.core.grid import Grid
 from clsas.factorized import visibility
-from clsas.factorized.surface import surface_of
+from clsas.core.surface import surface_of
 from clsas.factorized.tree import Division
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility
