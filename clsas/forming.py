@@ -13,7 +13,7 @@ from clsas.core.lines import RangeLines
 from clsas.exact.decision import ACCURACY_DB, Decision, decide
 from clsas.exact.run import ExactImager
 from clsas.factorized.imager import FactorizedImager
-from clsas.opencl.device import Device
+from clsas.opencl.device import Device, open_device
 from clsas.plans.factorization import ExactImage
 from clsas.plans.plan import Plan
 from clsas.scene import Scene, check_numbers
@@ -38,6 +38,8 @@ class SceneImager:
         True if the user need not be warned that no line adds anything to the image.
     keep : bool
         Whether references of exact images are kept for the next one.
+    decision : Decision, optional
+        How an exact image is formed, if that is known.
 
     Attributes
     ----------
@@ -54,12 +56,13 @@ class SceneImager:
         track: MeanTrack | None = None,
         warned: bool = False,
         keep: bool = True,
+        decision: Decision | None = None,
     ) -> None:
         self.scene, self.device, self._warned = scene, device, warned
-        self.decision: Decision | None = None
+        self.decision = decision
         method = plan.method if isinstance(plan, Plan) else plan
         if isinstance(method, ExactImage):
-            self.decision = decide(
+            self.decision = decision or decide(
                 scene, device, method.accuracy_db, taps=method.taps, upsampling=method.upsampling
             )
             self._exact = ExactImager(scene, self.decision, device, keep=keep)
@@ -121,12 +124,12 @@ def form_exactly(
     *,
     accuracy_db: float = ACCURACY_DB,
     beam: BeamWindow | None = None,
-    device: Device,
+    device: Device | str | int | None = None,
     progress: Progress | None = None,
 ) -> Image:
     """Return the image of `clsas.backproject`, without its checks and warnings."""
     scene = Scene.of(lines, grid, beam, accuracy_db)
-    return form(scene, ExactImage(accuracy_db), device, progress=progress)
+    return form(scene, ExactImage(accuracy_db), open_device(device), progress=progress)
 
 
 def scene_of_plan(lines: RangeLines, grid: Grid, plan: Plan) -> Scene:

@@ -3,14 +3,13 @@
 from functools import cache, partial
 
 import numpy as np
+from exactly import execute, prepare, same_interpolator
 
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
-from clsas.exact.backprojection import prepare
-from clsas.exact.reference import ideal, same_interpolator
-from clsas.exact.run import execute
+from clsas.exact.reference import ideal
 from clsas.signal.spectrum import Spectrum
 
 SPARE = 160  # samples of a line beyond what a grid needs, at each end

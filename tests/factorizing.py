@@ -13,7 +13,7 @@ from cases import along_x, lines_over
 from clsas import plan
 from clsas.core.grid import Grid
 from clsas.core.image import Image
-from clsas.exact.backprojection import backproject
+from clsas.imaging import backproject
 from clsas.opencl.device import open_device
 from clsas.planning.costs import Costs
 from clsas.sonar.beam import BeamWindow

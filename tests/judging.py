@@ -10,17 +10,15 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
+from exactly import execute, prepare
 from families import Scene
 
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
-from clsas.exact.backprojection import prepare
-from clsas.exact.run import execute
+from clsas.imaging import factorize, plan
 from clsas.measures.certificate import Certificate, certify
 from clsas.planning.costs import Costs
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
 
 REFERENCE_DB = -85.0  # of the exact image with which others are compared everywhere
 FLOOR_DB = -90.0  # below which sums of these large phases do not agree

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
-from clsas.exact.backprojection import backproject
+from clsas.imaging import backproject
 from clsas.simulation.scenes import Observer, PointTargets, Seabed
 from clsas.simulation.simulator import simulate_lines
 

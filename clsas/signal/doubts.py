@@ -367,7 +367,8 @@ def _focused(
         arc_m = best_m + np.linspace(-spread, spread, 17)[:, None] * course
         spread /= 6
     range_m, found = (each[0] for each in at(best_m, near))
-    found = found / (np.abs(found).max() or np.float32(1))  # squares stay within floating point
+    found = found.astype(np.complex128)
+    found /= np.abs(found).max() or 1.0  # squares stay within floating point
     level = np.abs(found)
     total, square = float(level.sum()), float((level**2).sum())
     if not total or total**2 < _LEAST_PHASED * square:

@@ -17,9 +17,9 @@ import warnings
 from collections.abc import Callable
 
 import numpy as np
+from exactly import prepare
 
 import clsas
-from clsas.exact.backprojection import prepare
 from clsas.planning.costs import Costs
 from clsas.trials.extremes import raw
 

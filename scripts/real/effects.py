@@ -22,10 +22,9 @@ import numpy as np
 import radar
 import recordings
 import ultrasound
+from exactly import execute, prepare
 
 import clsas
-from clsas.exact.backprojection import prepare
-from clsas.exact.run import execute
 from clsas.files import scene_files as config
 from clsas.measures.assessment_result import NONE_DB, Assessment, Effect
 from clsas.opencl.device import Device, open_device

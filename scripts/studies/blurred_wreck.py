@@ -20,8 +20,8 @@ from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
 from clsas.files.formats import load
 from clsas.files.scene_files import parse_scene
+from clsas.imaging import factorize
 from clsas.measures.quality import measure_point
-from clsas.planning.factorize import factorize
 from clsas.processing.chain import process
 from clsas.signal.compression import compress
 from clsas.simulation.scenes import PointTargets

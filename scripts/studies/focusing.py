@@ -16,12 +16,12 @@ from scipy.ndimage import gaussian_filter1d
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.wavelengths import wavelength_m
-from clsas.exact.backprojection import form_exactly
 from clsas.files.phase_histories import read_phase_history
+from clsas.forming import form_exactly
+from clsas.imaging import factorize
 from clsas.navigation.autofocus import IMAGE_TOLERANCE_DB, Autofocus, autofocus
 from clsas.navigation.responses import Passage
 from clsas.opencl.device import Device
-from clsas.planning.factorize import factorize
 from clsas.signal.compression import compress
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate

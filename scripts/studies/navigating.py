@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
-from clsas.exact.backprojection import form_exactly
+from clsas.forming import form_exactly
 from clsas.measures.quality import measure_point
 from clsas.navigation.micronavigation import Micronavigation, micronavigate
 from clsas.opencl.device import Device

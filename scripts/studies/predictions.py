@@ -8,15 +8,15 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
-from clsas.exact.backprojection import form_exactly
+from clsas.forming import form_exactly
+from clsas.imaging import factorize, plan
 from clsas.opencl.device import Device
 from clsas.planning import costs, scaling
 from clsas.planning.costs import KnownCosts
 from clsas.planning.exact_image import expect
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
-from clsas.planning.visibility_model import VisibilityModel
+from clsas.planning.visibility_model import model_of
 from clsas.plans.report import costs_in_words
+from clsas.scene import Scene
 from clsas.trials import cases
 from studies.tables import TOLERANCES_DB
 
@@ -72,7 +72,8 @@ def _prepared(
     described = (cases.EXACT_CASES | cases.FACTORIZED_CASES)[case]
     lines, grid, beam = described.lines(), described.grid, described.beam
     if case in cases.EXACT_CASES:
-        work = expect(VisibilityModel.of(lines, grid, beam), asked_db, device).work
+        scene = Scene.of(lines, grid, beam, None)
+        work = expect(scene, asked_db, device, model_of(scene)).work
         form = partial(form_exactly, lines, grid, beam=beam, accuracy_db=asked_db, device=device)
         return "", float(known.costs.seconds(work)), form
     chosen = plan(lines, grid, tolerance_db=asked_db, beam=beam, device=device, costs=known.costs)

@@ -23,11 +23,9 @@ from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.exact.backprojection import backproject
+from clsas.imaging import backproject, factorize, plan
 from clsas.opencl.device import Device
 from clsas.planning.costs import Costs
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import cases
 
@@ -36,7 +34,6 @@ MODULES = ("clsas.signal.spectrum", "clsas.signal.ambiguity", "clsas.signal.inte
 FIXED = {
     "clsas.planning.scaling": "measures costs, which are given for the cases",
     "clsas.planning.timed_images": "as scaling",
-    "clsas.exact.checks": "limits of input",
     "clsas.exact.reference": "the float64 reference",
     "clsas.exact.wavenumber": "another imager, which has its own tool",
     "STACK HELD CHUNK GUARD PHASES _GROUP _FINE VECTOR_ROOM": "layouts that kernels share",

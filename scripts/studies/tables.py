@@ -18,10 +18,12 @@ from scipy import stats
 import clsas
 from clsas import plot
 from clsas.core.image_error import levels
-from clsas.exact.backprojection import prepare
-from clsas.exact.run import execute
+from clsas.exact.decision import ACCURACY_DB
+from clsas.forming import form
 from clsas.measures.shadows import dark_level_db
 from clsas.opencl.device import open_device
+from clsas.plans.factorization import ExactImage
+from clsas.scene import Scene
 from clsas.simulation import seabeds
 from clsas.trials import bench, cases, wreck
 
@@ -138,8 +140,9 @@ def taps(devices: list[str]) -> None:
         for name in devices:
             device = open_device(name)
             for count in (2, 4, 6, 8):
+                method = ExactImage(ACCURACY_DB, taps=count, upsampling=3.0)
                 with device.profile() as times:
-                    execute(prepare(lines, grid, device=device, taps=count, upsampling=3.0))
+                    form(Scene.of(lines, grid, None, None), method, device)
                 seconds = times["backproject_tiles"].total_s
                 best[name, count] = min(best.get((name, count), seconds), seconds)
     pairs = lines.channels * grid.size

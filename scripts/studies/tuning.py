@@ -8,10 +8,8 @@ import time
 from collections.abc import Callable, Iterator
 
 from clsas.core.image import Image
-from clsas.exact.backprojection import backproject
+from clsas.imaging import backproject, factorize, plan
 from clsas.opencl.device import Device
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
 from clsas.trials.cases import FFBP_2K, Case
 from studies.sensitivity import Constant
 

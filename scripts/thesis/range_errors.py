@@ -9,8 +9,8 @@ import clsas
 from clsas.aperture.mean_track import mean_track
 from clsas.aperture.nearest import NearestBeams
 from clsas.core.geometry import pairwise_range_m
-from clsas.core.wavelengths import band_wavelength_m
 from clsas.core.surface import surface_of
+from clsas.core.wavelengths import band_wavelength_m
 from clsas.factorized.tree import Division
 
 

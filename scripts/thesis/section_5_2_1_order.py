@@ -54,11 +54,11 @@ def with_sides(
     """Return a plan of the same taps and tolerance with given subimages."""
     factorization = plan.factorization
     taps = factorization.align.taps, factorization.aperture.filter.taps
-    request = Request(scene.lines, scene.grid, tolerance_db=TOLERANCE_DB, device=scene.device)
+    request = Request(scene.lines, scene.grid, tolerance_db=TOLERANCE_DB)
     # A search for such trees that finds one, however slow it is.
     object.__setattr__(request, "allowed", Allowed(stages=(len(sides),)))
     with mock.patch.object(fastest, "search", return_value=Tree(sides, *taps)):
-        return planned(request).plan
+        return planned(request.scene(), request, scene.device)[0]
 
 
 def factors(plan: clsas.Plan) -> str:

@@ -43,8 +43,8 @@ def main() -> None:
         depth = min(found, key=lambda each: found[each].seconds)
         best, plans = found[depth], {}
         for name, some in (("best", {"taps": taps, "depth": depth}), ("chosen", {})):
-            request = Request(lines, grid, tolerance_db=tolerance_db, device=device, **some)
-            plans[name] = planned(request).plan.method
+            request = Request(lines, grid, tolerance_db=tolerance_db, **some)
+            plans[name] = planned(request.scene(), request, device)[0].method
         kept, chosen = plans["best"], plans["chosen"]
         is_chosen = chosen.sides and taps == (chosen.align.taps, chosen.aperture.filter.taps)
         seconds = {

@@ -48,12 +48,10 @@ class Trial:
 
 def interpolated(system: System, taps: int, tolerance_db: float, device: Device) -> clsas.Plan:
     """Return the plan with some taps along the aperture; any taps in range, any stages."""
-    request = Request(
-        system.lines, system.grid, tolerance_db=tolerance_db, beam=system.beam, device=device
-    )
+    request = Request(system.lines, system.grid, tolerance_db=tolerance_db, beam=system.beam)
     # `clsas.plan` offers 4, 6 and 8 taps only.
     object.__setattr__(request, "allowed", Allowed(aperture_taps=(taps,)))
-    return planned(request).plan
+    return planned(request.scene(), request, device)[0]
 
 
 def plans_of_nearest_beams(system: System, device: Device) -> dict[str, clsas.Plan]:
@@ -67,7 +65,7 @@ def plans_of_nearest_beams(system: System, device: Device) -> dict[str, clsas.Pl
         divisions = math.prod(divisions for _, divisions in stages)
         if 16 * divisions > system.pixels:
             continue
-        plan = clsas.plan(system.lines, system.grid, stages=stages, beam=system.beam, device=device)
+        plan = clsas.plan(system.lines, system.grid, stages=stages, beam=system.beam)
         found.append((plan.predicted_seconds, plan.predicted_error_db, chapter5.name(stages), plan))
     front, best_db = {}, math.inf
     for seconds, error_db, name, plan in sorted(found, key=lambda each: each[:2]):

@@ -23,6 +23,7 @@ from cases import (
     thesis_lines,
     true_error_db,
 )
+from exactly import execute, prepare, same_interpolator
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiers import name_of, thinned
@@ -32,12 +33,10 @@ from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.exact.backprojection import backproject, prepare
 from clsas.exact.groups import Groups
 from clsas.exact.lookup import lookup_options, lookup_room
-from clsas.exact.reference import same_interpolator
-from clsas.exact.run import execute
 from clsas.exact.tiles import BLOCKS, HELD, STACK, Tiles
+from clsas.imaging import backproject
 from clsas.opencl.device import list_devices
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines

@@ -5,14 +5,14 @@ from functools import partial
 import numpy as np
 import pytest
 from cases import CARRIER, STEP, along_x, bistatic, made, noise, patch, thesis_lines
+from exactly import prepare, same_interpolator
 
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.exact import reference
-from clsas.exact.backprojection import prepare
-from clsas.exact.reference import ideal, same_interpolator, sampled_error_db
+from clsas.exact.reference import ideal, sampled_error_db
 
 TRACK = along_x(7, 0.3)
 RX = TRACK + np.array([0.1, -0.05, 0.2])
@@ -122,8 +122,9 @@ def test_blocks_and_progress(which, monkeypatch):
     lines = thesis_lines(patch(1, 42, 3, 4), TRACK)
     points = patch(1, 42, 3, 4).positions_m()
     preparation = prepare(lines, Grid.points(points), taps=4, upsampling=3)
-    given = preparation if which == "same_interpolator" else lines
-    evaluate = partial(getattr(reference, which), given, points)
+    evaluate = partial(ideal, lines, points)
+    if which == "same_interpolator":
+        evaluate = partial(same_interpolator, preparation, points)
     whole = evaluate()
     assert whole.shape == (4, 3)
     assert whole.dtype == np.complex128
@@ -164,7 +165,6 @@ def test_an_error_is_measured_at_random_pixels():
         (lambda lines: ideal(lines, [0, 0, 1j]), TypeError, "points_m"),
         (lambda lines: ideal(lines, [0, 0, 0], beam=20), TypeError, "beam must be .*BeamWindow"),
         (lambda lines: ideal(lines, [0, 0, 0], padding=-1), ValueError, "padding"),
-        (lambda lines: same_interpolator(lines, [0, 0, 0]), TypeError, "preparation must be"),
         (lambda lines: sampled_error_db(lines, None), TypeError, "image must be .*Image"),
     ],
 )

@@ -8,9 +8,7 @@ from cases import along_x
 from factorizing import EXACT_IS_SLOW, around, exact, made, over, planned, swaying
 
 from clsas.core.image_error import relative_error_db
-from clsas.exact.backprojection import backproject
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
+from clsas.imaging import backproject, factorize, plan
 
 FAR = np.array([1e7, -1e7, 1e7])
 

@@ -20,14 +20,14 @@ from cases import (
     rounding_error_db,
     thesis_lines,
 )
+from exactly import execute, prepare, same_interpolator
 
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.exact.backprojection import backproject, prepare
-from clsas.exact.reference import same_interpolator, sampled_error_db
-from clsas.exact.run import execute
+from clsas.exact.reference import sampled_error_db
+from clsas.imaging import backproject
 
 FAR = np.array([1e7, -1e7, 1e7])
 

@@ -3,11 +3,11 @@ import pytest
 from factorizing import BEAMS, EXACT_IS_SLOW, around, over, swaying
 
 from clsas.core.geometry import bistatic_range_m
+from clsas.core.surface import surface_of
 from clsas.factorized import visibility
 from clsas.factorized.geometry import geometry_of
 from clsas.factorized.sectors import references, sector_of
-from clsas.core.surface import surface_of
-from clsas.planning.planner import plan
+from clsas.imaging import plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import cases
 

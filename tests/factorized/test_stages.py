@@ -37,9 +37,9 @@ from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.validate import ClsasWarning
-from clsas.exact.backprojection import backproject, form_exactly
+from clsas.forming import form_exactly
+from clsas.imaging import backproject, factorize
 from clsas.planning.costs import Costs
-from clsas.planning.factorize import factorize
 from clsas.planning.prediction import HALF_ROUNDING
 from clsas.plans.plan import Plan
 from clsas.simulation.scenes import PointTargets

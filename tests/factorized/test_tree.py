@@ -4,12 +4,10 @@ from cases import along_x
 from factorizing import BEAMS, EXACT_IS_SLOW, around, over
 
 from clsas.core.image_error import relative_error_db
-from clsas.exact.backprojection import backproject
-from clsas.factorized import sectors, tree
 from clsas.core.surface import surface_of
+from clsas.factorized import sectors, tree
 from clsas.factorized.tree import Division
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
+from clsas.imaging import backproject, factorize, plan
 
 # Division
 

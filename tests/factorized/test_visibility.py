@@ -6,8 +6,8 @@ from factorizing import BEAMS, CARRIER, SPEED, made, near
 from clsas.aperture.beam_directions import directions_of
 from clsas.aperture.mean_track import mean_track
 from clsas.core.grid import Grid
-from clsas.factorized import visibility
 from clsas.core.surface import surface_of
+from clsas.factorized import visibility
 from clsas.factorized.tree import Division
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility

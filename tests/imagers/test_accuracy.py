@@ -1,16 +1,14 @@
 """Every imager compared with an independent oracle, at the extremes."""
 
 import pytest
+from exactly import execute, prepare
 from scenes import kept
 from tiers import thinned
 
 from clsas import wavenumber as form_wavenumber
-from clsas.exact.backprojection import prepare
-from clsas.exact.run import execute
+from clsas.imaging import factorize, plan
 from clsas.mosaics.mosaic import mosaic
 from clsas.planning.costs import Costs
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import extremes
 from clsas.trials.extremes import (

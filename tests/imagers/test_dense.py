@@ -14,13 +14,11 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.exact import reference
-from clsas.exact.backprojection import backproject
 from clsas.factorized.sectors import Roots
+from clsas.imaging import backproject, factorize, plan
 from clsas.opencl.device import open_device
 from clsas.planning import planner
 from clsas.planning.costs import Costs
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
 from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials.selftest import driven

@@ -11,8 +11,7 @@ from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.exact.backprojection import backproject
-from clsas.planning.factorize import factorize
+from clsas.imaging import backproject, factorize
 from clsas.sonar.beam import BeamWindow
 
 pytestmark = pytest.mark.slow

@@ -14,8 +14,8 @@ from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.sound_speed import SoundSpeed
 from clsas.core.validate import ClsasWarning
-from clsas.exact.backprojection import backproject
 from clsas.files.hdf5 import FileFormatError, load, save
+from clsas.imaging import backproject
 from clsas.mosaics.mosaic import mosaic
 from clsas.mosaics.survey import (
     END,

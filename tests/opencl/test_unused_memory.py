@@ -9,9 +9,8 @@ from dense import scene
 from factorizing import EXACT_IS_SLOW, changed
 from tiers import thinned
 
+from clsas.imaging import factorize, plan
 from clsas.opencl.device import Device
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import extremes, selftest
 from clsas.trials.extremes import along_x

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import exactly
 import numpy as np
 import pytest
 from cases import along_x
@@ -9,7 +10,6 @@ from factorizing import around, over
 
 from clsas.planning.channels import sampled_channels
 from clsas.planning.errors import beam_weights, phase_error, relative_error, root_error
-from clsas.planning.visibility_model import VisibilityModel
 from clsas.sonar.beam import BeamWindow
 
 TRACK = along_x(200, 0.02)
@@ -20,7 +20,7 @@ ALTERNATING = np.where(np.arange(len(TRACK)) % 2, 1.0, -1.0)
 
 def model_of(tx, rx=None, beam=None, **more):
     lines, grid = over(GRID, tx, rx, **more)
-    return VisibilityModel.of(lines, grid, beam)
+    return exactly.sampled(lines, grid, beam)
 
 
 def sampled(model, offset_m):
@@ -132,7 +132,7 @@ def test_a_loud_channel_off_the_track_counts_more_than_others():
     quiet = dataclasses.replace(lines, tx_m=tx, rx_m=tx)
     loud = dataclasses.replace(quiet, samples=samples)
     none, few, many = (
-        root_error(VisibilityModel.of(each, GRID, None), ROOT) for each in (lines, quiet, loud)
+        root_error(exactly.sampled(each, GRID), ROOT) for each in (lines, quiet, loud)
     )
     # Its share of the power grows from 1/200 to 100/299.
     assert many - none == pytest.approx(200 * 100 / 299 * (few - none), rel=0.1)

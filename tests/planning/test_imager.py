@@ -13,10 +13,9 @@ from tiers import thinned
 import clsas
 from clsas.core.image_error import relative_error_db
 from clsas.core.validate import ClsasWarning
-from clsas.exact.backprojection import backproject
 from clsas.factorized import sectors
-from clsas.planning.former import former
-from clsas.planning.planner import plan
+from clsas.forming import form, scene_of_plan
+from clsas.imaging import backproject, plan
 
 
 def planned(lines, grid, beam=None, tolerance_db=-40):
@@ -129,7 +128,7 @@ def test_it_is_closed_after_a_with_block():
     lines, grid = made(straight)
     with clsas.Imager(lines, grid, planned(lines, grid)) as imager:
         imager(lines)
-        kept = weakref.ref(imager._former)
+        kept = weakref.ref(imager._imager)
     gc.collect()
     assert kept() is None
     with pytest.raises(ValueError, match="the imager was closed"):
@@ -224,6 +223,6 @@ def test_a_plan_forms_images_of_a_track_beside_its_own(platform):
     moved = dataclasses.replace(lines, tx_m=lines.tx_m + away_m, rx_m=lines.rx_m + away_m)
     with pytest.raises(ValueError, match="lines must have the geometry"):
         chosen.check(moved, grid)
-    image = former(moved, grid, chosen, platform).form(moved)
+    image = form(scene_of_plan(moved, grid, chosen), chosen, platform)
     ideal = backproject(moved, grid, accuracy_db=-75, device=platform)
     assert relative_error_db(image, ideal) <= chosen.tolerance_db

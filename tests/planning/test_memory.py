@@ -14,11 +14,9 @@ from factorizing import (
 )
 
 from clsas.core.sound_speed import SoundSpeed
-from clsas.exact.backprojection import backproject
+from clsas.imaging import backproject, factorize, plan
 from clsas.opencl.buffers import Slot
 from clsas.planning import exact_image, memory, prediction
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
 from clsas.signal.refraction import homogeneous
 from clsas.sonar.beam import BeamWindow
 

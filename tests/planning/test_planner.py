@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 from cases import along_x, lines_over
+from exactly import sampled
 from factorizing import (
     BEAMS,
     EXACT_IS_SLOW,
@@ -26,14 +27,11 @@ from tiers import also, thinned
 
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
-from clsas.exact.backprojection import backproject
+from clsas.imaging import backproject, factorize, plan
 from clsas.planning import fastest, planner, timed_images
 from clsas.planning.beam_coverage import trimmed
 from clsas.planning.channels import frequencies
 from clsas.planning.costs import Costs
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
-from clsas.planning.visibility_model import VisibilityModel
 from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
@@ -44,7 +42,7 @@ from clsas.sonar.visibility import sines
 def test_lines_that_nearly_fill_the_sampled_band_are_upsampled_by_filters(monkeypatch):
     """FFTs in their place take several times as long, and lines of half precision need filters."""
     monkeypatch.setattr(timed_images, "_BAND", 0.92)
-    lines, grid = timed_images.scene(300, 128)
+    lines, grid = timed_images.noise(300, 128)
     chosen = plan(lines, grid, tolerance_db=-45, costs=EXACT_IS_SLOW)
     assert chosen.factorization.upsampler is not None
     image, exact = factorize(lines, grid, chosen), backproject(lines, grid, accuracy_db=-80)
@@ -353,7 +351,7 @@ def test_next_to_nothing_of_a_beam_is_left_out(beam_deg, share):
     grid = around(0, 40, pixel_m=(0.03, 0.3), shape=(50, 60))
     lines, _ = over(grid, along_x(200, 0.014))
     beam = BeamWindow(beam_deg, "hann")
-    low, high = trimmed(VisibilityModel.of(lines, grid, beam), share).limits
+    low, high = trimmed(sampled(lines, grid, beam), share).limits
     sine = sines(grid.positions_m().reshape(-1, 3), lines.phase_centres_m, beam.directions(lines))
     weights = beam.weights(sine) ** 2
     left_out = weights[(sine < low) | (sine > high)].sum() / weights.sum()
@@ -513,7 +511,7 @@ def test_the_highest_frequency_leaves_out_as_little_as_is_allowed():
     noisy = dataclasses.replace(lines, samples=lines.samples + floor)
     highest, bin_m = [], 1 / (256 * lines.range_step_m)
     for outside in (1e-6, 1e-9, 1e-11):
-        model = VisibilityModel.of(noisy, grid, None, outside)
+        model = sampled(noisy, grid, None, outside)
         cycles_per_m, share = frequencies(model)
         assert share[cycles_per_m > model.highest_cycles_per_m + bin_m].sum() <= outside
         highest.append(model.highest_cycles_per_m)

@@ -3,6 +3,7 @@ from itertools import pairwise, product
 
 import numpy as np
 import pytest
+from exactly import sampled
 from factorizing import BEAMS, around, over
 
 from clsas.opencl.device import open_device
@@ -11,7 +12,6 @@ from clsas.planning.aperture_phases import AperturePhases
 from clsas.planning.costs import Costs
 from clsas.planning.search import Allowed
 from clsas.planning.sizes import all_sizes
-from clsas.planning.visibility_model import VisibilityModel
 
 
 def priced(model, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
@@ -36,7 +36,7 @@ def everything_tried(*arguments):
 @pytest.fixture(scope="module", params=[None, BEAMS[0]], ids=["wide", "beam"])
 def model(request):
     grid = around(0, 40, shape=(500, 700))
-    return VisibilityModel.of(over(grid)[0], grid, request.param)
+    return sampled(over(grid)[0], grid, request.param)
 
 
 def cost_of(tree, model, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):

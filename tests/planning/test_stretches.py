@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 from cases import along_x
+from exactly import sampled
 from factorizing import around, over
 
 from clsas.planning.stretches import aligned_spectrum, stretch_of, uncompensated
-from clsas.planning.visibility_model import VisibilityModel
 from clsas.signal import interpolation
 from clsas.signal.spectrum import shares_of_bins
 from clsas.sonar.beam import BeamWindow
@@ -19,7 +19,7 @@ GRID = around(0, 40, shape=(32, 32))
 
 def model_of(rx=None, *, band=0.02, **more):
     lines, grid = over(GRID, TRACK, rx, band=band, **more)
-    return VisibilityModel.of(lines, grid, None)
+    return sampled(lines, grid, None)
 
 
 def test_channels_on_the_mean_track_have_none():
@@ -90,6 +90,6 @@ def test_silent_channels_have_none():
     samples = lines.samples.copy()
     samples[100:300] = 0
     silent = dataclasses.replace(lines, samples=samples, rx_m=lines.rx_m + [0, 0, 20])
-    model = VisibilityModel.of(silent, grid, BeamWindow(20, "hann"))
+    model = sampled(silent, grid, BeamWindow(20, "hann"))
     assert stretch_of(model).shares is None
     assert np.isfinite(aligned_spectrum(model).power).all()

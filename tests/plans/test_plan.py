@@ -22,11 +22,9 @@ from factorizing import (
 from clsas.core.digests import grid_digest, lines_digest, with_digest
 from clsas.core.grid import Grid
 from clsas.core.sound_speed import SoundSpeed
-from clsas.exact.backprojection import form_exactly
+from clsas.imaging import factorize, plan
 from clsas.opencl.device import open_device
 from clsas.planning import costs
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
 from clsas.plans.plan import VERSION, Plan
 from clsas.sonar.beam import BeamWindow
 
@@ -343,11 +341,9 @@ def test_device_memory_of_plain_backprojection(monkeypatch, case, beam):
     else:
         lines, grid = over(around(0, 40, shape=(1, 1) if case == "one pixel" else (150, 160)))
         lines = lines.select(slice(100, 220)) if case == "few channels" else lines
-    planned = plan(lines, grid, stages=[], beam=beam).memory_bytes
-    # A plan with given stages neglects no effects, and treats points on a plane as points.
-    whole = partial(form_exactly, lines, grid, accuracy_db=-60, beam=beam, full_model=True)
-    peak = peak_device_bytes(monkeypatch, whole, None)
-    assert 0.5 * planned <= peak <= 1.01 * planned
+    planned = plan(lines, grid, stages=[], beam=beam)
+    peak = peak_device_bytes(monkeypatch, partial(factorize, lines, grid, planned), None)
+    assert 0.5 * planned.memory_bytes <= peak <= 1.01 * planned.memory_bytes
 
 
 # Digests

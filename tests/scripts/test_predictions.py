@@ -4,9 +4,9 @@ import pytest
 from studies import predictions
 
 from clsas.core.grid import Grid
+from clsas.imaging import plan
 from clsas.opencl.device import open_device
 from clsas.planning import costs
-from clsas.planning.planner import plan
 from clsas.trials import cases
 from clsas.trials.cases import Case
 

@@ -6,14 +6,13 @@ import math
 import numpy as np
 import pytest
 from cases import TAPER, along_x, noise
+from exactly import execute, prepare
 
 import clsas
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.exact.backprojection import prepare
-from clsas.exact.run import execute
 from clsas.signal.ambiguity import ends_error
 from clsas.signal.spectrum import measure_spectrum
 

@@ -18,17 +18,19 @@ from cases import (
     points,
     thesis_lines,
 )
+from exactly import execute, prepare, same_interpolator
 from scipy.signal.windows import taylor
 
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.exact.backprojection import backproject, form_exactly, prepare
+from clsas.exact import reference
 from clsas.exact.groups import Groups
-from clsas.exact.reference import ideal, same_interpolator
-from clsas.exact.run import execute
+from clsas.exact.reference import ideal
 from clsas.exact.tiles import Tiles
+from clsas.forming import form_exactly
+from clsas.imaging import backproject
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import INTERVALS, SHAPES, BeamWindow
@@ -187,7 +189,10 @@ def test_an_image_is_the_weighted_sum(name, device):
     assert isinstance(preparation.layout, Groups if name[-6:] in ("points", "eights") else Tiles)
     chosen, where = pixels_of(case)
     wanted = same_interpolator(preparation, where)
-    seen = beam.weights(sines(where, made(case)[0].phase_centres_m, preparation.along), 0.0015) > 0
+    seen = (
+        beam.weights(sines(where, made(case)[0].phase_centres_m, preparation.scene.along), 0.0015)
+        > 0
+    )
     assert 0.02 < seen.mean() < 0.98 or name == "inverse"
     assert relative_error_db(execute(preparation).pixels.ravel()[chosen], wanted) <= -75
 
@@ -208,10 +213,7 @@ def test_an_image_at_the_edge_of_a_window_is_as_accurate(shape, accuracy_db):
     grid = Grid((-23.07, 40, 0), (0.02, 0, 0), (0, 0.02, 0), shape=(48, 48))
     lines = thesis_lines(grid, along_x(150, 0.004))
     preparation = prepare(lines, grid, beam=beam, accuracy_db=accuracy_db)
-    chosen, each = (
-        execute(choice)
-        for choice in (preparation, dataclasses.replace(preparation, one_cubic=False))
-    )
+    chosen, each = (execute(choice) for choice in (preparation, preparation.but(one_cubic=False)))
     assert relative_error_db(chosen, each) <= accuracy_db - 6
 
 
@@ -226,9 +228,7 @@ def test_one_cubic_of_weights_errs_by_no_more_than_is_expected(shape, squint_deg
     grid = Grid(middle - 31.5 * np.sum(steps_m, axis=0), *steps_m, shape=(64, 64))
     lines = thesis_lines(grid, along_x(800, 0.005))
     preparation = prepare(lines, grid, beam=beam, accuracy_db=-60)
-    each, one = (
-        execute(dataclasses.replace(preparation, one_cubic=choice)) for choice in (False, True)
-    )
+    each, one = (execute(preparation.but(one_cubic=choice)) for choice in (False, True))
     tiles = preparation.layout
     nearest_m = tiles.nearest_m(lines.phase_centres_m) - tiles.radius_m
     expected_db = 20 * np.log10(tiles.one_cubic_error(beam, nearest_m, 0.0015))
@@ -253,8 +253,8 @@ def test_the_references_weigh_each_channel(normalise):
     whole = prepare(lines, grid, beam=beam, **FINE)
     wanted = 0
     for channel, weight in enumerate(np.moveaxis(weights, -1, 0)):
-        alone = dataclasses.replace(whole, lines=lines.select([channel]), beam=None)
-        wanted += weight * same_interpolator(alone, where)
+        alone = lines.select([channel])
+        wanted += weight * reference.same_interpolator(alone, whole.decision, where)
     if normalise:
         wanted = (
             np.where(weights.any(axis=-1), 10 / np.maximum(weights.sum(axis=-1), 1e-9), 0) * wanted
@@ -341,7 +341,7 @@ def test_a_narrow_beam_costs_little(platform):
     beam = BeamWindow(2, "hann")
     preparation = prepare(lines, grid, device=platform, beam=beam, **FINE)
     layout = preparation.layout
-    track = BeamTrack(beam.limits, lines.phase_centres_m, preparation.along)
+    track = BeamTrack(beam.limits, lines.phase_centres_m, preparation.scene.along)
     ranges = track.spans(layout.boxes(slice(None))).ranges
     assert (ranges[:, 1] - ranges[:, 0]).mean() < 0.1 * 1500
     some = grid.positions_m()[::9, ::9]

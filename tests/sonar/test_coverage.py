@@ -10,10 +10,8 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.exact.backprojection import backproject
+from clsas.imaging import backproject, factorize, plan
 from clsas.planning.costs import Costs
-from clsas.planning.factorize import factorize
-from clsas.planning.planner import plan
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import UnreachedWarning, reaches
 

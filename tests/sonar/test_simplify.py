@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from cases import along_x, beside, lines_over
+from exactly import execute, prepare
 
 from clsas import factorize, plan
 from clsas.core.decibels import in_db, power
@@ -15,9 +16,8 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
-from clsas.exact.backprojection import backproject, prepare
 from clsas.exact.reference import ideal
-from clsas.exact.run import execute
+from clsas.imaging import backproject
 from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import APART, MOTION, RELIEF, SHARE, leave_out, simplify
@@ -150,11 +150,11 @@ def test_exact_images_keep_their_accuracy_on_either_side(case, beside_db, platfo
     accuracy_db = min(max(begins_db + beside_db, -85), -1)
     preparation = prepare(lines, grid, accuracy_db=accuracy_db, beam=beam, device=platform)
     if beside_db > 0:
-        assert preparation.left_out == model.left_out
-        assert preparation.left_out_error == pytest.approx(model.error)
+        assert preparation.scene.left_out == model.left_out
+        assert preparation.scene.left_out_error == pytest.approx(model.error)
     image = execute(preparation)
     assert image.grid is grid
-    assert preparation.predicted_error_db <= accuracy_db + 1e-9
+    assert preparation.error_db <= accuracy_db + 1e-9
     assert true_error_db(case, image) <= accuracy_db + 0.3
 
 
@@ -209,20 +209,20 @@ def test_the_error_of_what_is_left_out_is_predicted():
         prepare(lines, grid, accuracy_db=begins_db + 1, full_model=full) for full in (True, False)
     )
     of_filter = power(without.interpolator.error_db)
-    assert without.predicted_error_db == pytest.approx(in_db(of_filter + model.error))
-    assert with_it.left_out == ()
-    assert with_it.lines is lines
+    assert without.error_db == pytest.approx(in_db(of_filter + model.error))
+    assert with_it.scene.left_out == ()
+    assert with_it.scene.lines is lines
 
 
 def test_an_image_without_the_effect_has_nothing_to_model():
     """Kernel options and uploads then know neither velocities nor a second antenna."""
     lines, grid, *_, begins_db = made(everything)
     preparation = prepare(lines, grid, accuracy_db=min(begins_db + 7, -1))
-    assert preparation.lines.rx_velocity_m_s is None
-    assert np.array_equal(preparation.lines.tx_m, preparation.lines.rx_m)
-    assert preparation.grid.is_planar
-    assert preparation.given_grid is grid
-    assert np.shares_memory(preparation.lines.samples, lines.samples)
+    assert preparation.scene.lines.rx_velocity_m_s is None
+    assert np.array_equal(preparation.scene.lines.tx_m, preparation.scene.lines.rx_m)
+    assert preparation.scene.grid.is_planar
+    assert preparation.scene.given_grid is grid
+    assert np.shares_memory(preparation.scene.lines.samples, lines.samples)
 
 
 @pytest.mark.parametrize(
@@ -243,7 +243,7 @@ def test_lines_with_no_such_effect_are_taken_as_they_are(lines, grid):
 
 def test_a_fixed_interpolator_takes_the_full_model():
     lines, grid, *_ = made(apart)
-    assert prepare(lines, grid, taps=4, upsampling=2).left_out == ()
+    assert prepare(lines, grid, taps=4, upsampling=2).scene.left_out == ()
 
 
 def test_small_images_are_not_worth_a_fit():
