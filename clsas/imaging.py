@@ -549,7 +549,6 @@ class Imager:
             plan.check(lines, placed(lines, grid))
             method, beam = plan, plan.beam
             scene = scene_of_plan(lines, grid, plan)
-            warned = plan.is_exact and not scene.is_reached  # `clsas.plan` has warned
         elif tolerance_db is not None:
             request = Request(lines, grid, tolerance_db=tolerance_db, beam=beam)
             scene = request.scene()

@@ -3,10 +3,10 @@ import pytest
 from factorizing import BEAMS, EXACT_IS_SLOW, around, over, swaying
 
 from clsas.core.geometry import bistatic_range_m
-from clsas.core.surface import surface_of
 from clsas.factorized import visibility
 from clsas.factorized.geometry import geometry_of
 from clsas.factorized.sectors import references, sector_of
+from clsas.forming import scene_of_plan
 from clsas.imaging import plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import cases
@@ -26,7 +26,7 @@ def wide_plan():
 def wide(wide_plan):
     case, chosen = cases.scaled(512), wide_plan
     lines, grid = case.lines(), case.grid
-    return geometry_of(lines, surface_of(grid), chosen.factorization, chosen.beam)
+    return geometry_of(scene_of_plan(lines, grid, chosen), chosen.factorization)
 
 
 def beside():
@@ -45,7 +45,7 @@ def any_track(request, wide):
     lines = lines.select(np.flatnonzero(np.abs(lines.tx_m[:, 0] - 2) > 8))
     beam = BeamWindow(3.0, "hann")
     chosen = plan(lines, case.grid, tolerance_db=-40, beam=beam, costs=EXACT_IS_SLOW)
-    return geometry_of(lines, surface_of(case.grid), chosen.factorization, chosen.beam)
+    return geometry_of(scene_of_plan(lines, case.grid, chosen), chosen.factorization)
 
 
 # Channels that are formed
@@ -98,7 +98,7 @@ def test_subimages_use_what_their_parents_have(any_track):
 def test_roots_do_not_depend_on_those_prepared_beside_them(case):
     lines, grid = case()
     chosen = plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
-    geometry = geometry_of(lines, surface_of(grid), chosen.factorization, chosen.beam)
+    geometry = geometry_of(scene_of_plan(lines, grid, chosen), chosen.factorization)
     roots = geometry.division.roots
     together = sector_of(geometry, roots)
     for index in range(len(roots)):
@@ -118,7 +118,7 @@ def test_roots_do_not_depend_on_those_prepared_beside_them(case):
 def test_leaves_are_visible_from_wherever_they_are_alone():
     lines, grid = beside()
     chosen = plan(lines, grid, tolerance_db=-40, beam=HANN, costs=EXACT_IS_SLOW)
-    geometry = geometry_of(lines, surface_of(grid), chosen.factorization, chosen.beam)
+    geometry = geometry_of(scene_of_plan(lines, grid, chosen), chosen.factorization)
     sector = sector_of(geometry, geometry.division.roots)
     last = len(chosen.sides) - 1
     leaves = geometry.division.corners(last, sector.roots)

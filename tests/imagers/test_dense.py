@@ -15,6 +15,7 @@ from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.exact import reference
 from clsas.factorized.sectors import Roots
+from clsas.forming import scene_of_plan
 from clsas.imaging import backproject, factorize, plan
 from clsas.opencl.device import open_device
 from clsas.planning import planner
@@ -204,7 +205,7 @@ def test_virtual_channels_are_as_many_as_predicted(name):
     """Filters of each stage extend past the ends of those before: these count too."""
     lines, grid = scene(name)
     chosen = planned(name, -60, depth=3)
-    roots = Roots(lines, grid, chosen.factorization, chosen.beam)
+    roots = Roots(scene_of_plan(lines, grid, chosen), chosen.factorization)
     sectors = list(roots.sectors(100, 100))
     for level, stage in enumerate(chosen.stages[:-1]):
         needs = [sector.needs[level] for sector in sectors]

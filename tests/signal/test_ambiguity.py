@@ -65,7 +65,7 @@ def test_exact_images_too_tell_of_ends_that_do_not_fade(cut_off, accuracy_db):
     lines, ((grid, exact), _) = cut_off
     with pytest.warns(ClsasWarning, match=f"do not fade.* instead of accuracy_db {accuracy_db}"):
         image = clsas.backproject(lines, grid, accuracy_db=accuracy_db)
-    predicted_db = prepare(lines, grid, accuracy_db=accuracy_db).predicted_error_db
+    predicted_db = prepare(lines, grid, accuracy_db=accuracy_db).error_db
     assert accuracy_db < predicted_db < -35
     assert relative_error_db(image, exact) <= predicted_db
 
@@ -87,7 +87,7 @@ def test_the_rest_makes_up_for_ends_that_take_some_of_what_is_allowed(cut_off, s
     )
     chosen = clsas.plan(lines, grid, tolerance_db=tolerance_db)
     assert chosen.predicted_error_db <= tolerance_db
-    assert prepare(lines, grid, accuracy_db=tolerance_db).predicted_error_db <= tolerance_db
+    assert prepare(lines, grid, accuracy_db=tolerance_db).error_db <= tolerance_db
     assert relative_error_db(clsas.factorize(lines, grid, chosen), exact) <= tolerance_db
 
 
@@ -121,7 +121,7 @@ def test_a_band_that_fills_all_that_is_sampled_is_told_with_the_numbers(four_poi
     message = r"oversampling is 1\.0\d*, but must be above 1.05; the error may be -\d\d dB"
     with pytest.warns(ClsasWarning, match=message):
         image = clsas.backproject(lines, grid, accuracy_db=-80)
-    predicted_db = prepare(lines, grid, accuracy_db=-80).predicted_error_db
+    predicted_db = prepare(lines, grid, accuracy_db=-80).error_db
     assert -80 < relative_error_db(image, exact) <= predicted_db < -20
     with pytest.warns(ClsasWarning, match=message):
         assert -50 < clsas.plan(lines, grid, tolerance_db=-50).predicted_error_db < -20
