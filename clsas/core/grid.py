@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,19 +83,6 @@ class Grid:
     height_m: NDArray[np.float64] | None = None
     points_m: NDArray[np.float64] | None = None
     georeference: Georeference | None = None
-
-    if TYPE_CHECKING:  # the constructor converts array_like arguments
-
-        def __init__(
-            self,
-            origin_m: ArrayLike | None,
-            row_step_m: ArrayLike | None,
-            column_step_m: ArrayLike | None,
-            shape: Sequence[int],
-            height_m: ArrayLike | None = None,
-            points_m: ArrayLike | None = None,
-            georeference: Georeference | None = None,
-        ) -> None: ...
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""
@@ -214,7 +200,13 @@ class Grid:
             If an argument has the wrong type or shape or is not finite, or if pixels would
             coincide because steps are zero or parallel.
         """
-        return cls(origin_m, row_step_m, column_step_m, shape, georeference=georeference)
+        return cls(
+            origin_m,  # type: ignore[arg-type]
+            row_step_m,  # type: ignore[arg-type]
+            column_step_m,  # type: ignore[arg-type]
+            shape,
+            georeference=georeference,
+        )
 
     @classmethod
     def height_map(

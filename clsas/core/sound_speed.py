@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -68,12 +68,6 @@ class SoundSpeed:
     depth_m: NDArray[np.float64]
     speed_m_s: NDArray[np.float64]
     surface_z_m: float = 0.0
-
-    if TYPE_CHECKING:  # the constructor converts array_like arguments
-
-        def __init__(
-            self, depth_m: ArrayLike, speed_m_s: ArrayLike, surface_z_m: float = 0.0
-        ) -> None: ...
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""

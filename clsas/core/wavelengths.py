@@ -9,13 +9,14 @@ occupied band, `band_wavelength_m`, which does not depend on what was mixed out.
 from __future__ import annotations
 
 import math
-from typing import overload
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsas.core.lines import RangeLines
 
+Number = TypeVar("Number", float, NDArray[np.float64])
 _LEAST_CYCLES = 0.02  # per sample, at the middle of a band that shows the carrier
 
 
@@ -65,17 +66,7 @@ def is_about_zero(lines: RangeLines, centre: float) -> bool:
     return abs(cycles_per_m_at(lines, centre)) * lines.range_step_m <= _LEAST_CYCLES
 
 
-@overload
-def cycles_per_m_at(lines: RangeLines, frequency: float) -> float: ...
-
-
-@overload
-def cycles_per_m_at(lines: RangeLines, frequency: NDArray[np.float64]) -> NDArray[np.float64]: ...
-
-
-def cycles_per_m_at(
-    lines: RangeLines, frequency: float | NDArray[np.float64]
-) -> float | NDArray[np.float64]:
+def cycles_per_m_at(lines: RangeLines, frequency: Number) -> Number:
     """Return the two-way phase per metre of range, cycles.
 
     Parameters

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from clsas.core.sound_speed import SoundSpeed
 from clsas.files.sound_speed_files import read_sound_speed
 from clsas.files.tables import Table, located
@@ -40,7 +42,7 @@ class SoundSpeedTable(Table):
                 return read_sound_speed(folder / self.file, **surface)
             assert self.depth_m is not None
             if self.speed_m_s is not None:
-                return SoundSpeed(self.depth_m, self.speed_m_s, **surface)
+                return SoundSpeed(np.array(self.depth_m), np.array(self.speed_m_s), **surface)
             assert self.temperature_c is not None
             assert self.salinity is not None
             return SoundSpeed.from_temperature(

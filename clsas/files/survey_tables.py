@@ -76,7 +76,8 @@ class SonarTable(Table):
         skipped = {"preset", "pulse", "receivers", "spacing_m", "rx_m"}
         skipped |= {"bank_heights_m", "bank_numbers"}
         with located("[sonar]"):
-            return Sonar(pulse, rx_m, **self.model_dump(exclude=skipped), bank_numbers=banks)
+            options = self.model_dump(exclude=skipped) | {"bank_numbers": banks}
+            return Sonar(pulse, rx_m, **options)
 
     def _receivers(self) -> tuple[NDArray[np.float64], ArrayLike | None]:
         """Return the positions of the receivers, [receivers, 3], and their banks."""

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from clsas.core import reprs, validate
 from clsas.core.grid import Grid
@@ -58,18 +57,6 @@ class Interferogram:
     phase_sd_rad: NDArray[np.float32]
     grid: Grid
     window_m: float
-
-    if TYPE_CHECKING:  # the constructor converts array_like arguments
-
-        def __init__(
-            self,
-            phase_rad: ArrayLike,
-            coherence: ArrayLike,
-            looks: ArrayLike,
-            phase_sd_rad: ArrayLike,
-            grid: Grid,
-            window_m: float,
-        ) -> None: ...
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from clsas.core import reprs, validate
 from clsas.core.georeference import Georeference
@@ -57,20 +57,6 @@ class Heights:
     m_per_rad: NDArray[np.float64]
     image: Image
     window_m: float
-
-    if TYPE_CHECKING:  # the constructor converts array_like arguments
-
-        def __init__(
-            self,
-            height_m: ArrayLike,
-            sd_m: ArrayLike,
-            coherence: ArrayLike,
-            mask: ArrayLike,
-            looks: ArrayLike,
-            m_per_rad: ArrayLike,
-            image: Image,
-            window_m: float,
-        ) -> None: ...
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""

@@ -290,7 +290,7 @@ def survey_lines(
     lines = simulate_lines(
         geometry.tx_m,
         geometry.rx_m,
-        PointTargets(grid.at(np.array([middle])), [1.0]),
+        PointTargets(grid.at(np.array([middle]))),
         carrier_hz=pulse.carrier_hz,
         bandwidth_hz=pulse.bandwidth_hz,
         window=window,

@@ -85,7 +85,7 @@ class Survey:
     @cached_property
     def antennas_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Transmitter and receiver of every channel, [channels, 3]."""
-        track = self.track or Track([[0.0, 0.0, 0.0]], [0.0])
+        track = self.track or Track(np.zeros((1, 3)), np.zeros(1))
         tx, rx, _ = channels(self.sonar, track)
         return tx, rx
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from clsas.core import reprs, validate
 from clsas.core.georeference import Georeference
@@ -88,25 +87,6 @@ class Echoes:
     georeference: Georeference | None = None
     bank_numbers: NDArray[np.int64] | None = None
     sound_speed: SoundSpeed | None = None
-
-    if TYPE_CHECKING:  # the constructor converts array_like arguments
-
-        def __init__(
-            self,
-            samples: ArrayLike,
-            start_time_s: ArrayLike,
-            sample_rate_hz: float,
-            carrier_hz: float,
-            tx_m: ArrayLike,
-            rx_m: ArrayLike,
-            sound_speed_m_s: float,
-            pulse: Pulse | None = None,
-            rx_velocity_m_s: ArrayLike | None = None,
-            look_direction: ArrayLike | None = None,
-            georeference: Georeference | None = None,
-            bank_numbers: ArrayLike | None = None,
-            sound_speed: SoundSpeed | None = None,
-        ) -> None: ...
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""

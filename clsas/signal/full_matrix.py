@@ -122,7 +122,7 @@ def from_full_matrix(
     lines = compress(
         Echoes(
             samples,
-            start_time_s=start_s,
+            start_time_s=np.array(start_s),
             sample_rate_hz=rate_hz,
             carrier_hz=carrier_hz,
             tx_m=elements_m[tx],

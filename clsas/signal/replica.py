@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,10 +46,6 @@ class Replica:
 
     samples: NDArray[np.complex128]
     sample_rate_hz: float
-
-    if TYPE_CHECKING:  # the constructor converts array_like arguments
-
-        def __init__(self, samples: ArrayLike, sample_rate_hz: float) -> None: ...
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""

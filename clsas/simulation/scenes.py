@@ -214,19 +214,6 @@ class Seabed:
     seed: int = 0
     floor_db: float = -50.0
 
-    if TYPE_CHECKING:  # the constructor converts array_like arguments
-
-        def __init__(
-            self,
-            x_m: tuple[float, float],
-            y_m: tuple[float, float],
-            heights_m: ArrayLike,
-            texture: ArrayLike = 1.0,
-            density_m2: float = 600.0,
-            seed: int = 0,
-            floor_db: float = -50.0,
-        ) -> None: ...
-
     def __post_init__(self) -> None:
         """Check every field and convert it."""
         for name in ("x_m", "y_m"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -102,20 +102,6 @@ class BeamWindow:
     along: NDArray[np.float64] | None = None
     normalise: bool = False
     track_pings: int | None = None
-
-    if TYPE_CHECKING:  # the constructor converts array_like arguments
-
-        def __init__(
-            self,
-            width_deg: float,
-            shape: str = "rectangular",
-            squint_deg: float = 0.0,
-            taper: float = 0.5,
-            element_length_m: float | None = None,
-            along: ArrayLike | None = None,
-            normalise: bool = False,
-            track_pings: int | None = None,
-        ) -> None: ...
 
     __repr__ = reprs.of_fields
 

@@ -6,7 +6,7 @@ Equations in brackets are those of the thesis (Ødegaard 2004).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -261,22 +261,6 @@ class Sonar:
     tx_height_m: float | None = None
     rx_height_m: float | None = None
     bank_numbers: NDArray[np.int64] | None = None
-
-    if TYPE_CHECKING:  # the constructor converts array_like arguments
-
-        def __init__(
-            self,
-            pulse: Pulse,
-            rx_m: ArrayLike,
-            tx_m: ArrayLike = (0.0, 0.0, 0.0),
-            sample_rate_hz: float | None = None,
-            sound_speed_m_s: float = 1500.0,
-            tx_length_m: float | None = None,
-            rx_length_m: float | None = None,
-            tx_height_m: float | None = None,
-            rx_height_m: float | None = None,
-            bank_numbers: ArrayLike | None = None,
-        ) -> None: ...
 
     def __post_init__(self) -> None:  # noqa: D105
         if not isinstance(self.pulse, Pulse):

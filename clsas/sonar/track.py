@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -69,19 +69,6 @@ class Track:
     pitch_rad: NDArray[np.float64] = 0.0  # type: ignore[assignment]
     roll_rad: NDArray[np.float64] = 0.0  # type: ignore[assignment]
     georeference: Georeference | None = None
-
-    if TYPE_CHECKING:  # the constructor converts array_like arguments
-
-        def __init__(
-            self,
-            positions_m: ArrayLike,
-            time_s: ArrayLike,
-            velocity_m_s: ArrayLike = (0.0, 0.0, 0.0),
-            yaw_rad: ArrayLike = 0.0,
-            pitch_rad: ArrayLike = 0.0,
-            roll_rad: ArrayLike = 0.0,
-            georeference: Georeference | None = None,
-        ) -> None: ...
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""
@@ -274,7 +261,8 @@ class Track:
             np.radians(validate.array(name, value, np.float64, (pings,), broadcast=True))
             for name, value in (("pitch_deg", pitch_deg), ("roll_deg", roll_deg))
         )
-        track = cls(positions, time_s, (0, 0, 0), yaw_rad, -pitch, roll, frame)
+        still = np.zeros(3)
+        track = cls(positions, time_s, still, yaw_rad, -pitch, roll, frame)  # type: ignore[arg-type]
         degrees = np.stack([np.asarray(each, float) for each in (latitude_deg, longitude_deg)], 1)
         warn_of(doubts_of_track(positions, track.time_s, degrees))
         if pings == 1:

@@ -341,7 +341,8 @@ def edge(**options: Any) -> Known:
     """Return a scene at 30 kHz, with points at the edge of a Hann beam, where weights are small."""
     return scene(
         along_x(300, 0.02), (3, 9.5, 0), carrier_hz=3e4, bandwidth_hz=9e3, pixel_m=(0.04, 0.02),
-        shape=(32, 96), beam=BeamWindow(20, "hann", along=[1, 0, 0]), within=(0.88, 0.97),
+        shape=(32, 96), within=(0.88, 0.97),
+        beam=BeamWindow(20, "hann", along=np.array([1.0, 0, 0])),
         **options,
     )  # fmt: skip
 

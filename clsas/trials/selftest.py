@@ -9,6 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from clsas.core import validate
 from clsas.core.image import Image
 from clsas.exact.wavenumber import wavenumber
@@ -211,7 +213,7 @@ IMAGERS = {
     "mosaic": _mosaic,
     "wavenumber": _wavenumber,
 }
-_HANN = BeamWindow(12, "hann", along=[1, 0, 0])
+_HANN = BeamWindow(12, "hann", along=np.array([1.0, 0, 0]))
 _SMALL: dict[str, Any] = {"shape": (32, 32)}
 _SCENES: dict[str, Callable[[], Known]] = {
     "flat": lambda: extremes.ultrasonic(96, **_SMALL),

@@ -33,7 +33,7 @@ WAVELENGTH_M = 0.015
 PINGS, STEP_M = 400, 0.02
 GRID = Grid.plane(x=(1.5, 6.5, 320), y=(18.0, 21.0, 220))
 LARGE_PINGS, LARGE_GRID = 1500, Grid.plane(x=(1.5, 28.5, 1000), y=(18.0, 27.0, 1000))
-SONAR = Sonar(Pulse(100e3, 30e3, 1e-3), [[0.0, 0.0, 0.0]], tx_length_m=0.06, rx_length_m=0.06)
+SONAR = Sonar(Pulse(100e3, 30e3, 1e-3), np.zeros((1, 3)), tx_length_m=0.06, rx_length_m=0.06)
 
 _SMOOTHED = 12  # pings: standard deviation of the Gaussian that smooths residuals
 _REPEATS = 5  # runs in turns, of which the fastest counts

@@ -81,7 +81,7 @@ class Scene:
         return clsas.RangeLines(
             np.zeros((_CHANNELS, length), np.complex64), first_m, step_m, tx_m, rx_m,
             self.carrier_hz, _SPEED_M_S, rx_velocity_m_s=[1.8, 0.0, 0.0] if moving else None,
-            sound_speed=clsas.SoundSpeed(self.depth_m, self.speed_m_s),
+            sound_speed=clsas.SoundSpeed(np.array(self.depth_m), np.array(self.speed_m_s)),
         )  # fmt: skip
 
 

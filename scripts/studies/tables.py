@@ -180,7 +180,9 @@ def simulation_along_rays(devices: list[str], turns: int = 3) -> None:
     track = clsas.Track.straight((-2, 0, 20), (2, 0, 0), pings=4, ping_interval_s=0.2)
     directive = clsas.Sonar.edgetech()
     plain = dataclasses.replace(directive, tx_length_m=None, rx_length_m=None)
-    profile = clsas.SoundSpeed([0, 12, 15, 60], [1505, 1504, 1494, 1490], surface_z_m=30)
+    profile = clsas.SoundSpeed(
+        np.array([0.0, 12, 15, 60]), np.array([1505.0, 1504, 1494, 1490]), surface_z_m=30
+    )
     rows = []
     for name, sonar, scene, spreading in (
         ("points", plain, points, False),

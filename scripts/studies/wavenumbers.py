@@ -21,7 +21,7 @@ BEAMS = {
     "rectangular, 16 degrees": clsas.BeamWindow(16, "rectangular"),
 }
 SWAYS_M = (0.01, 0.05, 0.2)
-SWAYING_BEAM = clsas.BeamWindow(8, "hann", along=[1, 0, 0])
+SWAYING_BEAM = clsas.BeamWindow(8, "hann", along=np.array([1.0, 0, 0]))
 _RUNS = 3  # runs in turn, of which the fastest counts
 
 
