@@ -77,10 +77,6 @@ _LISTED = 3  # patches that are listed for each flag; arbitrary
     "--verify", is_flag=True,
     help="Form nothing; compare the whole store with its checksums.",
 )  # fmt: skip
-@click.option(
-    "--add-levels", is_flag=True,
-    help="Form nothing; compute levels, for fast overviews, that are missing or damaged.",
-)  # fmt: skip
 @options.picture("an overview in dB")
 @options.levels
 @click.option("--borders", is_flag=True, help="Draw the borders between patches into the picture.")
@@ -99,7 +95,6 @@ def mosaic(
     follow: bool,
     idle_s: float | None,
     verify: bool,
-    add_levels: bool,
     picture: Path | None,
     dynamic_range_db: float | None,
     percentiles: tuple[float, float] | None,
@@ -118,18 +113,13 @@ def mosaic(
     patches again. With --verify it only lists damage; the exit code is then 1 if there is any.
 
     A store contains the image at 2, 4, 8, ... times the pixel spacing too, which pictures are drawn
-    from. --add-levels computes those that are missing or damaged.
+    from.
 
     \b
     Example:  clsas mosaic scene.toml --lines lines.h5 -o image.zarr --picture image.png
     """
-    if verify and add_levels:
-        raise click.UsageError("give only one of --verify and --add-levels")
     if verify:
-        _verify(_existing_store(scene, output, "--verify"), as_json)
-        return
-    if add_levels:
-        _add_levels(_existing_store(scene, output, "--add-levels"), as_json)
+        _verify(_existing_store(scene, output), as_json)
         return
     if scene is None:
         _check_without_scene(given["x"] is not None, lines_path, output)
@@ -278,28 +268,13 @@ def _store_beside(scene: Path | None) -> Path:
     return scene.with_suffix(".zarr")
 
 
-def _existing_store(scene: Path | None, output: Path | None, option: str) -> Path:
-    """Return the store given, or that of the scene, for an option that forms nothing."""
+def _existing_store(scene: Path | None, output: Path | None) -> Path:
+    """Return the store to verify: the one given, or that of the scene."""
     if output is not None:
         return output
     if scene is None:
-        raise click.UsageError(f"{option} requires a store: clsas mosaic {option} -o STORE.zarr")
+        raise click.UsageError("--verify requires a store: clsas mosaic --verify -o STORE.zarr")
     return read_scene(scene).mosaic.get("store") or _store_beside(scene)
-
-
-def _add_levels(path: Path, as_json: bool) -> None:
-    """Add levels to a store, and report which it has."""
-    store = clsas.Store.opened(path)
-    start = time.perf_counter()
-    with progress_bar("computing levels") as progress:
-        added = store.add_levels(progress)
-    seconds = time.perf_counter() - start
-    factors = ", ".join(f"{factor}x" for factor in store.levels) or "in dB only, since it is small"
-    done = f"computed in {seconds:.2f} s" if added else "there already"
-    report(
-        as_json, f"{printable(path)}: levels {factors}: {done}",
-        file=path, levels=store.levels, added=added, seconds=seconds,
-    )  # fmt: skip
 
 
 def _verify(path: Path, as_json: bool) -> None:

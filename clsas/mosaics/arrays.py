@@ -36,10 +36,8 @@ from clsas.mosaics.levels import (
     LEVELS,
     SHADOWED,
     WINDOW,
-    Levels,
     PixelArray,
     chunk_side,
-    factors_of,
     levels_of,
     mosaic_arrays,
     multiscales,
@@ -106,31 +104,6 @@ def open_array(path: Path, attributes: dict[str, Any], name: str) -> zarr.Array:
         If the metadata are not those of a mosaic, or differ from those that were written.
     """
     return _opened(path, attributes, name, read_only=True)
-
-
-def add_levels(path: Path) -> None:
-    """Add the arrays of levels to a store without them, all to be computed by `complete_levels`.
-
-    A killed process leaves a store without levels, or one with them.
-
-    Raises
-    ------
-    OSError
-        If the store cannot be written.
-    """
-    attributes = read_document(path)
-    levels = Levels(of_mosaic=factors_of(attributes["inputs"]["pixels"]))
-    attributes = attributes | {LEVELS: levels.json()} | multiscales(levels)
-    names = {name.split("/")[0] for name in forms(attributes, False)} - {"pixels", "x", "y"}
-    with staging(path) as temporary:
-        new, old = temporary / "new", temporary / "old"
-        new.mkdir()
-        old.mkdir()
-        _create_arrays(new, plane_of(attributes), attributes)
-        for name in sorted(names):
-            _exchange(path, name, new, old)
-    digests = _digests(path, attributes, has_height(attributes))
-    write_attributes(path, with_digest(attributes | {DIGESTS: digests}))
 
 
 def write_values(

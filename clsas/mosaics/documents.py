@@ -23,7 +23,7 @@ from clsas.mosaics.levels import WINDOW, are_levels
 
 FORMAT = "clsas mosaic"
 VERSION = 6
-"""Version of stores. Before version 6, digests left out some fields of the lines and the grid."""
+"""Version of stores. Those of other versions are refused."""
 
 DIGESTS = "metadata"
 """Attribute with a digest of every array's metadata."""

@@ -61,7 +61,7 @@ LEVELS = "levels"
 """Attribute that lists the levels, and name of the group that records those of the mosaic."""
 
 CHUNK_SHAPE = "chunk_shape"
-"""Attribute with the chunks of the pixels; without it, a patch is a chunk."""
+"""Attribute with the shape of a chunk of the pixels."""
 
 _CONVENTION = {
     "uuid": "d35379db-88df-4056-af3a-620245f8e347",
@@ -72,7 +72,6 @@ _CONVENTION = {
     "description": "Multiscale layout of zarr datasets",
 }
 _SMALLEST_CHUNK = 64  # pixels; a patch without a larger divisor is one chunk
-_MOST_LEVELS = 32  # in the document of a store: more than memory and disks allow
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ class Levels:
         Factors of the levels that are computed when all patches are finished.
     """
 
-    of_patches: tuple[int, ...] = ()
+    of_patches: tuple[int, ...]
     of_mosaic: tuple[int, ...] = ()
 
     @property
@@ -98,9 +97,9 @@ class Levels:
         return tuple(factor for factor in self.of_patches + self.of_mosaic if factor > 1)
 
     @property
-    def coarsest(self) -> int | None:
-        """Factor of the coarsest level, or None if there are none."""
-        return max(self.of_patches + self.of_mosaic, default=None)
+    def coarsest(self) -> int:
+        """Factor of the coarsest level."""
+        return max(self.of_patches + self.of_mosaic)
 
     def json(self) -> dict[str, list[int]]:
         """Return the attribute to store."""
@@ -236,9 +235,7 @@ def level_shape(shape: tuple[int, ...], factor: int) -> tuple[int, int]:
 
 def stored_levels(attributes: Mapping[str, Any]) -> Levels:
     """Return the levels in the attributes of a store."""
-    stored = attributes.get(LEVELS)
-    if stored is None:
-        return Levels()
+    stored = attributes[LEVELS]
     return Levels(tuple(stored["of_patches"]), tuple(stored["of_mosaic"]))
 
 
@@ -258,38 +255,15 @@ def are_levels(attributes: Mapping[str, Any]) -> bool:
     `patch_shape` and the number of pixels must have been checked.
     """
     shape, patch_shape = attributes["inputs"]["pixels"], attributes["patch_shape"]
-    chunk_shape = attributes.get(CHUNK_SHAPE, patch_shape)
-    if not (
-        isinstance(chunk_shape, list)
-        and len(chunk_shape) == 2
-        and all(type(side) is int and side > 0 for side in chunk_shape)
-        and all(
-            side % chunk == 0 or side >= count
-            for side, chunk, count in zip(patch_shape, chunk_shape, shape, strict=True)
-        )
-    ):
-        return False
-    stored = attributes.get(LEVELS, {"of_patches": [], "of_mosaic": []})
-    if not (isinstance(stored, dict) and stored.keys() == {"of_patches", "of_mosaic"}):
-        return False
-    if not all(isinstance(each, list) and len(each) <= _MOST_LEVELS for each in stored.values()):
-        return False
-    factors = stored["of_patches"] + stored["of_mosaic"]
-    expected = [1] if factors == [1] else [2 << i for i in range(len(factors))]
     return (
-        factors == expected
-        and all(type(factor) is int for factor in factors)
-        and all(
-            side % factor == 0 or side >= count
-            for factor in stored["of_patches"]
-            for side, count in zip(patch_shape, shape, strict=True)
-        )
+        attributes.get(CHUNK_SHAPE) == list(map(chunk_side, patch_shape, shape))
+        and attributes.get(LEVELS) == levels_of(shape, patch_shape).json()
     )
 
 
 def patch_arrays(attributes: Mapping[str, Any]) -> list[PixelArray]:
     """Return the arrays that are written with each patch: the pixels, and the levels of patches."""
-    chunk_shape = tuple(attributes.get(CHUNK_SHAPE, attributes["patch_shape"]))
+    chunk_shape = tuple(attributes[CHUNK_SHAPE])
     shape, patch_shape = tuple(attributes["inputs"]["pixels"]), tuple(attributes["patch_shape"])
     pixels = PixelArray("pixels", 1, "complex64", shape, chunk_shape, patch_shape)
     layers = [

@@ -388,8 +388,6 @@ def mosaic(
     stored = None if opened is None else opened.patch_shape
     if patch_shape is None:
         patch_shape = stored or choose_patch_shape(visibility, grid, memory_bytes)
-    elif stored is not None and Layout(grid, stored).shape == Layout(grid, patch_shape).shape:
-        patch_shape = stored  # early versions rounded the sides of patches differently
     layout = Layout(grid, patch_shape)
     job = Job(
         files=(),

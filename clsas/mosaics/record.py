@@ -109,13 +109,8 @@ class Record:
     def attributes(self, checksums: Checksums) -> dict[str, Any]:
         """Return the attributes to store, with the checksums of pixels and levels."""
         levels = {name: value for name, value in checksums.items() if name != "pixels"}
-        stored = {PIXELS_CHECKSUM: checksums["pixels"]} | (
-            {LEVELS_CHECKSUMS: levels} if levels else {}
-        )
-        own = asdict(self)
-        if self.heights is None:  # of an image
-            del own["heights"]
-        return with_digest(own | stored)
+        stored = {PIXELS_CHECKSUM: checksums["pixels"], LEVELS_CHECKSUMS: levels}
+        return with_digest(asdict(self) | stored)
 
     @classmethod
     def read(cls, folder: Path) -> tuple[Record, Checksums] | None:
@@ -134,7 +129,7 @@ class Record:
         names = {field.name for field in fields(cls)}
         try:
             record = cls(**{name: value for name, value in stored.items() if name in names})
-            checksums = {"pixels": stored[PIXELS_CHECKSUM], **stored.get(LEVELS_CHECKSUMS, {})}
+            checksums = {"pixels": stored[PIXELS_CHECKSUM], **stored[LEVELS_CHECKSUMS]}
         except (LookupError, TypeError) as error:
             raise DamageError("its record is incomplete") from error
         return record, checksums

@@ -38,7 +38,6 @@ from clsas.mosaics.levels import (
     SHADOWED,
     layers_of,
     shadowed_of,
-    stored_levels,
 )
 from clsas.mosaics.metadata import GROUP, has_height
 from clsas.mosaics.overview import Reading, reduced, step_of
@@ -368,41 +367,6 @@ class Store:
         _completing().complete(self.path, read_document(self.path), digest, self._read, progress)
         return True
 
-    def add_levels(self, progress: Callable[[int, int], object] | None = None) -> bool:
-        """Compute levels that are missing or damaged from the pixels.
-
-        Patches and records stay as they are. If patches are formed later, run it again, or let the
-        run that forms the last of them compute the levels.
-
-        Parameters
-        ----------
-        progress : callable, optional
-            Called as progress(chunks computed so far, number of chunks).
-
-        Returns
-        -------
-        bool
-            True if levels were computed, False if the store has its levels already, which are then
-            read and compared with their checksums.
-
-        Raises
-        ------
-        ValueError
-            If a patch or its part of the levels is damaged; the message names it.
-        OSError
-            If the store cannot be read or written.
-        """
-        validate.progress(progress)
-        if stored_levels(read_document(self.path)).coarsest is None:
-            zarr_arrays().add_levels(self.path)
-            self.__dict__.pop("_arrays", None)
-        self._forget_damaged_levels()
-        added = self.complete_levels(progress)
-        files = self._arrays.files
-        if found := self._arrays.damage(files.arrays[1:], files.indices()):  # without the pixels
-            raise ValueError(f"{self.path} is damaged: {describe_damage(found)}{REPAIR}")
-        return added
-
     def read(
         self, rows: slice = slice(None), columns: slice = slice(None)
     ) -> NDArray[np.complex64]:
@@ -641,7 +605,7 @@ class Store:
         if factor not in (found := self.levels):
             if damaged := self._level_damage():
                 raise ValueError(f"{self.path} is damaged: {describe_arrays(damaged)}{REPAIR}")
-            known = ", ".join(map(str, found)) or "none: clsas mosaic --add-levels adds them"
+            known = ", ".join(map(str, found)) or "none"
             raise ValueError(
                 f"factor must be that of a level of {self.path} ({known}), got {factor}"
             )

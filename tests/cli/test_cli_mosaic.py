@@ -45,7 +45,7 @@ def made(tmp_path_factory):
     """A scene, its mosaic, and what the command printed."""
     folder = tmp_path_factory.mktemp("mosaic")
     (folder / "scene.toml").write_text(SCENE)
-    return folder, run("mosaic", folder / "scene.toml", "--png", folder / "image.png")
+    return folder, run("mosaic", folder / "scene.toml", "--picture", folder / "image.png")
 
 
 @pytest.mark.slow
@@ -235,9 +235,9 @@ def test_options_replace_the_scene(made, tmp_path):
         (["--workers", "2", "--scheduler", "tcp://localhost:1"], 2, "give only one of"),
         (["--workers", "2", "--device", "0"], 2, "--device has no effect"),
         (["--lines", "folder", "-o", "./folder"], 2, "--lines and -o must be two files"),
-        (["-o", "new", "--png", "new"], 2, "-o and --picture must be two files"),
+        (["-o", "new", "--picture", "new"], 2, "-o and --picture must be two files"),
         (
-            ["-o", "scene.zarr", "--png", "scene.zarr/all.png"],
+            ["-o", "scene.zarr", "--picture", "scene.zarr/all.png"],
             2,
             "--picture must not lie in the store",
         ),
@@ -284,7 +284,7 @@ def test_lines_that_were_simulated_are_not_written_over(made, monkeypatch):
     monkeypatch.chdir(made[0])
     name = lines_of(made).name
     before = lines_of(made).read_bytes()
-    _, stderr = run("mosaic", "scene.toml", "--png", name, code=2)
+    _, stderr = run("mosaic", "scene.toml", "--picture", name, code=2)
     assert f"the file's name must end in .png or .pdf or .svg, got {name!r}" in stderr
     assert lines_of(made).read_bytes() == before
 
@@ -292,10 +292,10 @@ def test_lines_that_were_simulated_are_not_written_over(made, monkeypatch):
 @pytest.mark.parametrize(
     ("mosaic", "args", "message"),
     [
-        ("", ["-o", "a.png", "--png", "a.png"], "-o and --picture must be two files"),
-        ('store = "a.png"', ["--png", "a.png"], "--picture and the store must be two files"),
+        ("", ["-o", "a.png", "--picture", "a.png"], "-o and --picture must be two files"),
+        ('store = "a.png"', ["--picture", "a.png"], "--picture and the store must be two files"),
         ('lines = "folder"', ["-o", "folder"], "mosaic.lines and -o must be two files"),
-        ('lines = "a"', ["--png", "./a"], "mosaic.lines and --picture must be two files"),
+        ('lines = "a"', ["--picture", "./a"], "mosaic.lines and --picture must be two files"),
         ('lines = "folder"\nstore = "folder"', [], "the range lines and the store must be two"),
     ],
 )

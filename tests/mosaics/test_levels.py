@@ -1,7 +1,6 @@
 """Levels of mosaics: right, crash-safe, found by other programs, and read by overviews."""
 
 import functools
-import json
 import shutil
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
@@ -357,21 +356,6 @@ def test_levels_of_other_patches_are_not_damaged(tmp_path):
     assert store.complete_levels()
 
 
-def test_adding_levels_finds_damaged_ones(tmp_path):
-    store = finished(tmp_path / "a.zarr", MIXED)
-    whole = files_of(store.path)
-    assert not store.add_levels()
-    for name, of_patches in (("8x/amplitude", False), ("4x/amplitude", True)):
-        chunk = store.path / name / "c/0/0"
-        chunk.write_bytes(b"\1" + chunk.read_bytes()[1:])
-        if of_patches:
-            with pytest.raises(ValueError, match=r"patch 0,0: its values of 4x/amplitude do not"):
-                store.add_levels()
-        else:
-            assert store.add_levels()
-            assert files_of(store.path) == whole
-
-
 def test_numbers_of_other_programs_that_are_not_finite_are_refused(tmp_path, monkeypatch):
     """Zarr gives them checksums as good as any."""
     store = finished(tmp_path / "a.zarr", OF_PATCHES)
@@ -405,100 +389,16 @@ def test_metadata_of_levels_are_repaired(tmp_path, name):
     assert files_of(store.path) == whole
 
 
-class TestStoresWithoutLevels:
-    """Without levels, and with one chunk for each patch."""
-
-    @pytest.fixture
-    def store(self, tmp_path, monkeypatch):
-        with monkeypatch.context() as patch:
-            patch.setattr("clsas.mosaics.levels.CHUNK_SIDE", 1024)
-            patch.setattr("clsas.mosaics.arrays.levels_of", lambda *_: Levels())
-            path = begun(tmp_path / "old.zarr", ODD).path
-            change(path, chunk_shape=None, levels=None)
-            store = clsas.Store.opened(path)
-            for window in patches_of(ODD)[:-1]:
-                write(store, window)
-        assert not list(path.glob("[0-9]*x"))
-        assert not (path / "amplitude_db").exists()
-        record = json.loads((path / "patches/0.0/zarr.json").read_text())["attributes"]
-        assert isinstance(record["pixels_crc32c"], str)
-        assert "levels_crc32c" not in record
-        return store
-
-    def test_they_are_read_and_continued(self, store):
-        assert store.levels == ()
-        assert store.overview(10).pixels.any()
-        before = files_of(store.path)
-        store = begun(store.path, ODD)
-        assert files_of(store.path) == before
-        write(store, patches_of(ODD)[-1])
-        assert not store.complete_levels()
-        np.testing.assert_array_equal(store.read(), PIXELS)
-
-    @pytest.mark.slow
-    def test_levels_can_be_added(self, store, tmp_path):
-        path = store.path
-        write(store, patches_of(ODD)[-1])
-        before = files_of(path)
-        result = CliRunner().invoke(main, ["mosaic", "--add-levels", "-o", str(path)])
-        assert result.exit_code == 0, result.output
-        assert "levels 2x, 4x, 8x: computed in" in result.output
-        assert {
-            name: (path / name).read_bytes() for name in before if name.name != "zarr.json"
-        } == {name: content for name, content in before.items() if name.name != "zarr.json"}
-        store = clsas.Store.opened(path)
-        assert not store.array_damage()
-        new = finished(tmp_path / "new.zarr", ODD)
-        for factor in new.levels:
-            np.testing.assert_array_equal(store.read_level(factor), new.read_level(factor))
-        result = CliRunner().invoke(main, ["mosaic", "--add-levels", "--json", "-o", str(path)])
-        assert json.loads(result.stdout)["added"] is False
-
-    @pytest.mark.slow
-    def test_they_can_be_added_before_the_last_patch(self, store):
-        assert store.add_levels()
-        write(store, patches_of(ODD)[-1])
-        assert store.levels == ()
-        assert store.complete_levels()
-        np.testing.assert_allclose(store.read_level(8), expected(8)[0], rtol=1e-6)
-
-    @pytest.mark.exhaustive
-    def test_adding_is_killed_at_any_step(self, store, tmp_path, monkeypatch):
-        whole = tmp_path / "whole.zarr"
-        shutil.copytree(store.path, whole)
-        clsas.Store.opened(whole).add_levels()
-        path, step = tmp_path / "a.zarr", 0
-        while True:
-            shutil.rmtree(path, ignore_errors=True)
-            shutil.copytree(store.path, path)
-            if not killed_at(monkeypatch, step, clsas.Store.opened(path).add_levels):
-                break
-            np.testing.assert_array_equal(clsas.Store.opened(path).read(), store.read())
-            clsas.Store.opened(path).add_levels()
-            assert files_of(path) == files_of(whole)
-            step += 7
-        assert step > 14
-
-
 @pytest.mark.slow
-def test_a_mosaic_forms_levels_and_continues_patches_of_other_sides(tmp_path, monkeypatch):
-    """As those of early versions, which are not rounded for levels."""
-    with monkeypatch.context() as patch:
-        patch.setattr("clsas.mosaics.levels.COARSEST_SIDE", 1024)
-        old = clsas.mosaic(stores.LINES, stores.GRID, tmp_path / "old.zarr", **stores.REQUEST)
+def test_a_mosaic_forms_levels(tmp_path):
     new = clsas.mosaic(stores.LINES, stores.GRID, tmp_path / "new.zarr", **stores.REQUEST)
-    assert (old.patch_shape, new.patch_shape) == ((15, 14), (16, 16))
+    assert new.patch_shape == (16, 16)
     image = new.image()
-    again = clsas.mosaic(stores.LINES, stores.GRID, tmp_path / "old.zarr", **stores.REQUEST)
-    assert again.patch_shape == (15, 14)
-    assert clsas.relative_error_db(again.image(), image) < -50
     store = clsas.Store.opened(tmp_path / "new.zarr")
     assert store.levels == (2, 4)
     for factor in store.levels:
         amplitude = expected(factor, image.pixels)[0]
         np.testing.assert_allclose(store.read_level(factor), amplitude, rtol=1e-6)
-    assert clsas.Store.opened(tmp_path / "old.zarr").levels == ()
-    assert clsas.Store.opened(tmp_path / "old.zarr").overview(10).shape == (7, 10)
 
 
 class TestOtherPrograms:

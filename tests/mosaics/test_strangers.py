@@ -159,15 +159,16 @@ def test_zarr_is_given_what_was_checked(path, monkeypatch):
 def test_a_store_that_claims_more_than_memory_is_refused(path, monkeypatch):
     """A few bytes can claim 50 000 x 50 000 heights of zero."""
     side = 50_000
+    monkeypatch.setattr("clsas.mosaics.levels.COARSEST_SIDE", side)
     document = json.loads((path / "zarr.json").read_text())["attributes"]
     inputs = document["inputs"] | {"pixels": [side, side]}
     sides = {"patch_shape": [50, 50], "chunk_shape": [50, 50]}
     digests = {}
-    for name, axes in {"pixels": 2, "height": 2, "x": 1, "y": 1}.items():
+    for name, axes in {"pixels": 2, "amplitude_db": 2, "height": 2, "x": 1, "y": 1}.items():
         grid = {"name": "regular", "configuration": {"chunk_shape": axes * [50]}}
         change_metadata(path, name, shape=axes * [side], chunk_grid=grid)
         digests[name] = digest(json.loads((path / name / "zarr.json").read_text()))
-    change(path, inputs=inputs, **sides, levels=None, metadata=digests)
+    change(path, inputs=inputs, **sides, metadata=digests)
     shutil.rmtree(path / "height" / "c")
     monkeypatch.setattr(validate, "_memory_bytes", lambda: 2**30)
     store = clsas.Store.opened(path)

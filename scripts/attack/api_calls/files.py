@@ -117,9 +117,6 @@ def files(folder: Path) -> dict[str, Call]:
         "Store.complete_levels": Call(
             opened.complete_levels, {"progress": nothing}, accepts={"progress": optional}
         ),
-        "Store.add_levels": Call(
-            opened.add_levels, {"progress": nothing}, accepts={"progress": optional}
-        ),
         "Store.write": Call(
             of_heights.write,
             {
