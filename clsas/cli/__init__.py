@@ -61,13 +61,6 @@ _GROUPS = {
     },
 }
 _COMMANDS = {name: entry for group in _GROUPS.values() for name, entry in group.items()}
-# What to do instead of a command of an earlier version.
-_RENAMED = {
-    "calibrate": (
-        "There is no command 'calibrate'. 'devices --measure' measures a device. To calibrate a "
-        "sonar, use 'known-points', or the step 'calibrate' of 'process'."
-    ),
-}
 
 
 class _Commands(click.Group):
@@ -90,9 +83,7 @@ class _Commands(click.Group):
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
-            if args[0] in _RENAMED:
-                error.message = _RENAMED[args[0]]  # type: ignore[misc]
-            elif close := difflib.get_close_matches(args[0].lower(), _COMMANDS):
+            if close := difflib.get_close_matches(args[0].lower(), _COMMANDS):
                 guesses = " or ".join(map(repr, close))
                 error.message += f" Did you mean {guesses}?"  # type: ignore[misc]
             raise

@@ -50,9 +50,9 @@ def output(kind: str) -> Callable:
 
 
 def picture(what: str) -> Callable:
-    """Return the option for a picture of the result; earlier versions called it --png."""
+    """Return the option for a picture of the result."""
     return click.option(
-        "--picture", "--png", "picture", type=Output(*PICTURES),
+        "--picture", type=Output(*PICTURES),
         help=f"Also draw {what}, as PNG, PDF or SVG according to the suffix.",
     )  # fmt: skip
 

@@ -348,10 +348,7 @@ def _check_header(file: h5py.File) -> None:
         raise FileFormatError(
             f"is damaged: its attribute version must be a number, got {version!r}"
         )
-    if version > VERSION:
+    if version != VERSION:
         raise FileFormatError(
-            f"is of format version {version}, but this clsas reads versions up to {VERSION}: "
-            "update clsas"
+            f"is of format version {version}, but this clsas reads version {VERSION}"
         )
-    if version < 1:
-        raise FileFormatError(f"is of format version {version}, but the first one is 1")

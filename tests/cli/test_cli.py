@@ -62,10 +62,12 @@ def made(tmp_path_factory):
         folder / name for name in ("scene.toml", "echoes.h5", "lines.h5", "image.h5")
     )
     results = [
-        run_json("simulate", scene, "-o", echoes, "--png", folder / "geometry.png"),
-        run_json("compress", echoes, "--scene", scene, "-o", lines, "--png", folder / "lines.png"),
-        run_json("image", lines, "--scene", scene, "-o", image, "--png", folder / "image.png"),
-        run_json("quality", image, "--near", "0,20", "--png", folder / "cuts.png"),
+        run_json("simulate", scene, "-o", echoes, "--picture", folder / "geometry.png"),
+        run_json(
+            "compress", echoes, "--scene", scene, "-o", lines, "--picture", folder / "lines.png"
+        ),
+        run_json("image", lines, "--scene", scene, "-o", image, "--picture", folder / "image.png"),
+        run_json("quality", image, "--near", "0,20", "--picture", folder / "cuts.png"),
     ]
     return folder, results
 
@@ -350,7 +352,7 @@ def test_tradeoff(made, tmp_path):
     ways = ("--tolerance-db", -30, "--stages", "2x2,2x2", "--repeats", 1)
     grid = ("--x", "-0.3:0.3:64", "--y", "19.7:20.3:64")
     args = ("tradeoff", made[0] / "lines.h5", *grid, *ways)
-    result = run_json(*args, "--csv", table, "--png", png)
+    result = run_json(*args, "--csv", table, "--picture", png)
     assert [row["label"] for row in result["rows"]] == ["-30 dB", "2 of 2x2", "exact"]
     assert result["rows"][0]["error_db"] < -28
     assert (result["channels"], result["pixels"]) == (320, [64, 64])
@@ -522,7 +524,7 @@ def test_a_plan_for_a_grid_that_no_line_reaches_is_a_warning(made):
 @pytest.mark.parametrize(
     ("option", "name", "words"),
     [
-        ("--png", "x.tif", "must end in .png or .pdf or .svg, got 'x.tif'"),
+        ("--picture", "x.tif", "must end in .png or .pdf or .svg, got 'x.tif'"),
         ("-o", "x.tif", "must end in .h5 or .hdf5 or .he5, got 'x.tif'"),
     ],
 )
@@ -600,10 +602,20 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (["image", "-", *GRID, "-o", "new.h5"], 2, "must be a path; '-'"),
         (["show", "image.h5", "-o", "new.png", "--db", "1e300"], 2, "'--db': must be"),
         (["simulate", "scene.toml", "-o", "/dev/null"], 2, "'/dev/null' is not an ordinary file"),
-        (["simulate", "scene.toml", "-o", "new", "--png", "./new"], 2, "must be two files"),
-        (["compress", "echoes.h5", "--png", "new", "-o", "new"], 2, "must be two files"),
+        (["simulate", "scene.toml", "-o", "new", "--picture", "./new"], 2, "must be two files"),
+        (["compress", "echoes.h5", "--picture", "new", "-o", "new"], 2, "must be two files"),
         (
-            ["image", "lines.h5", *GRID, "-o", "new.h5", "--png", "a", "--dynamic-range-db", "-5"],
+            [
+                "image",
+                "lines.h5",
+                *GRID,
+                "-o",
+                "new.h5",
+                "--picture",
+                "a",
+                "--dynamic-range-db",
+                "-5",
+            ],
             2,
             "'--db': must be finite and > 0 and <= 2000 dB, got -5",
         ),
@@ -673,15 +685,18 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         ),
         (["tradeoff", "--case", "bp-nothing"], 2, "'bp-nothing' is not one of bp-thesis, "),
         (["tradeoff", "--case", "bp-thesis", *GRID], 2, "--case has its own grid"),
-        (["tradeoff", "lines.h5", *GRID, "--csv", "new", "--png", "new"], 2, "must be two files"),
+        (
+            ["tradeoff", "lines.h5", *GRID, "--csv", "new", "--picture", "new"],
+            2,
+            "must be two files",
+        ),
         (["image", "lines.h5", "-o", "new.h5"], 2, "no grid given: use --scene, or --x and --y"),
         (["image", "lines.h5", *GRID[:2], "-o", "new.h5"], 2, "--x and --y must be given together"),
         (["image", "lines.h5", "--x", "0:1", *GRID[2:], "-o", "new.h5"], 2, "START:STOP:N"),
         (["quality", "image.h5", "--near", "0"], 2, "must be X,Y or X,Y,Z in metres"),
-        (["quality", "image.h5", "--png", "new.png"], 2, "require --near"),
+        (["quality", "image.h5", "--picture", "new.png"], 2, "require --near"),
         (["bench", "bp-nothing"], 2, "'bp-nothing' is not one of bp-thesis, "),
         (["imagine"], 2, "No such command 'imagine'. Did you mean 'image'?"),
-        (["calibrate"], 2, "'devices --measure' measures a device"),
         (["image", "lines.h5", *GRID, "--tolerence-db", "-40"], 2, "'--tolerance-db'"),
         (["--trace", "devices"], 2, "Did you mean '--traceback'?"),
     ],
@@ -706,22 +721,25 @@ def test_errors_are_one_message_and_leave_nothing(made, monkeypatch, args, code,
     ("args", "kept"),
     [
         (["simulate", "scene.toml", "-o", "scene.toml"], "scene.toml"),
-        (["simulate", "scene.toml", "--png", "scene.toml", "-o", "new"], "scene.toml"),
+        (["simulate", "scene.toml", "--picture", "scene.toml", "-o", "new"], "scene.toml"),
         (["simulate", "along.toml", "-o", "track.csv"], "track.csv"),
         (["compress", "echoes.h5", "-o", "echoes.h5"], "echoes.h5"),
         (["compress", "-o", "echoes.h5", "echoes.h5"], "echoes.h5"),
         (["compress", "echoes.h5", "--scene", "scene.toml", "-o", "scene.toml"], "scene.toml"),
         (["image", "lines.h5", *GRID, "-o", "lines.h5"], "lines.h5"),
         (["image", "lines.h5", *GRID, "-o", "link.h5"], "lines.h5"),
-        (["image", "lines.h5", *GRID, "-o", "new", "--png", "./lines.h5"], "lines.h5"),
+        (["image", "lines.h5", *GRID, "-o", "new", "--picture", "./lines.h5"], "lines.h5"),
         (["image", "lines.h5", "--scene", "scene.toml", "-o", "scene.toml"], "scene.toml"),
         (["image", "lines.h5", "--scene", "along.toml", "-o", "track.csv"], "track.csv"),
-        (["quality", "image.h5", "--near", "0,20", "--png", "image.h5"], "image.h5"),
-        (["quality", "image.h5", "--reference", "b.h5", "--near", "0,20", "--png", "b.h5"], "b.h5"),
+        (["quality", "image.h5", "--near", "0,20", "--picture", "image.h5"], "image.h5"),
+        (
+            ["quality", "image.h5", "--reference", "b.h5", "--near", "0,20", "--picture", "b.h5"],
+            "b.h5",
+        ),
         (["tradeoff", "lines.h5", *GRID, "--csv", "lines.h5"], "lines.h5"),
         (["mosaic", "scene.toml", "--lines", "lines.h5", "-o", "lines.h5"], "lines.h5"),
-        (["mosaic", "scene.toml", "--lines", "lines.h5", "--png", "lines.h5"], "lines.h5"),
-        (["mosaic", "scene.toml", "--lines", "lines.h5", "--png", "scene.toml"], "scene.toml"),
+        (["mosaic", "scene.toml", "--lines", "lines.h5", "--picture", "lines.h5"], "lines.h5"),
+        (["mosaic", "scene.toml", "--lines", "lines.h5", "--picture", "scene.toml"], "scene.toml"),
     ],
 )
 def test_what_is_read_is_not_written_over(made, tmp_path, monkeypatch, args, kept):
@@ -774,7 +792,7 @@ def test_traceback_on_request(made):
 def test_pictures_without_matplotlib_are_refused_before_any_work(made, tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     scene = made[0] / "scene.toml"
-    png = ("--png", tmp_path / "x.png")
+    png = ("--picture", tmp_path / "x.png")
     _, stderr = run("simulate", scene, "-o", tmp_path / "echoes.h5", *png, code=1)
     assert "pip install 'matplotlib>=3.10'" in stderr
     run("demo", "--out", tmp_path / "out", code=1)

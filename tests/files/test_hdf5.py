@@ -264,8 +264,8 @@ def change(file, name):
     [
         ("foreign", "is an HDF5 file, but was not written by clsas"),
         ("of another format", "is an HDF5 file, but was not written by clsas"),
-        ("newer", "is of format version 2, but this clsas reads versions up to 1"),
-        ("of version 0", "is of format version 0, but the first one is 1"),
+        ("newer", "is of format version 2, but this clsas reads version 1"),
+        ("of version 0", "is of format version 0, but this clsas reads version 1"),
         ("of a version in words", "is damaged: its attribute version must be a number, got 'zzz'"),
         ("without version", "is damaged: .*version"),
         ("of unknown kind", "contains an object of unknown kind 'hologram'"),
