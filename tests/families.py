@@ -17,6 +17,7 @@ import numpy as np
 from apertures import Aperture, Floats, aperture, log_uniform
 from numpy.random import Generator
 from numpy.typing import NDArray
+from rays import rays
 from sums import SPEED_M_S, BentChannels, Both, Channels, Echoes, Noise, Points, Sampling, weights
 
 from clsas.core.grid import Grid
@@ -286,7 +287,7 @@ def _in_water(
     ends = surface_z_m - np.array([lowest, highest + room_m])
     # Weaker changes until rays fall all the way between the heights that are nearest each other.
     for _ in range(12):
-        if np.isfinite(oracle.rays(depth_m, found.speed_m_s, far_m, *ends)[0]):
+        if np.isfinite(rays(depth_m, found.speed_m_s, far_m, *ends)[0]):
             return found
         change = change / 2
         found = dataclasses.replace(found, speed_m_s=1490 + change)

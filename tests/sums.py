@@ -12,6 +12,7 @@ import finufft
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
+from rays import rays
 
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import oracle
@@ -105,7 +106,7 @@ class BentChannels(Channels):
 
     def _rays(self, antennas_m: Floats, points_m: Floats) -> tuple[Floats, Floats]:
         offset_m = points_m[None] - antennas_m
-        found = oracle.rays(
+        found = rays(
             self.depth_m, self.speed_m_s, np.hypot(offset_m[..., 0], offset_m[..., 1]),
             self.surface_z_m - antennas_m[..., 2], self.surface_z_m - points_m[None, :, 2],
         )  # fmt: skip

@@ -42,7 +42,7 @@ class Axis(NamedTuple):
 class Grid:
     """Positions of the pixels of an image, metres (x along-track, y across-track, z up).
 
-    Create grids with `Grid.plane`, `Grid.oriented`, `Grid.height_map` or `Grid.points`. On a plane,
+    Create grids with `Grid.plane`, `Grid.oriented` or `Grid.points`. On a plane,
     pixel [row, column] lies at
 
         origin_m + row row_step_m + column column_step_m (+ height_m[row, column] along z).
@@ -207,33 +207,6 @@ class Grid:
             shape,
             georeference=georeference,
         )
-
-    @classmethod
-    def height_map(
-        cls,
-        x: tuple[float, float, int],
-        y: tuple[float, float, int],
-        height_m: ArrayLike,
-        *,
-        georeference: Georeference | None = None,
-    ) -> Self:
-        """Return the plane z = 0 raised by heights.
-
-        Parameters
-        ----------
-        x, y : (start, stop, count)
-            As for `plane`.
-        height_m : array_like, shape [rows, columns]
-            Heights, metres along z.
-        georeference : Georeference, optional
-            Where the coordinates lie on Earth.
-
-        Raises
-        ------
-        TypeError, ValueError
-            As for `plane` and `with_height`.
-        """
-        return cls.plane(x, y, georeference=georeference).with_height(height_m)
 
     @classmethod
     def points(cls, points_m: ArrayLike, *, georeference: Georeference | None = None) -> Self:

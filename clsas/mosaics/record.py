@@ -86,11 +86,6 @@ class Record:
     __repr__ = reprs.of_fields
 
     @property
-    def is_empty(self) -> bool:
-        """True if no channel with samples contributes; all pixels are then zero."""
-        return self.channels == self.missing_channels
-
-    @property
     def flags(self) -> tuple[str, ...]:
         """Descriptions of the defects of the data; empty if there are none."""
         found = []

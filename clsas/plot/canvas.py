@@ -99,17 +99,6 @@ def save_png(figure: Figure, path: str | os.PathLike, *, dpi: float | None = Non
     save(figure, path, dpi=dpi)
 
 
-def with_fewer_colours(png: str | os.PathLike | BytesIO, colours: int) -> bytes:
-    """Return a PNG with at most `colours` colours, up to 256; it takes a third of the bytes."""
-    from PIL import Image  # a dependency of matplotlib
-
-    reduced = BytesIO()
-    with Image.open(png) as picture:
-        few = picture.convert("RGB").quantize(colours, dither=Image.Dither.NONE)
-    few.save(reduced, format="png", optimize=True)
-    return reduced.getvalue()
-
-
 def with_palette(png: BytesIO, palette: NDArray[np.uint8]) -> bytes:
     """Return a PNG whose pixels have the nearest of up to 256 colours, uint8 [colours, 3].
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,20 +123,3 @@ MOSAIC_CASES = {"mosaic-wreck": (4096, BeamWindow(5.0, "hann"))}
 
 HEIGHTS_CASES = {"heights-512": 512, "heights": 1024}
 """Cases of heights from two banks (`clsas.trials.dunes`): pixels along each side."""
-
-
-def scaled(size: int) -> Case:
-    """Return ffbp-2k with `size` channels and `size` x `size` pixels over the same area.
-
-    Frequencies are scaled so that pixels and channels keep their spacing in wavelengths.
-    """
-    case = FFBP_2K
-    finer = size / case.pixels
-    return replace(
-        case,
-        channels=size,
-        spacing_m=case.spacing_m * case.channels / size,
-        carrier_hz=case.carrier_hz * finer,
-        bandwidth_hz=case.bandwidth_hz * finer,
-        pixels=size,
-    )

@@ -28,6 +28,7 @@ from clsas.opencl.device import Device
 from clsas.planning.costs import Costs
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import cases
+from studies.scaling import scaled
 
 ROOMS = ("planning", "factorized", "aperture", "exact")
 MODULES = ("clsas.signal.spectrum", "clsas.signal.ambiguity", "clsas.signal.interpolation")
@@ -191,7 +192,7 @@ def trials(device: Device) -> list[Trial]:
             Trial(tolerance_db, lines, case.grid, case.beam, costs, device, exact, reference)
         )
 
-    large, medium, small = (cases.scaled(size) for size in (2048, 512, 256))
+    large, medium, small = (scaled(size) for size in (2048, 512, 256))
     add(large, -50.0, Costs())
     add(replace(large, beam=None), -30.0, Costs())
     add(replace(medium, depth_m=20.0, relief_m=1.0), -50.0, _SLOW_EXACT)

@@ -26,6 +26,7 @@ from clsas.plans.factorization import ExactImage
 from clsas.scene import Scene
 from clsas.simulation import seabeds
 from clsas.trials import bench, cases, wreck
+from studies.scaling import scaled
 
 TOLERANCES_DB = {
     "ffbp-thesis": (-40.0,),
@@ -251,7 +252,7 @@ def scaling(device: str, largest: int, png_file: str | None) -> None:
     sizes = [size for size in SIZES if size <= largest]
     measured = [
         # Large images take minutes, and their times vary little from run to run.
-        bench.run_factorized(cases.scaled(size), device=device, repeats=3 if size <= 4096 else 1)
+        bench.run_factorized(scaled(size), device=device, repeats=3 if size <= 4096 else 1)
         for size in sizes
     ]
     seconds = {
@@ -435,7 +436,9 @@ def survey(devices: list[str]) -> None:
             rate = grid.size / seconds
             _, row_step_m, column_step_m = grid.vectors_m
             square_m = np.linalg.norm(row_step_m) * np.linalg.norm(column_step_m)
-            predicted_db = [r.predicted_error_db for r in records if not r.is_empty]
+            predicted_db = [
+                r.predicted_error_db for r in records if r.channels > r.missing_channels
+            ]
             rows.append(
                 [
                     name,

@@ -26,11 +26,11 @@ import clsas
 from clsas import plot
 from clsas.aperture import nearest
 from clsas.opencl.device import Device, open_device
-from clsas.plot.canvas import with_fewer_colours
 from clsas.sonar.system import Sonar, line_array
 
 sys.path.append(str(Path(__file__).parents[1]))
 import stored_tables
+from fewer_colours import with_fewer_colours
 
 Stages = Sequence[tuple[int, int]]  # (QR, QI)
 

@@ -97,7 +97,7 @@ def test_grids_of_scene_files(folder, command):
     )
     slope = Grid.oriented([-1, 20, 0], [0, 0.06, 0.01], [0.05, 0, 0], (33, 40))
     with_heights = "height_file = 'heights.npy'\n"
-    relief = Grid.height_map((-1, 1, 40), (20, 22, 33), heights)
+    relief = Grid.plane((-1, 1, 40), (20, 22, 33)).with_height(heights)
     for number, (table, grid) in enumerate(
         [
             (plain.replace("[grid]\n", f"[grid]\n{with_heights}"), relief),

@@ -10,7 +10,7 @@ HEIGHT = np.random.default_rng(2).normal(size=(3, 5))
 GRIDS = {
     "plane": Grid.plane(x=(-1, 1, 5), y=(40, 41, 3), z=-7),
     "oriented": Grid.oriented([1, 2, 3], [0.1, 0.2, -0.3], [0.3, -0.1, 0.2], (3, 5)),
-    "height map": Grid.height_map(x=(-1, 1, 5), y=(40, 41, 3), height_m=HEIGHT),
+    "height map": Grid.plane(x=(-1, 1, 5), y=(40, 41, 3)).with_height(HEIGHT),
     "points": Grid.points(np.random.default_rng(3).normal(size=(3, 5, 3))),
 }
 EVERY_GRID = pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from factorizing import BEAMS, EXACT_IS_SLOW, around, over, swaying
+from studies.scaling import scaled
 
 from clsas.core.geometry import bistatic_range_m
 from clsas.factorized import visibility
@@ -9,7 +10,6 @@ from clsas.factorized.sectors import references, sector_of
 from clsas.forming import scene_of_plan
 from clsas.imaging import plan
 from clsas.sonar.beam import BeamWindow
-from clsas.trials import cases
 
 HANN = BEAMS[0]
 
@@ -17,14 +17,14 @@ HANN = BEAMS[0]
 @pytest.fixture(scope="module")
 def wide_plan():
     """A plan with a narrow beam, for a scene that extends past both ends of the track."""
-    case = cases.scaled(512)
+    case = scaled(512)
     lines, grid = case.lines(), case.grid
     return plan(lines, grid, tolerance_db=-40, beam=case.beam, costs=EXACT_IS_SLOW)
 
 
 @pytest.fixture(scope="module")
 def wide(wide_plan):
-    case, chosen = cases.scaled(512), wide_plan
+    case, chosen = scaled(512), wide_plan
     lines, grid = case.lines(), case.grid
     return geometry_of(scene_of_plan(lines, grid, chosen), chosen.factorization)
 
@@ -40,7 +40,7 @@ def any_track(request, wide):
     """The same geometry, and one with a gap in the track longer than a root and its beam."""
     if request.param == "whole":
         return wide
-    case = cases.scaled(512)
+    case = scaled(512)
     lines = case.lines()
     lines = lines.select(np.flatnonzero(np.abs(lines.tx_m[:, 0] - 2) > 8))
     beam = BeamWindow(3.0, "hann")

@@ -1,10 +1,10 @@
 import pytest
 from studies import sensitivity
+from studies.scaling import scaled
 
 from clsas.opencl.device import open_device
 from clsas.planning import search
 from clsas.planning.costs import Costs
-from clsas.trials import cases
 
 
 def named(name):
@@ -35,7 +35,7 @@ def test_a_constant_is_changed_wherever_it_is_imported_and_then_restored():
 
 
 def test_a_trial_plans_and_measures():
-    case = cases.scaled(64)
+    case = scaled(64)
     lines, costs = case.lines(), Costs(pixel_ns=1e4, point_ns=1e4)
     trial = sensitivity.Trial(-30.0, lines, case.grid, case.beam, costs, open_device())
     found = trial.run()

@@ -1,9 +1,9 @@
 import pytest
 from studies import tuning
+from studies.scaling import scaled
 
 from clsas.factorized import stages
 from clsas.opencl.device import open_device
-from clsas.trials import cases
 
 
 @pytest.mark.watches("scripts/studies")
@@ -12,7 +12,7 @@ def test_every_constant_takes_turns_and_keeps_its_value(monkeypatch):
     monkeypatch.setattr(tuning, "_RUNS", 1)
     device = open_device()
     before = {str(each): each.value for each in tuning.constants(device)}
-    rows = list(tuning.changes(device, cases.scaled(256)))
+    rows = list(tuning.changes(device, scaled(256)))
     assert {str(each): each.value for each in tuning.constants(device)} == before
     assert len(rows) == 2 * len(before)
     for row in rows:

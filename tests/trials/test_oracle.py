@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bent import travel_times
+from rays import rays
 
 from clsas.trials import oracle
 from clsas.trials.oracle import Band, Echo
@@ -80,7 +81,7 @@ def test_rays_are_those_of_quadrature(name):
     distance_m = np.append(np.random.default_rng(1).uniform(0, 80, 500), [1e-3, 80])
     times = travel_times(depth_m, speed_m_s, 6.0, 25.0, 90.0)
     for ends in ((6.0, 25.0), (25.0, 6.0)):
-        time_s, slowness = oracle.rays(depth_m, speed_m_s, distance_m, *ends)
+        time_s, slowness = rays(depth_m, speed_m_s, distance_m, *ends)
         np.testing.assert_allclose(time_s, times(distance_m), rtol=0, atol=1e-13)
         np.testing.assert_allclose(slowness, times(distance_m, 1), rtol=0, atol=1e-10)
 
@@ -90,7 +91,7 @@ def test_rays_that_would_turn_are_left_out():
     radius_m = 1500.0 - 25.0
     reach_m = np.sqrt((1500.0 - 6.0) ** 2 - radius_m**2)
     distance_m = reach_m * np.array([0.999, 1.001])
-    time_s, _ = oracle.rays([0, 60], [1500, 1440], distance_m, 6.0, 25.0)
-    assert np.isnan(oracle.rays([0, 60], [1500, 1500], 10.0, 6.0, 6.0)[0])
+    time_s, _ = rays([0, 60], [1500, 1440], distance_m, 6.0, 25.0)
+    assert np.isnan(rays([0, 60], [1500, 1500], 10.0, 6.0, 6.0)[0])
     assert np.isfinite(time_s[0])
     assert np.isnan(time_s[1])

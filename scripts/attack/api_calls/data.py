@@ -58,10 +58,6 @@ def data(folder: Path) -> dict[str, Call]:
                 **place,
             },
         ),
-        "Grid.height_map": Call(
-            clsas.Grid.height_map,
-            {"x": axis, "y": (10.0, 12.0, 6), "height_m": np.arange(30.0).reshape(6, 5), **place},
-        ),
         "Grid.points": Call(
             clsas.Grid.points, {"points_m": np.arange(12.0).reshape(2, 2, 3), **place}
         ),
