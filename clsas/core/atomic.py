@@ -41,7 +41,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         full disk. The error names `path`, not the temporary file.
     """
     path, before = _target(Path(path))
-    with _temporary(path, _make_file) as (temporary, descriptor):
+    with _temporary(path, lambda new: new.touch(exist_ok=False)) as (temporary, descriptor):
         if before is not None:
             # Done while the file is still empty, so that no other user can read its contents in the
             # meantime. The writer must be able to open it.
@@ -305,10 +305,6 @@ def _remove_leftovers(folder: Path) -> None:
                 _remove(path)
             finally:
                 os.close(descriptor)
-
-
-def _make_file(path: Path) -> None:
-    path.touch(exist_ok=False)
 
 
 def _open(path: Path) -> int:

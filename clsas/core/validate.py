@@ -110,8 +110,8 @@ def number(
         and (most is None or result <= most)
     )
     if not inside:
-        allowed = " and ".join(["finite", *limits])
-        raise ValueError(f"{name} must be {allowed}{_in(unit)}, got {result:g}")
+        allowed = " and ".join(["finite", *limits]) + (f" {unit}" if unit else "")
+        raise ValueError(f"{name} must be {allowed}, got {result:g}")
     return result
 
 
@@ -532,7 +532,3 @@ def _check_narrowing(name: str, given: NDArray, dtype: np.dtype) -> None:
             f"{name} must have a largest value from {least:.2g} to {most:.2g}, the range of "
             f"{kind.dtype}, got {largest:.3g}: scale the values"
         )
-
-
-def _in(unit: str) -> str:
-    return f" {unit}" if unit else ""
