@@ -183,11 +183,12 @@ def image(
         validate.flag(name, flag)
     title = drawable("title", title)
     figure_class()  # raises if matplotlib is missing
-    if axes is None:
-        from matplotlib import pyplot
+    from matplotlib import pyplot
+    from matplotlib.axes import Axes
 
+    if axes is None:
         axes = pyplot.figure(figsize=_size_in(image), layout="compressed").subplots()
-    _check_axes(axes)
+    validate.instance("axes", axes, Axes)
     across, upward = image.grid.sides
     factor, unit = length_unit(max(float(np.abs(s.places_m).max()) for s in (across, upward)))
     places = factor * across.places_m, factor * upward.places_m
@@ -380,12 +381,6 @@ def height_per_width(image: Image) -> float:
         return 0.75
     across_m, upward_m = (abs(s.step_m) * len(s.places_m) for s in image.grid.sides)
     return upward_m / across_m
-
-
-def _check_axes(axes: object) -> None:
-    from matplotlib.axes import Axes
-
-    validate.instance("axes", axes, Axes)
 
 
 def aligned(
