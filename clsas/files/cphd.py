@@ -136,7 +136,7 @@ def read_cphd(
             raise ValueError(f"channel must be one of {there}, got {validate.shown(channel)}")
         with _defects(path):
             name = reference if channel is None else channel
-            _check_sizes(tree, name, header, path.stat().st_size)
+            _check_sizes(tree, name, header)
             vectors = reader.read_pvps(name)
             signal = reader.read_signal(name)
             collection = _Collection.read(tree)
@@ -202,7 +202,7 @@ def _header(file: Any, size: int) -> dict[str, int]:
     return values
 
 
-def _check_sizes(tree: Any, name: str, header: dict[str, int], size: int) -> None:
+def _check_sizes(tree: Any, name: str, header: dict[str, int]) -> None:
     """Raise FileFormatError unless a channel's arrays lie within the file and fit into memory."""
     data = tree["Data"]
     if "SignalCompressionID" in data:

@@ -233,9 +233,12 @@ def _read(group: h5py.Group, budget: validate.Budget, **instead: Any) -> Any:
     for field in fields(kind):
         if field.name in instead:
             values[field.name] = instead[field.name]
-        elif field.name in group.attrs:
+            continue
+        if field.name in group.attrs:
             values[field.name] = _attribute(group, field.name)
-        elif (item := find_item(group, field.name, _kinds_of_values(field.type))) is not None:
+            continue
+        kinds_of_values = "b" if "bool" in str(field.type) else "iufc"
+        if (item := find_item(group, field.name, kinds_of_values)) is not None:
             is_group = isinstance(item, h5py.Group)
             # Check the kind before reading, since a group may contain a link to itself.
             if is_group and _kind_of_field(field.type) != _attribute(item, "kind"):
@@ -252,11 +255,6 @@ def _kind_of_field(annotation: object) -> str | None:
     """Return the kind of object in a field such as `pulse: Pulse | None`; None for other fields."""
     classes = str(annotation).split(" | ")
     return next((name for name, kind in _KINDS.items() if kind.__name__ in classes), None)
-
-
-def _kinds_of_values(annotation: object) -> str:
-    """Return the kinds of values that an array in a field may have."""
-    return "b" if "bool" in str(annotation) else "iufc"
 
 
 def find_item(
