@@ -128,7 +128,7 @@ def write(
     scene |= {"patches": _patches(readers[0])}
     with replacing_folder(folder) as made:
         for name in _FILES:
-            (made / name).write_text(_text_of(name), encoding="utf-8")
+            (made / name).write_bytes((resources.files("clsas.maps") / "page" / name).read_bytes())
         # Escaped to ASCII, in which no text can end the script.
         (made / _SCENE).write_text(f"{_START}{json.dumps(scene, allow_nan=False)};\n")
         for index, reader in enumerate(readers):
@@ -296,7 +296,3 @@ def _table(name: str) -> str:
     """Return the 256 colours of a colour map as hexadecimal digits, six for each colour."""
     colours = colours_of(name)(np.arange(256), bytes=True)
     return np.asarray(colours)[:, :3].astype(np.uint8).tobytes().hex()
-
-
-def _text_of(name: str) -> str:
-    return (resources.files("clsas.maps") / "page" / name).read_text(encoding="utf-8")
