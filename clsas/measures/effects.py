@@ -209,16 +209,6 @@ def _ranges_without(survey: Survey, sample: _Sample) -> dict[str, NDArray[np.flo
     return ranges_m | {RELIEF: ranges_of(sample.flat_m, sample.lines)}
 
 
-def _without_motion(lines: RangeLines) -> RangeLines:
-    """Return lines whose receivers stay where they were at transmission."""
-    return replace(lines, rx_velocity_m_s=None)
-
-
-def _at_phase_centres(lines: RangeLines) -> RangeLines:
-    """Return lines whose transmitters and receivers are both at the phase centre."""
-    return replace(lines, tx_m=lines.phase_centres_m, rx_m=lines.phase_centres_m)
-
-
 def _on_straight_track(lines: RangeLines) -> RangeLines:
     """Return lines whose antennas are moved onto a straight track."""
     off_m = track_errors_m(lines)
@@ -226,8 +216,8 @@ def _on_straight_track(lines: RangeLines) -> RangeLines:
 
 
 LINES_WITHOUT: dict[str, Callable[[RangeLines], RangeLines]] = {
-    MOTION: _without_motion,
-    APART: _at_phase_centres,
+    MOTION: lambda lines: replace(lines, rx_velocity_m_s=None),
+    APART: lambda lines: replace(lines, tx_m=lines.phase_centres_m, rx_m=lines.phase_centres_m),
     SWAY: _on_straight_track,
 }
 """Functions that return lines without an effect of their antennas."""

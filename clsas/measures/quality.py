@@ -130,8 +130,9 @@ def measure_point(
     across, upward = axes = image.grid.sides
     for axis in axes:
         if len(axis.places_m) < 3:
+            side = axis.name.removeprefix("along ")
             raise ValueError(
-                f"image must have 3 or more pixels along {_word(axis)}, got {len(axis.places_m)}"
+                f"image must have 3 or more pixels along {side}, got {len(axis.places_m)}"
             )
     dx, dy = across.step_m, upward.step_m
     if extent_m is not None:
@@ -233,10 +234,6 @@ def _position_m(grid: Grid, row: float, column: float) -> tuple[float, float, fl
     x_m, y_m, z_m = origin_m + row * row_step_m + column * column_step_m
     height_m = 0.0 if grid.height_m is None else grid.height_m[round(row), round(column)]
     return float(x_m), float(y_m), float(z_m + height_m)
-
-
-def _word(axis: Axis) -> str:
-    return axis.name.removeprefix("along ")
 
 
 def _without_carrier(pixels: NDArray, row: int, column: int) -> NDArray:
