@@ -120,10 +120,6 @@ class Run:
             return self.client.get_executor(pure=False)
         return device_threads(self.workers, self.devices)
 
-    def job_on(self, visibility: SurveyVisibility) -> PatchJob:
-        """Return the settings of the patches, with the present survey."""
-        return self.job.on(visibility, self.client is None)
-
 
 class _GrowingSurvey:
     """A survey to which files may be added.
@@ -201,7 +197,7 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Form
                 ready.remove(index)
                 todo.remove(index)
                 with uninterrupted():
-                    job = run.job_on(survey.visibility)
+                    job = run.job.on(survey.visibility, run.client is None)
                     running[executor.submit(job.form, layout.window(index))] = index
                 known[index] = survey.channels
             if not running and not todo and survey.has_ended:

@@ -231,7 +231,9 @@ class Store:
             validate.warn(
                 f"{self.path} was damaged and has been repaired: {describe_arrays(repaired)}"
             )
-        if damaged := self._forget_damaged_levels():
+        if damaged := self._level_damage():
+            # Without their record, the run computes them again when all patches are finished.
+            (self.path / LEVELS / "zarr.json").unlink()
             validate.warn(
                 f"{self.path} was damaged; these levels are computed again: "
                 f"{describe_arrays(damaged)}"
@@ -627,15 +629,6 @@ class Store:
     def _is_complete(self) -> bool:
         """Return whether the levels that mix patches are those of the present patches."""
         return _completing().is_current(self.path, read_document(self.path), self._digest())
-
-    def _forget_damaged_levels(self) -> dict[str, str]:
-        """Return the damaged levels that mix patches, and remove the record of all of them.
-
-        Without it they are computed again when all patches are finished.
-        """
-        if damaged := self._level_damage():
-            (self.path / LEVELS / "zarr.json").unlink()
-        return damaged
 
     def _level_damage(self) -> dict[str, str]:
         """Read the levels that mix patches, if they are complete; return those that are damaged."""

@@ -107,7 +107,8 @@ class Survey:
                     self._samples(index, slice(channel, channel + 1), columns)
                     for channel in np.unique(np.linspace(0, count - 1, _DIGESTED).astype(int))
                 ]
-            found.append(digest([self._part_geometry(index), *samples], _NOT_IN_PARTS))
+            geometry = self.geometry.select(slice(*self.begins[index : index + 2]))
+            found.append(digest([geometry.without_samples(), *samples], _NOT_IN_PARTS))
         return found
 
     def within(self, near_m: NDArray[np.float64], far_m: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -214,10 +215,6 @@ class Survey:
         if _stamp(part) != self.stamps[index]:
             raise FileFormatError(f"{part} has changed since the survey was opened")
         return read_samples(part, rows, columns)
-
-    def _part_geometry(self, index: int) -> RangeLines:
-        channels = self.geometry.select(slice(*self.begins[index : index + 2]))
-        return channels.without_samples()
 
 
 def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
