@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -120,20 +121,9 @@ def passes(count: int, per_pass: int, spacing_m: float) -> NDArray[np.float64]:
     return np.concatenate(found)
 
 
-def _helix() -> NDArray[np.float64]:
-    return helix(150, 360, 0.83, 0.09, 5e-3)
-
-
-def _circle() -> NDArray[np.float64]:
-    return helix(1, 4096, 15.0, 8.0, 0.0)
-
-
-def _passes() -> NDArray[np.float64]:
-    return passes(20, 800, 0.015)
-
-
 def _in_air(pixels: int) -> DenseCase:
-    return DenseCase(_helix, 20e3, 20e3, _AIR_M_S, (0.24, 0.24, 0.0), 0.24, pixels)
+    track = partial(helix, 150, 360, 0.83, 0.09, 5e-3)
+    return DenseCase(track, 20e3, 20e3, _AIR_M_S, (0.24, 0.24, 0.0), 0.24, pixels)
 
 
 DENSE_CASES = {
@@ -141,10 +131,12 @@ DENSE_CASES = {
     "ffbp-helix": _in_air(150),
     "ffbp-helix-fine": _in_air(600),
     "ffbp-passes": DenseCase(
-        _passes, 120e3, 30e3, _WATER_M_S, (10.0, 10.0, 0.0), 10.0, 1024, points=100
+        partial(passes, 20, 800, 0.015),
+        120e3, 30e3, _WATER_M_S, (10.0, 10.0, 0.0), 10.0, 1024, points=100,
     ),
     "ffbp-volume": DenseCase(
-        _circle, 120e3, 30e3, _WATER_M_S, (1.28, 1.28, 0.64), 1.27, 128, slices=64
+        partial(helix, 1, 4096, 15.0, 8.0, 0.0),
+        120e3, 30e3, _WATER_M_S, (1.28, 1.28, 0.64), 1.27, 128, slices=64,
     ),
-}
+}  # fmt: skip
 """Cases of factorized imaging."""

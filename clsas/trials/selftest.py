@@ -95,10 +95,11 @@ def run(
     validate.progress(progress)
     own = open_device(device)
     checks = [(own, "", *check) for check in _CHECKS]
+    of_kernels = [check for check in _CHECKS if check[1] != "wavenumber"]
     checks += [
         (other, f", {name}", *check)
         for name, other in variants(own).items()
-        for check in (_of_kernels() if other.info.width == 1 else _OF_VARIANTS)
+        for check in (of_kernels if other.info.width == 1 else _OF_VARIANTS)
     ]
     made = functools.cache(lambda name: _SCENES[name]())
     results = []
@@ -268,8 +269,3 @@ _CHECKS = (
 )
 # Requests whose kernels compile fast. Kernels for -80 and -50 dB take 1.5 times as long.
 _OF_VARIANTS = (("flat", "exact", -60.0), ("flat", "factorized", -35.0))
-
-
-def _of_kernels() -> list[tuple[str, str, float | None]]:
-    """Return the checks of imagers that run kernels."""
-    return [check for check in _CHECKS if check[1] != "wavenumber"]
