@@ -134,7 +134,7 @@ class _Commands(click.Group):
             except _errors() as error:
                 if ctx.params.get("traceback"):
                     raise
-                raise click.ClickException(_message(error)) from error
+                raise click.ClickException(_worded(_text(error))) from error
 
 
 def _errors() -> tuple[type[Exception], ...]:
@@ -200,10 +200,6 @@ def _worded(text: str) -> str:
     from clsas.cli.wording import in_options
 
     return _printable(in_options(text))
-
-
-def _message(error: BaseException) -> str:
-    return _worded(_text(error))
 
 
 def _text(error: BaseException) -> str:

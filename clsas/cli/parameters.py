@@ -61,10 +61,6 @@ def _position(text: str) -> tuple[float, ...]:
     return position
 
 
-def _ratio(text: str) -> float:
-    return float(Fraction(text))
-
-
 def _stages(text: str) -> tuple[tuple[int, int], ...]:
     pairs = [stage.lower().split("x") for stage in text.split(",")]
     stages = tuple((int(beams), int(divisions)) for beams, divisions in pairs)
@@ -102,7 +98,7 @@ ORIGIN = Parsed(
     "LATITUDE,LONGITUDE in degrees, or LATITUDE,LONGITUDE,HEIGHT, without a space, such as "
     "60.39,5.32",
 )
-RATIO = Parsed("NUMBER", _ratio, "a number or a fraction such as 1/30")
+RATIO = Parsed("NUMBER", lambda text: float(Fraction(text)), "a number or a fraction such as 1/30")
 STAGES = Parsed("stages", _stages, "QRxQI for every stage, such as 2x2,2x2")
 PERCENTILES = Parsed(
     "LOW,HIGH", _percentiles, "LOW,HIGH from 0 to 100, without a space, such as 1,99.5"

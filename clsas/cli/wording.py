@@ -196,12 +196,9 @@ def _options(running: click.Context) -> dict[str, str]:
     if "unknowns" in params:
         options["unknowns"] = option_name(params["unknowns"])
     if {"x", "scene"} <= params.keys():
-        options["grid"] = "the grid of --x and --y" if _given(running, "x") else "[grid]"
+        is_given = running.get_parameter_source("x") is ParameterSource.COMMANDLINE
+        options["grid"] = "the grid of --x and --y" if is_given else "[grid]"
     return options
-
-
-def _given(running: click.Context, name: str) -> bool:
-    return running.get_parameter_source(name) is ParameterSource.COMMANDLINE
 
 
 def _named(text: str, name: str, option: str) -> str:
