@@ -90,11 +90,6 @@ class Recording:
         counts = self.pings.receivers
         return None if np.ptp(counts) else int(counts[0])
 
-    @cached_property
-    def moving_bank(self) -> RangeLines:
-        """Moving lines of the first receiver bank; those of several may cancel in an image."""
-        return self.moving.bank(banks.present(self.moving.bank_numbers)[0])
-
     @property
     def receivers_per_bank(self) -> int | None:
         """Channels per ping and bank if all pings have the same number, else None."""
@@ -155,7 +150,8 @@ class Recording:
     @cached_property
     def sign(self) -> tuple[PhaseSign | None, str]:
         """Comparison of both signs of the phase; see `phase_sign`."""
-        lines = self.moving_bank
+        # Of the first bank, since those of several may cancel in an image.
+        lines = self.moving.bank(banks.present(self.moving.bank_numbers)[0])
         if self.background > decibels.power(CONSTANT_DB):
             # It is equally bright in every ping, and would be taken for the brightest echoes.
             lines = lines.without_background("median", receivers=self.receivers_per_bank)
