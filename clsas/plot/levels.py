@@ -183,10 +183,11 @@ def image(
         validate.flag(name, flag)
     title = drawable("title", title)
     figure_class()  # raises if matplotlib is missing
-    from matplotlib import pyplot
     from matplotlib.axes import Axes
 
     if axes is None:
+        from matplotlib import pyplot
+
         axes = pyplot.figure(figsize=_size_in(image), layout="compressed").subplots()
     validate.instance("axes", axes, Axes)
     across, upward = image.grid.sides
