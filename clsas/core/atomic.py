@@ -88,13 +88,7 @@ def assembling(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def _target(given: Path) -> tuple[Path, os.stat_result | None]:
-    """Return the file to replace, behind links, and its status if it exists.
-
-    Raises
-    ------
-    ValueError, OSError
-        As for `replacing`, if the file cannot be replaced.
-    """
+    """Return the file to replace, behind links, and its status if it exists."""
     path = Path(os.path.realpath(given)) if given.is_symlink() else given
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot write {given}: there is no folder {path.parent}")

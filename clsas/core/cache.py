@@ -145,15 +145,8 @@ def _exposure(folder: Path, link: Path | None = None) -> str | None:
 
     The owner of a folder, and others where its mode allows it, can rename its entries. All folders
     above it are therefore checked as well. In a sticky folder, such as /tmp, others can only add
-    entries of their own. That is safe for the folders above, and for a folder that contains a
-    symbolic link to the cache.
-
-    Parameters
-    ----------
-    folder : Path
-        Path without symbolic links.
-    link : Path, optional
-        Symbolic link in the folder that leads to the cache.
+    entries of their own. That is safe for the folders above, and for a folder that contains `link`,
+    a symbolic link to the cache.
     """
     # The owner of the root folder can do everything. In a container that need not be user 0.
     trusted = {0, os.geteuid(), os.lstat("/").st_uid}

@@ -42,7 +42,7 @@ def load(path: str | os.PathLike) -> Saved:
     Raises
     ------
     FileFormatError
-        If the file is of another kind, was written by a newer version, is incomplete or damaged, is
+        If the file is of another kind, has another version, is incomplete or damaged, is
         larger than memory when unpacked, or contains links.
     ImportError
         If the file is CPHD and sarkit is not installed (extra `radar`).

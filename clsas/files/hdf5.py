@@ -109,7 +109,7 @@ def load(path: str | os.PathLike) -> Saved:
     Raises
     ------
     FileFormatError
-        If the file is not HDF5, was not written by clsas, has a newer version, is incomplete or
+        If the file is not HDF5, was not written by clsas, has another version, is incomplete or
         damaged, is larger than memory when unpacked, or contains links.
     OSError
         If the file does not exist (FileNotFoundError) or cannot be read.

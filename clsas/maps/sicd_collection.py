@@ -164,14 +164,7 @@ def time_and_axes(
 def _fitted(
     at_m: NDArray[np.float64], values: NDArray[np.float64], deviation: float
 ) -> NDArray[np.float64]:
-    """Return the polynomial of the lowest order with a deviation, or else of the highest order.
-
-    Parameters
-    ----------
-    at_m : float64 [points, 2]
-        Places along rows and columns.
-    values : float64 [points]
-    """
+    """Return the polynomial of the lowest order with a deviation, or else of the highest order."""
     scale_m = np.abs(at_m).max(axis=0)
     x, y = (at_m / scale_m).T
     found = np.zeros((1, 1))

@@ -114,13 +114,7 @@ def run(
 
 
 def _scene_in(out: Path) -> SceneFile:
-    """Return the scene after writing its file into a folder.
-
-    Raises
-    ------
-    FileExistsError
-        If the folder contains files with the names of the demo's that another program wrote.
-    """
+    """Return the scene after writing its file into a folder."""
     text, file = built_in_scene("thesis_wide_beam"), out / "scene.toml"
     taken = [name for name in _FILES if (out / name).exists()]
     if taken and not (file.is_file() and file.read_bytes() == text):
