@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from stored_tables import printed
 from studies import tables
+from studies.scaling import scaled
 
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import bench, cases, dunes
@@ -48,13 +49,13 @@ def test_dense_cases_have_the_channels_that_they_promise():
 
 
 def test_scaled_cases_keep_what_they_look_like_in_wavelengths():
-    base, scaled = cases.scaled(2048), cases.scaled(512)
-    assert (base.channels, base.pixels, scaled.channels, scaled.pixels) == (2048, 2048, 512, 512)
+    base, small = scaled(2048), scaled(512)
+    assert (base.channels, base.pixels, small.channels, small.pixels) == (2048, 2048, 512, 512)
     assert base.carrier_hz == 120e3
-    assert scaled.spacing_m == pytest.approx(4 * base.spacing_m)
+    assert small.spacing_m == pytest.approx(4 * base.spacing_m)
     for name in ("carrier_hz", "bandwidth_hz"):
-        assert getattr(scaled, name) == pytest.approx(getattr(base, name) / 4)
-    assert (base.x_m, base.y_m, base.beam) == (scaled.x_m, scaled.y_m, scaled.beam)
+        assert getattr(small, name) == pytest.approx(getattr(base, name) / 4)
+    assert (base.x_m, base.y_m, base.beam) == (small.x_m, small.y_m, small.beam)
 
 
 @pytest.mark.watches("clsas/trials", "scripts/bench", "scripts/studies")
