@@ -21,11 +21,10 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.exact.decision import ACCURACY_DB, BEST_ACCURACY_DB
+from clsas.factorized.costs import Costs
+from clsas.factorized.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, Request, planned
 from clsas.forming import Progress, SceneImager, form, scene_of_plan
 from clsas.opencl.device import Device, open_device
-from clsas.planning.costs import Costs
-from clsas.planning.planner import planned
-from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, Request
 from clsas.plans.factorization import ExactImage
 from clsas.plans.plan import Plan
 from clsas.scene import Scene

@@ -13,7 +13,7 @@ import tiers
 from variants import DEFAULT, EVERY_VARIANT, OTHERS, OWN, repeated_in, variant
 
 from clsas.opencl.device import Device, list_devices
-from clsas.planning import costs
+from clsas.factorized import measured_costs as costs
 
 os.environ["MPLBACKEND"] = "agg"  # before Matplotlib is imported: figures open no windows
 _ALL = OWN | OTHERS

@@ -15,7 +15,7 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.imaging import backproject
 from clsas.opencl.device import open_device
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 from clsas.sonar.beam import BeamWindow
 
 EXACT_IS_SLOW = Costs(pixel_ns=1e6, point_ns=1e6)

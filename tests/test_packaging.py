@@ -17,7 +17,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 IMAGING = """
 import numpy as np
 import clsas
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 
 positions_m = np.zeros((64, 3))
 positions_m[:, 0] = np.linspace(-0.5, 0.5, 64)

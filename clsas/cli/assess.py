@@ -13,14 +13,14 @@ from clsas.cli.inputs import load_lines, read_beam, read_grid, read_request
 from clsas.cli.outputs import json_able, report
 from clsas.cli.parameters import INPUT
 from clsas.cli.wording import command
-from clsas.files.cphd import START as CPHD
-from clsas.files.matlab import is_matlab
-from clsas.planning.request import (
+from clsas.factorized.planner import (
     BEST_TOLERANCE_DB,
     TOLERANCE_DB,
     WORST_TOLERANCE_DB,
     tolerance_in_db,
 )
+from clsas.files.cphd import START as CPHD
+from clsas.files.matlab import is_matlab
 
 _HDF5 = b"\x89HDF"
 

@@ -17,7 +17,7 @@ from clsas.opencl.device import choose, open_device
 from clsas.trials import demo as demonstration
 
 if TYPE_CHECKING:
-    from clsas.planning.costs import KnownCosts
+    from clsas.factorized.costs import KnownCosts
 
 
 @command()
@@ -34,20 +34,20 @@ def devices(measure: bool, as_json: bool) -> None:
     \b
     Example:  CLSAS_DEVICE=0 clsas devices
     """
-    from clsas.planning import costs, scaling
+    from clsas.factorized import measured_costs
 
     used, reason = choose()
     if measure:
-        scaling.scaled(open_device(used.index))
+        measured_costs.scaled(open_device(used.index))
     found = clsas.list_devices()
-    known = {info.index: costs.load(info) for info in found}
+    known = {info.index: measured_costs.load(info) for info in found}
     if as_json:
         origins = {
             index: {"source": k.source, "measured": k.measured} for index, k in known.items()
         }
         print_json(
             {"devices": found, "used": used.index, "reason": reason,
-             "costs": origins, "costs_file": costs.path()}
+             "costs": origins, "costs_file": measured_costs.path()}
         )  # fmt: skip
         return
     for info in found:
@@ -60,7 +60,7 @@ def devices(measure: bool, as_json: bool) -> None:
             f"buffer), {'fp64' if info.fp64 else 'no fp64'}, vectors of {info.width}{in_stages}\n"
             f"   costs: {_origin(known[info.index])}"
         )
-    say(f"Used: {used.index} ({reason})\nCosts are stored in {printable(costs.path())}")
+    say(f"Used: {used.index} ({reason})\nCosts are stored in {printable(measured_costs.path())}")
 
 
 def _origin(known: KnownCosts) -> str:

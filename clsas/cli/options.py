@@ -13,13 +13,13 @@ import click
 from clsas.cli.parameters import AXIS, INPUT, PERCENTILES, RATIO, STAGES, Output
 from clsas.core import validate
 from clsas.exact.decision import BEST_ACCURACY_DB
-from clsas.files.hdf5 import SUFFIXES
-from clsas.planning.request import (
+from clsas.factorized.planner import (
     BEST_TOLERANCE_DB,
     WORST_TOLERANCE_DB,
     checked_tolerance_db,
     wavelengths,
 )
+from clsas.files.hdf5 import SUFFIXES
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.sonar.beam import SHAPES
 from clsas.sonar.coverage import UnreachedWarning

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from clsas.core import validate
+from clsas.factorized.planner import tolerance_in_db
 from clsas.files.tables import Table, Vector, located
 from clsas.interferometry.checks import (
     checked_coherence,
@@ -24,7 +25,6 @@ from clsas.navigation.autofocus import UNKNOWNS as FOCUSED
 from clsas.navigation.checks import checked_unknowns
 from clsas.navigation.known_points import UNKNOWNS as CALIBRATED
 from clsas.navigation.micronavigation import UNKNOWNS as NAVIGATED
-from clsas.planning.request import tolerance_in_db
 
 STEPS = (
     "inspect", "calibrate", "navigate", "focus", "pair_errors", "image", "heights", "mosaic"

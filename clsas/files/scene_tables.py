@@ -17,13 +17,13 @@ from pydantic import Field
 
 from clsas.core import validate
 from clsas.exact.decision import BEST_ACCURACY_DB
+from clsas.factorized.planner import checked_pairs, tolerance_in_db
 from clsas.files.georeference_table import GeoreferenceTable
 from clsas.files.grid_tables import GridTable
 from clsas.files.process_tables import ProcessTable
 from clsas.files.sound_speed_table import SoundSpeedTable
 from clsas.files.survey_tables import SonarTable, TrackTable
 from clsas.files.tables import Table, Vector, located
-from clsas.planning.request import checked_pairs, tolerance_in_db
 from clsas.signal.compression import check_options as check_compression
 from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 from clsas.simulation.scenes import PointTargets, Seabed

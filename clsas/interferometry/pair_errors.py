@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from clsas.core import validate
 from clsas.core.lines import RangeLines
+from clsas.factorized.planner import checked_tolerance_db
 from clsas.interferometry.checks import check_pair, checked_known_sd
 from clsas.interferometry.comparisons import Comparison, at_pixels, at_points, in_overlap
 from clsas.interferometry.displaced import Displaced
@@ -19,7 +20,6 @@ from clsas.interferometry.pair import Pair
 from clsas.interferometry.pair_errors_result import UNKNOWNS, PairErrors
 from clsas.interferometry.result import Heights
 from clsas.opencl.device import Device, open_device
-from clsas.planning.request import checked_tolerance_db
 from clsas.signal.spectrum import middle_cycles_per_m
 from clsas.sonar.beam import BeamWindow
 

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from clsas.core import validate
 from clsas.core.grid import Grid
+from clsas.factorized.planner import checked_tolerance_db
 from clsas.interferometry.checks import checked_coherence, checked_search
 from clsas.interferometry.interferogram import window_within
-from clsas.planning.request import checked_tolerance_db
 from clsas.sonar.beam import BeamWindow
 
 

@@ -18,6 +18,9 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.sound_speed import SoundSpeed
 from clsas.core.wavelengths import band_wavelength_m
+from clsas.factorized.costs import Costs
+from clsas.factorized.errors import half_precision_error
+from clsas.factorized.planner import TOLERANCE_DB, checked_tolerance_db
 from clsas.forming import form
 from clsas.imaging import plan
 from clsas.measures.assessment_result import Assessment, Effect
@@ -31,9 +34,6 @@ from clsas.measures.effects import (
     errors_without,
 )
 from clsas.opencl.device import Device, open_device
-from clsas.planning.costs import Costs
-from clsas.planning.prediction import half_precision_error
-from clsas.planning.request import TOLERANCE_DB, checked_tolerance_db
 from clsas.plans.plan import Plan
 from clsas.scene import Scene
 from clsas.signal.compression import Window

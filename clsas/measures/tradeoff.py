@@ -19,6 +19,13 @@ from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.exact.decision import ACCURACY_DB
+from clsas.factorized.planner import (
+    BEST_TOLERANCE_DB,
+    WORST_TOLERANCE_DB,
+    Request,
+    checked_pairs,
+    planned,
+)
 from clsas.forming import form_exactly
 from clsas.imaging import factorize
 from clsas.measures.cuts import Cut
@@ -26,8 +33,6 @@ from clsas.measures.quality import measure_point
 from clsas.measures.shadows import DARKEST, dark_level_db
 from clsas.measures.tradeoff_result import Response, Row, Tradeoff
 from clsas.opencl.device import Device, open_device
-from clsas.planning.planner import planned
-from clsas.planning.request import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, Request, checked_pairs
 from clsas.plans.plan import Plan
 from clsas.signal.doubts import warn_before_imaging
 from clsas.sonar.beam import BeamWindow

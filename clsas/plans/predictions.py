@@ -21,7 +21,7 @@ Amount: TypeAlias = float | NDArray[np.float64]
 class Work:
     """Counted operations of a device and its host.
 
-    `clsas.planning.costs.Costs` has the same fields in nanoseconds, and `Costs.seconds` multiplies
+    `clsas.factorized.costs.Costs` has the same fields in nanoseconds, and `Costs.seconds` multiplies
     the two. Amounts are numbers, or arrays over sizes of subimages.
 
     Attributes
@@ -161,7 +161,7 @@ _NEGLIGIBLE = 1e-3  # share of the total below which contributions are not shown
 
 
 CostSource: TypeAlias = Literal["given", "calibrated", "scaled", "default"]
-"""Origin of the costs of a prediction: see `clsas.planning.costs.KnownCosts`."""
+"""Origin of the costs of a prediction: see `clsas.factorized.costs.KnownCosts`."""
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.core.validate import warn
+from clsas.factorized.planner import TOLERANCE_DB
 from clsas.files.hdf5 import save
 from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
@@ -34,7 +35,6 @@ from clsas.navigation.autofocus import autofocus
 from clsas.navigation.known_points import calibrate_track
 from clsas.navigation.micronavigation import micronavigate
 from clsas.opencl.device import Device
-from clsas.planning.request import TOLERANCE_DB
 from clsas.processing import numbers
 from clsas.processing.record import StepRecord
 from clsas.processing.tracks import csv_of_track

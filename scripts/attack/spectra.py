@@ -20,7 +20,7 @@ import numpy as np
 from exactly import prepare
 
 import clsas
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 from clsas.trials.extremes import raw
 
 POINTS = [(0.0, 42.5, 0), (0.08, 42.505, 0), (-0.07, 42.49, 0), (0.03, 42.512, 0)]

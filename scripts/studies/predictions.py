@@ -12,7 +12,7 @@ from clsas.forming import form_exactly
 from clsas.imaging import factorize, plan
 from clsas.opencl.device import Device
 from clsas.planning import costs, scaling
-from clsas.planning.costs import KnownCosts
+from clsas.factorized.costs import KnownCosts
 from clsas.planning.exact_image import expect
 from clsas.planning.visibility_model import model_of
 from clsas.plans.report import costs_in_words

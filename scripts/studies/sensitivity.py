@@ -25,7 +25,7 @@ from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
 from clsas.imaging import backproject, factorize, plan
 from clsas.opencl.device import Device
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import cases
 from studies.scaling import scaled

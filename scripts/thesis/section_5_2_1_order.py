@@ -17,8 +17,8 @@ import chapter5
 
 import clsas
 from clsas.planning import fastest
-from clsas.planning.planner import planned
-from clsas.planning.request import Request
+from clsas.factorized.planner import planned
+from clsas.factorized.planner import Request
 from clsas.planning.search import Allowed, Tree
 
 FACTORS = ((8, 2), (4, 4), (4, 2, 2), (16, 2), (8, 4), (8, 2, 2), (4, 4, 2))  # QR

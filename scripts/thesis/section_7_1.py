@@ -22,7 +22,7 @@ import stored_tables
 
 import clsas
 from clsas.opencl.device import Device, open_device
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 from clsas.sonar.system import line_array
 
 TOLERANCE_DB = -40.0

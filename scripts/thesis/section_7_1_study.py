@@ -14,8 +14,8 @@ import chapter5
 import clsas
 from clsas.measures.tradeoff import STUDIED_DEPTHS, STUDIED_TAPS
 from clsas.measures.tradeoff_result import Row, Tradeoff
-from clsas.planning.planner import planned
-from clsas.planning.request import Request
+from clsas.factorized.planner import planned
+from clsas.factorized.planner import Request
 
 TOLERANCES_DB = (-30.0, -40.0, -50.0)
 

@@ -23,8 +23,8 @@ from section_7_1 import SYSTEMS, System
 import clsas
 from clsas.measures.tradeoff import REFERENCE_DB
 from clsas.opencl.device import Device, open_device
-from clsas.planning.planner import planned
-from clsas.planning.request import Request
+from clsas.factorized.planner import planned
+from clsas.factorized.planner import Request
 from clsas.planning.search import Allowed
 
 TAPS = (2, 4, 6, 8)

@@ -26,7 +26,7 @@ from clsas.core import validate
 from clsas.files.scene_files import built_in_scene, read_scene
 from clsas.measures.resolution import expected_resolution_m
 from clsas.opencl.device import choose
-from clsas.planning import costs
+from clsas.factorized import measured_costs as costs
 from clsas.planning.scaling import Scale
 from clsas.trials import cases, demo
 

@@ -39,7 +39,7 @@ from clsas.core.lines import RangeLines, some_channels
 from clsas.core.validate import ClsasWarning
 from clsas.forming import form_exactly
 from clsas.imaging import backproject, factorize
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 from clsas.planning.prediction import HALF_ROUNDING
 from clsas.plans.plan import Plan
 from clsas.simulation.scenes import PointTargets

@@ -8,7 +8,7 @@ from tiers import thinned
 from clsas import wavenumber as form_wavenumber
 from clsas.imaging import factorize, plan
 from clsas.mosaics.mosaic import mosaic
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import extremes
 from clsas.trials.extremes import (

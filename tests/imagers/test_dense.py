@@ -19,7 +19,7 @@ from clsas.forming import scene_of_plan
 from clsas.imaging import backproject, factorize, plan
 from clsas.opencl.device import open_device
 from clsas.planning import planner
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials.selftest import driven

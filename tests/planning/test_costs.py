@@ -10,8 +10,8 @@ from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
 from clsas.imaging import plan
 from clsas.opencl.device import open_device
-from clsas.planning import costs
-from clsas.planning.costs import Costs, KnownCosts
+from clsas.factorized import measured_costs as costs
+from clsas.factorized.costs import Costs, KnownCosts
 from clsas.sonar.beam import BeamWindow
 
 

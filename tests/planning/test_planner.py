@@ -31,7 +31,7 @@ from clsas.imaging import backproject, factorize, plan
 from clsas.planning import fastest, planner, timed_images
 from clsas.planning.beam_coverage import trimmed
 from clsas.planning.channels import frequencies
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
@@ -566,7 +566,7 @@ def test_planning_with_a_beam_imports_nothing_slow():
 import sys
 import numpy as np
 import clsas
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 along = np.arange(200)[:, None] * [0.05, 0, 0]
 lines = clsas.RangeLines(np.ones((200, 512), complex), 40.0, 0.02, along, along, 120e3, 1500.0)
 grid = clsas.Grid.plane((0, 5, 256), (41, 46, 256))

@@ -11,7 +11,7 @@ from clsas.core.validate import ClsasWarning
 from clsas.imaging import plan
 from clsas.opencl.device import open_device
 from clsas.planning import costs, scaling
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 from clsas.planning.scaling import GROUPS, Scale
 
 SAME = Scale(*(1.0 for _ in dataclasses.fields(Scale)))

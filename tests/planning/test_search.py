@@ -9,7 +9,7 @@ from factorizing import BEAMS, around, over
 from clsas.opencl.device import open_device
 from clsas.planning import search
 from clsas.planning.aperture_phases import AperturePhases
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 from clsas.planning.search import Allowed
 from clsas.planning.sizes import all_sizes
 

@@ -24,7 +24,7 @@ from clsas.core.grid import Grid
 from clsas.core.sound_speed import SoundSpeed
 from clsas.imaging import factorize, plan
 from clsas.opencl.device import open_device
-from clsas.planning import costs
+from clsas.factorized import measured_costs as costs
 from clsas.plans.plan import VERSION, Plan
 from clsas.sonar.beam import BeamWindow
 

@@ -3,8 +3,8 @@ from studies import sensitivity
 from studies.scaling import scaled
 
 from clsas.opencl.device import open_device
-from clsas.planning import search
-from clsas.planning.costs import Costs
+from clsas.factorized import search
+from clsas.factorized.costs import Costs
 
 
 def named(name):

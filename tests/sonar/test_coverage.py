@@ -11,7 +11,7 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
 from clsas.imaging import backproject, factorize, plan
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import UnreachedWarning, reaches
 

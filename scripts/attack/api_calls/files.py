@@ -13,7 +13,7 @@ from api_calls.scene import Call, nothing, scene
 from clsas.core.digests import grid_digest
 from clsas.mosaics.documents import read_document
 from clsas.mosaics.record import Record
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 
 
 def files(folder: Path) -> dict[str, Call]:

@@ -16,7 +16,7 @@ import scipy.io
 
 import clsas
 from clsas.core.extras import is_installed
-from clsas.planning.costs import Costs
+from clsas.factorized.costs import Costs
 
 RESULTS = (
     "Assessment", "Autofocus", "Calibration", "Certificate", "Effect", "Finding", "Inspection",

@@ -1,1 +1,0 @@
-"""How fast, how accurate, and which way: errors, costs, search and plans."""
