@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 from clsas.exact import reference
 from clsas.exact.decision import ACCURACY_DB, Decision, decide
+from clsas.factorized.sampled import SampledRoots, SampledScene
 from clsas.forming import SceneImager
 from clsas.opencl.device import Device, open_device
-from clsas.planning.visibility_model import model_of
 from clsas.plans.factorization import ExactImage
 from clsas.scene import Scene
 
@@ -62,8 +62,8 @@ def same_interpolator(prepared, points_m, **options):
     )
 
 
-def sampled(lines, grid, beam=None, *outside):
-    """Return the model on which planning evaluates errors and costs, with nothing left out."""
-    model = model_of(Scene.of(lines, grid, beam, None), *outside)
-    assert model is not None
-    return model
+def sampled(lines, grid, beam=None, allowed_power=1.0):
+    """Return the sample points of a scene of which nothing is left out."""
+    found = SampledScene.of(Scene.of(lines, grid, beam, None), allowed_power)
+    assert found is not None
+    return SampledRoots.of(found, None if beam is None else beam.limits)

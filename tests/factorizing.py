@@ -13,9 +13,9 @@ from cases import along_x, lines_over
 from clsas import plan
 from clsas.core.grid import Grid
 from clsas.core.image import Image
+from clsas.factorized.costs import Costs
 from clsas.imaging import backproject
 from clsas.opencl.device import open_device
-from clsas.factorized.costs import Costs
 from clsas.sonar.beam import BeamWindow
 
 EXACT_IS_SLOW = Costs(pixel_ns=1e6, point_ns=1e6)

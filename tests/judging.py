@@ -16,9 +16,9 @@ from families import Scene
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
+from clsas.factorized.costs import Costs
 from clsas.imaging import factorize, plan
 from clsas.measures.certificate import Certificate, certify
-from clsas.factorized.costs import Costs
 
 REFERENCE_DB = -85.0  # of the exact image with which others are compared everywhere
 FLOOR_DB = -90.0  # below which sums of these large phases do not agree

@@ -59,7 +59,7 @@ def test_every_public_name_is_there_and_known_to_type_checkers():
 def test_functions_keep_their_names_when_modules_of_these_are_imported():
     program = """
 import clsas
-import clsas.planning.planner, clsas.mosaics.mosaic, clsas.measures.tradeoff
+import clsas.factorized.planner, clsas.mosaics.mosaic, clsas.measures.tradeoff
 from clsas.simulation.simulator import simulate_lines
 assert all(callable(getattr(clsas, name)) for name in clsas.__all__ if name != "plot")
 from clsas import plan, simulate

@@ -21,7 +21,7 @@ Amount: TypeAlias = float | NDArray[np.float64]
 class Work:
     """Counted operations of a device and its host.
 
-    `clsas.factorized.costs.Costs` has the same fields in nanoseconds, and `Costs.seconds` multiplies
+    `clsas.factorized.costs.Costs` has the same fields in nanoseconds; `Costs.seconds` multiplies
     the two. Amounts are numbers, or arrays over sizes of subimages.
 
     Attributes

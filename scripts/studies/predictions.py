@@ -8,13 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
+from clsas.factorized import measured_costs as costs
+from clsas.factorized.costs import KnownCosts, predict_exact
+from clsas.factorized.sampled import SampledRoots, SampledScene
 from clsas.forming import form_exactly
 from clsas.imaging import factorize, plan
 from clsas.opencl.device import Device
-from clsas.planning import costs, scaling
-from clsas.factorized.costs import KnownCosts
-from clsas.planning.exact_image import expect
-from clsas.planning.visibility_model import model_of
 from clsas.plans.report import costs_in_words
 from clsas.scene import Scene
 from clsas.trials import cases
@@ -35,7 +34,7 @@ def requests(names: Sequence[str] | None = None) -> list[tuple[str, float]]:
 def known_costs(device: Device) -> KnownCosts:
     """Return the costs that a plan would use: stored ones, or else scaled ones."""
     known = costs.load(device)
-    return scaling.scaled(device) if known.source == "default" else known
+    return costs.scaled(device) if known.source == "default" else known
 
 
 def title(device: Device) -> str:
@@ -73,7 +72,11 @@ def _prepared(
     lines, grid, beam = described.lines(), described.grid, described.beam
     if case in cases.EXACT_CASES:
         scene = Scene.of(lines, grid, beam, None)
-        work = expect(scene, asked_db, device, model_of(scene)).work
+        sampled = SampledScene.of(scene)
+        roots = None
+        if sampled is not None:
+            roots = SampledRoots(sampled, None if beam is None else beam.limits)
+        work = predict_exact(scene, asked_db, device, roots).work
         form = partial(form_exactly, lines, grid, beam=beam, accuracy_db=asked_db, device=device)
         return "", float(known.costs.seconds(work)), form
     chosen = plan(lines, grid, tolerance_db=asked_db, beam=beam, device=device, costs=known.costs)

@@ -23,18 +23,17 @@ from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
+from clsas.factorized.costs import Costs
 from clsas.imaging import backproject, factorize, plan
 from clsas.opencl.device import Device
-from clsas.factorized.costs import Costs
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import cases
 from studies.scaling import scaled
 
-ROOMS = ("planning", "factorized", "aperture", "exact")
+ROOMS = ("factorized", "aperture", "exact")
 MODULES = ("clsas.signal.spectrum", "clsas.signal.ambiguity", "clsas.signal.interpolation")
 FIXED = {
-    "clsas.planning.scaling": "measures costs, which are given for the cases",
-    "clsas.planning.timed_images": "as scaling",
+    "clsas.factorized.measured_costs": "measures costs, which are given for the cases",
     "clsas.exact.reference": "the float64 reference",
     "clsas.exact.wavenumber": "another imager, which has its own tool",
     "STACK HELD CHUNK GUARD PHASES _GROUP _FINE VECTOR_ROOM": "layouts that kernels share",

@@ -27,7 +27,7 @@ def constants(device: Device) -> list[Constant]:
     names = [
         ("exact.blocks", "_CHANNELS_AT_ONCE"),
         ("exact.blocks", "_PART_BYTES"),
-        ("planning.memory", batch),
+        ("factorized.costs", batch),
         ("factorized.stages", "_GROUPS_PER_UNIT"),
     ]
     if device.info.width == 1:

@@ -16,10 +16,9 @@ from unittest import mock
 import chapter5
 
 import clsas
-from clsas.planning import fastest
-from clsas.factorized.planner import planned
-from clsas.factorized.planner import Request
-from clsas.planning.search import Allowed, Tree
+from clsas.factorized import candidates
+from clsas.factorized.planner import Request, planned
+from clsas.factorized.search import Allowed, Tree
 
 FACTORS = ((8, 2), (4, 4), (4, 2, 2), (16, 2), (8, 4), (8, 2, 2), (4, 4, 2))  # QR
 RATIOS = (1, 2)  # QI over QR, the same in each stage
@@ -57,7 +56,7 @@ def with_sides(
     request = Request(scene.lines, scene.grid, tolerance_db=TOLERANCE_DB)
     # A search for such trees that finds one, however slow it is.
     object.__setattr__(request, "allowed", Allowed(stages=(len(sides),)))
-    with mock.patch.object(fastest, "search", return_value=Tree(sides, *taps)):
+    with mock.patch.object(candidates, "search", return_value=Tree(sides, *taps)):
         return planned(request.scene(), request, scene.device)[0]
 
 

@@ -21,8 +21,8 @@ import numpy as np
 import stored_tables
 
 import clsas
-from clsas.opencl.device import Device, open_device
 from clsas.factorized.costs import Costs
+from clsas.opencl.device import Device, open_device
 from clsas.sonar.system import line_array
 
 TOLERANCE_DB = -40.0

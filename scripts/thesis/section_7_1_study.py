@@ -12,10 +12,9 @@ from itertools import product
 import chapter5
 
 import clsas
+from clsas.factorized.planner import Request, planned
 from clsas.measures.tradeoff import STUDIED_DEPTHS, STUDIED_TAPS
 from clsas.measures.tradeoff_result import Row, Tradeoff
-from clsas.factorized.planner import planned
-from clsas.factorized.planner import Request
 
 TOLERANCES_DB = (-30.0, -40.0, -50.0)
 

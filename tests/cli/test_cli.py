@@ -23,11 +23,11 @@ import clsas
 from clsas import cli
 from clsas.cli import images
 from clsas.core import validate
+from clsas.factorized import measured_costs as costs
+from clsas.factorized.measured_costs import Scale
 from clsas.files.scene_files import built_in_scene, read_scene
 from clsas.measures.resolution import expected_resolution_m
 from clsas.opencl.device import choose
-from clsas.factorized import measured_costs as costs
-from clsas.planning.scaling import Scale
 from clsas.trials import cases, demo
 
 pytest.importorskip("matplotlib")
@@ -391,7 +391,7 @@ def test_costs_are_measured_again(monkeypatch, tmp_path):
         measured.append(device.info.index)
         return Scale(*(2.0 for _ in dataclasses.fields(Scale)))
 
-    monkeypatch.setattr("clsas.planning.scaling.measure", measure)
+    monkeypatch.setattr("clsas.factorized.measured_costs.measure", measure)
     assert {each["source"] for each in run_json("devices")["costs"].values()} == {"default"}
     assert not measured
     result = run_json("devices", "--measure")

@@ -37,10 +37,10 @@ from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.validate import ClsasWarning
+from clsas.factorized.costs import Costs
+from clsas.factorized.errors import HALF_ROUNDING
 from clsas.forming import form_exactly
 from clsas.imaging import backproject, factorize
-from clsas.factorized.costs import Costs
-from clsas.planning.prediction import HALF_ROUNDING
 from clsas.plans.plan import Plan
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines

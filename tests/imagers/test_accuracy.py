@@ -6,9 +6,9 @@ from scenes import kept
 from tiers import thinned
 
 from clsas import wavenumber as form_wavenumber
+from clsas.factorized.costs import Costs
 from clsas.imaging import factorize, plan
 from clsas.mosaics.mosaic import mosaic
-from clsas.factorized.costs import Costs
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import extremes
 from clsas.trials.extremes import (

@@ -14,12 +14,12 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.exact import reference
+from clsas.factorized import planner
+from clsas.factorized.costs import Costs
 from clsas.factorized.sectors import Roots
 from clsas.forming import scene_of_plan
 from clsas.imaging import backproject, factorize, plan
 from clsas.opencl.device import open_device
-from clsas.planning import planner
-from clsas.factorized.costs import Costs
 from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials.selftest import driven

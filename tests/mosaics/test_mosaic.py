@@ -26,6 +26,7 @@ from clsas.core import validate
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.validate import ClsasWarning
+from clsas.factorized import planner
 from clsas.mosaics import scheduling
 from clsas.mosaics.devices import claim_device
 from clsas.mosaics.documents import read_document
@@ -34,7 +35,6 @@ from clsas.mosaics.store import Store
 from clsas.mosaics.survey import END, open_survey
 from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import list_devices
-from clsas.planning import planner
 from clsas.sonar.beam import BeamWindow
 
 GRID = Grid.plane((-4, 4, 80), (30, 40, 60))

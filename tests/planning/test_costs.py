@@ -8,10 +8,10 @@ from factorizing import around, over
 
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.imaging import plan
-from clsas.opencl.device import open_device
 from clsas.factorized import measured_costs as costs
 from clsas.factorized.costs import Costs, KnownCosts
+from clsas.imaging import plan
+from clsas.opencl.device import open_device
 from clsas.sonar.beam import BeamWindow
 
 

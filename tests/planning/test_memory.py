@@ -14,9 +14,9 @@ from factorizing import (
 )
 
 from clsas.core.sound_speed import SoundSpeed
+from clsas.factorized import candidates, costs
 from clsas.imaging import backproject, factorize, plan
 from clsas.opencl.buffers import Slot
-from clsas.planning import exact_image, memory, prediction
 from clsas.signal.refraction import homogeneous
 from clsas.sonar.beam import BeamWindow
 
@@ -50,11 +50,11 @@ def case(request, monkeypatch):
     predicted = {}
 
     def batches_within(sizes, *others):
-        batches = memory.batches_within(sizes, *others)
+        batches = costs.batches_within(sizes, *others)
         predicted[batches.memory_bytes] = sizes
         return batches
 
-    monkeypatch.setattr(prediction, "batches_within", batches_within)
+    monkeypatch.setattr(candidates, "batches_within", batches_within)
     lines, grid = made(make)
     chosen = plan(lines, grid, **request_)
     assert not chosen.is_exact
@@ -103,11 +103,9 @@ def test_the_predicted_memory_is_an_upper_bound(case, monkeypatch):
 def test_memory_is_the_sum_of_all_buffers(case):
     *_, chosen, sizes = case
     image = chosen.factorization
-    total = memory.total_bytes(sizes.constant()) + memory.total_bytes(
-        sizes.work(image.roots_at_once)
-    )
+    total = costs.total_bytes(sizes.constant()) + costs.total_bytes(sizes.work(image.roots_at_once))
     roots = min(image.roots_prepared, chosen.stages[0].subimages)
-    total += 2 * memory.total_bytes(sizes.tables(roots))
+    total += 2 * costs.total_bytes(sizes.tables(roots))
     assert chosen.memory_bytes == total
 
 
@@ -126,8 +124,8 @@ def test_an_exact_run_allocates_what_was_predicted(make, beam, allocated, monkey
 
         return find_buffers
 
-    for find in (exact_image.block_buffers, exact_image.part_buffers):
-        monkeypatch.setattr(exact_image, find.__name__, recorded(find))
+    for find in (costs.block_buffers, costs.part_buffers):
+        monkeypatch.setattr(costs, find.__name__, recorded(find))
     lines, grid = made(make)
     plan(lines, grid, stages=[], beam=beam)
     backproject(lines, grid, accuracy_db=-60, beam=beam)

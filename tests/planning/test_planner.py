@@ -27,12 +27,12 @@ from tiers import also, thinned
 
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
-from clsas.imaging import backproject, factorize, plan
-from clsas.planning import fastest, planner, timed_images
-from clsas.planning.beam_coverage import trimmed
-from clsas.planning.channels import frequencies
+from clsas.factorized import candidates, measured_costs, planner
 from clsas.factorized.costs import Costs
+from clsas.factorized.planner import trimmed
+from clsas.imaging import backproject, factorize, plan
 from clsas.plans.plan import Plan
+from clsas.signal.spectrum import OUTSIDE
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
@@ -41,8 +41,8 @@ from clsas.sonar.visibility import sines
 
 def test_lines_that_nearly_fill_the_sampled_band_are_upsampled_by_filters(monkeypatch):
     """FFTs in their place take several times as long, and lines of half precision need filters."""
-    monkeypatch.setattr(timed_images, "_BAND", 0.92)
-    lines, grid = timed_images.noise(300, 128)
+    monkeypatch.setattr(measured_costs, "_BAND", 0.92)
+    lines, grid = measured_costs.noise(300, 128)
     chosen = plan(lines, grid, tolerance_db=-45, costs=EXACT_IS_SLOW)
     assert chosen.factorization.upsampler is not None
     image, exact = factorize(lines, grid, chosen), backproject(lines, grid, accuracy_db=-80)
@@ -257,13 +257,13 @@ def test_half_precision_is_for_tolerances_and_devices_that_allow_it(device):
 @pytest.mark.parametrize("width_deg", [20, 40])
 def test_planning_ends_soon_where_virtual_channels_follow_no_step(monkeypatch, width_deg):
     """Denser ones do not help: once the densest allowed were tried, the search ends."""
-    tried, errors = [], fastest.other_errors
+    tried, errors = [], candidates.errors_of_tree
 
     def counted(*arguments):
         tried.append(arguments)
         return errors(*arguments)
 
-    monkeypatch.setattr(fastest, "other_errors", counted)
+    monkeypatch.setattr(candidates, "errors_of_tree", counted)
     grid = around(-2, 10.8, shape=(99, 164), pixel_m=(0.0016, 0.0036))
     lines, grid = over(grid, along_x(341, 0.0346), carrier_hz=300e3, band=0.05)
     beam = BeamWindow(width_deg)
@@ -274,13 +274,14 @@ def test_planning_ends_soon_where_virtual_channels_follow_no_step(monkeypatch, w
 def test_planning_ends_whatever_is_tried_in_vain(monkeypatch):
     """Errors of a stage may remain, however dense its virtual channels are."""
     lines, grid = over(around(0, 40))
-    measured = fastest.other_errors
+    measured = candidates.errors_of_tree
 
     def hopeless(*arguments):
-        found = measured(*arguments)
-        return dataclasses.replace(found, spacing=(1e-2, *found.spacing[1:]))
+        errors, spacing = measured(*arguments)
+        spacing = (1e-2, *spacing[1:])
+        return dataclasses.replace(errors, spacing=sum(spacing)), spacing
 
-    monkeypatch.setattr(fastest, "other_errors", hopeless)
+    monkeypatch.setattr(candidates, "errors_of_tree", hopeless)
     request = {"tolerance_db": -40, "costs": EXACT_IS_SLOW}
     assert plan(lines, grid, **request).is_exact
 
@@ -351,7 +352,7 @@ def test_next_to_nothing_of_a_beam_is_left_out(beam_deg, share):
     grid = around(0, 40, pixel_m=(0.03, 0.3), shape=(50, 60))
     lines, _ = over(grid, along_x(200, 0.014))
     beam = BeamWindow(beam_deg, "hann")
-    low, high = trimmed(sampled(lines, grid, beam), share).limits
+    low, high = trimmed(sampled(lines, grid, beam).sampled, beam.limits, share)
     sine = sines(grid.positions_m().reshape(-1, 3), lines.phase_centres_m, beam.directions(lines))
     weights = beam.weights(sine) ** 2
     left_out = weights[(sine < low) | (sine > high)].sum() / weights.sum()
@@ -511,8 +512,8 @@ def test_the_highest_frequency_leaves_out_as_little_as_is_allowed():
     noisy = dataclasses.replace(lines, samples=lines.samples + floor)
     highest, bin_m = [], 1 / (256 * lines.range_step_m)
     for outside in (1e-6, 1e-9, 1e-11):
-        model = sampled(noisy, grid, None, outside)
-        cycles_per_m, share = frequencies(model)
+        model = sampled(noisy, grid, None, outside / OUTSIDE).sampled
+        cycles_per_m, share = model.frequencies()
         assert share[cycles_per_m > model.highest_cycles_per_m + bin_m].sum() <= outside
         highest.append(model.highest_cycles_per_m)
     assert highest[2] > highest[0]

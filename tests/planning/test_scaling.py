@@ -8,11 +8,11 @@ import pytest
 from factorizing import EXACT_IS_SLOW, made, straight
 
 from clsas.core.validate import ClsasWarning
+from clsas.factorized import measured_costs as costs
+from clsas.factorized.costs import Costs
+from clsas.factorized.measured_costs import GROUPS, Scale
 from clsas.imaging import plan
 from clsas.opencl.device import open_device
-from clsas.planning import costs, scaling
-from clsas.factorized.costs import Costs
-from clsas.planning.scaling import GROUPS, Scale
 
 SAME = Scale(*(1.0 for _ in dataclasses.fields(Scale)))
 TWICE = Scale(*(2.0 for _ in dataclasses.fields(Scale)))
@@ -34,9 +34,9 @@ def measured(monkeypatch):
         scale = SAME
 
     found = Measured()
-    monkeypatch.setattr(scaling, "measure", lambda device: found.append(device) or found.scale)
+    monkeypatch.setattr(costs, "measure", lambda device: found.append(device) or found.scale)
     # However small the image is.
-    monkeypatch.setattr("clsas.planning.planner._SEARCH_S", 0.0)
+    monkeypatch.setattr("clsas.factorized.planner._SEARCH_S", 0.0)
     return found
 
 
@@ -94,7 +94,7 @@ def test_plans_without_a_search_measure_nothing(cache, measured, request_):
 
 def test_nor_do_plans_of_small_images_or_with_given_costs(cache, measured, monkeypatch):
     assert plan(*scene(), **REQUEST, costs=EXACT_IS_SLOW).prediction.cost_source == "given"
-    monkeypatch.setattr("clsas.planning.planner._SEARCH_S", 1e6)
+    monkeypatch.setattr("clsas.factorized.planner._SEARCH_S", 1e6)
     assert plan(*scene(), **REQUEST).prediction.cost_source == "default"
     assert not measured
 
@@ -164,7 +164,7 @@ def test_a_device_is_measured(platform):
     A CPU's driver that passes for a GPU takes 500 times as long as the GPU of the defaults.
     """
     with platform.profile() as times:
-        found = scaling.measure(platform)
+        found = costs.measure(platform)
     assert not times  # of the measurement's own kernels
     assert all(1e-3 < factor < 1e5 for factor in vars(found).values())
 
@@ -184,9 +184,9 @@ def test_images_whose_times_do_not_repeat_are_timed_for_longer(platform, monkeyp
         times = dict.fromkeys(("upsample_lines", "stage", "backproject_tiles"), 0.005)
         image.kernels.append(times if tiled else {"backproject_points": 0.01 * runs[name]})
 
-    monkeypatch.setattr(scaling.TimedImage, "run", run)
-    monkeypatch.setattr(scaling.time, "perf_counter", lambda: 1e-6 * next(clock))
-    scaling.measure(platform)
+    monkeypatch.setattr(costs.TimedImage, "run", run)
+    monkeypatch.setattr(costs.time, "perf_counter", lambda: 1e-6 * next(clock))
+    costs.measure(platform)
     assert runs == {
         "Exact": pytest.approx(6, abs=1),
         "Exact off the plane": pytest.approx(6 + 15, abs=2),

@@ -6,17 +6,14 @@ import pytest
 from exactly import sampled
 from factorizing import BEAMS, around, over
 
-from clsas.opencl.device import open_device
-from clsas.planning import search
-from clsas.planning.aperture_phases import AperturePhases
+from clsas.factorized import search
 from clsas.factorized.costs import Costs
-from clsas.planning.search import Allowed
-from clsas.planning.sizes import all_sizes
+from clsas.factorized.search import Allowed, all_sizes
+from clsas.opencl.device import open_device
 
 
-def priced(model, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
+def priced(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed):
     """All sizes, and the options with the times of their operations."""
-    sizes = all_sizes(model, most, device)
     return sizes, search.all_options(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed)
 
 
@@ -34,18 +31,16 @@ def everything_tried(*arguments):
 
 
 @pytest.fixture(scope="module", params=[None, BEAMS[0]], ids=["wide", "beam"])
-def model(request):
+def sizes(request):
     grid = around(0, 40, shape=(500, 700))
-    return sampled(over(grid)[0], grid, request.param)
+    return all_sizes(sampled(over(grid)[0], grid, request.param), (512, 512), open_device())
 
 
-def cost_of(tree, model, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed):
+def cost_of(tree, sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed):
     """The time of a tree, summed stage by stage."""
     taps = (tree.align_taps,), (tree.aperture_taps,)
     allowed = Allowed(*taps, stages=(len(tree.sides),))
-    sizes, options = priced(
-        model, filters_db, most, leaf_pixels, beam_cycles, device, costs, allowed
-    )
+    sizes, options = priced(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed)
     (choice,) = options.choices
     path = [sizes.pairs.index(side) for side in tree.sides]
     division = sizes.in_root(path[0])
@@ -54,9 +49,7 @@ def cost_of(tree, model, filters_db, most, leaf_pixels, beam_cycles, device, cos
     taps_past_ends = choice.aperture_taps * (search.OVERHANG if len(path) > 1 else 1)
 
     def channels(phase_cycles):
-        return AperturePhases(model).virtual_channels(
-            taps_past_ends, 2 * choice.oversampling, phase_cycles
-        )
+        return sizes.roots.virtual_channels(taps_past_ends, 2 * choice.oversampling, phase_cycles)
 
     total = options.roots_s[0, path[0]]
     for parent, child in pairwise(path):
@@ -70,24 +63,23 @@ def cost_of(tree, model, filters_db, most, leaf_pixels, beam_cycles, device, cos
 @pytest.mark.slow
 @pytest.mark.parametrize("filters_db", [-20.0, -55.0])
 @pytest.mark.parametrize("costs", [Costs(), Costs(leaf_ns=50.0), Costs(reference_ns=1e5)])
-def test_nothing_is_faster_than_what_is_found(model, filters_db, costs):
-    arguments = (model, filters_db, (512, 512), 1, 0.5, open_device(), costs, Allowed())
+def test_nothing_is_faster_than_what_is_found(sizes, filters_db, costs):
+    arguments = (sizes, filters_db, 1, 0.5, costs, Allowed())
     tree = search.search(*arguments)
     assert cost_of(tree, *arguments) == pytest.approx(everything_tried(*arguments), rel=1e-9)
 
 
-def test_leaves_are_as_large_as_asked(model):
+def test_leaves_are_as_large_as_asked(sizes):
     for pixels in (1, 512, 4096):
-        tree = search.search(
-            model, -40.0, (512, 512), pixels, 0.5, open_device(), Costs(), Allowed()
-        )
+        tree = search.search(sizes, -40.0, pixels, 0.5, Costs(), Allowed())
         assert math.prod(tree.sides[-1]) >= pixels
 
 
-def test_without_any_size_that_fits_there_is_none(model):
-    arguments = (0.5, open_device(), Costs(), Allowed())
-    assert search.search(model, -40.0, (8, 2), 1, *arguments) is None
-    assert search.search(model, -40.0, (512, 512), 10**9, *arguments) is None
+def test_without_any_size_that_fits_there_is_none(sizes):
+    arguments = (0.5, Costs(), Allowed())
+    none = all_sizes(sizes.roots, (8, 2), open_device())
+    assert search.search(none, -40.0, 1, *arguments) is None
+    assert search.search(sizes, -40.0, 10**9, *arguments) is None
 
 
 @pytest.mark.parametrize("is_sheet", [False, True])

@@ -8,7 +8,7 @@ from cases import along_x
 from exactly import sampled
 from factorizing import around, over
 
-from clsas.planning.stretches import aligned_spectrum, stretch_of, uncompensated
+from clsas.factorized.errors import uncompensated
 from clsas.signal import interpolation
 from clsas.signal.spectrum import shares_of_bins
 from clsas.sonar.beam import BeamWindow
@@ -17,46 +17,49 @@ TRACK = along_x(200, 0.02)
 GRID = around(0, 40, shape=(32, 32))
 
 
-def model_of(rx=None, *, band=0.02, **more):
+def roots_of(rx=None, *, band=0.02, **more):
     lines, grid = over(GRID, TRACK, rx, band=band, **more)
     return sampled(lines, grid, None)
 
 
 def test_channels_on_the_mean_track_have_none():
-    model = model_of()
-    found = stretch_of(model)
+    roots = roots_of()
+    found = roots.stretch
     assert abs(found.mean) < 1e-12
     assert found.shares is None
-    assert aligned_spectrum(model) is model.spectrum
+    assert roots.stretch.spectrum(roots.sampled.scene.spectrum) is roots.sampled.scene.spectrum
 
 
 def test_a_receiver_above_the_transmitter():
     """The gradient of range is the cosine of half the angle between both lines of sight."""
-    model = model_of(TRACK + [0, 0, 8.0])
+    roots = roots_of(TRACK + [0, 0, 8.0])
     from_tx, from_rx = np.array([0, 40, 0]), np.array([0, 40, -8])
     cosine = from_tx @ from_rx / np.linalg.norm(from_tx) / np.linalg.norm(from_rx)
     # The plane is level: only the gradient's part along it can be made up for.
     gradient = (from_tx / np.linalg.norm(from_tx) + from_rx / np.linalg.norm(from_rx)) / 2
     of_middle = np.array([0, 40, -4]) / np.hypot(40, 4)
     assert np.linalg.norm(gradient) == pytest.approx(np.sqrt((1 + cosine) / 2), rel=1e-12)
-    assert stretch_of(model).mean == pytest.approx(gradient[1] / of_middle[1] - 1, rel=0.02)
+    assert roots.stretch.mean == pytest.approx(gradient[1] / of_middle[1] - 1, rel=0.02)
 
 
 def test_velocities_that_differ_widen_the_band():
     velocity = np.zeros((len(TRACK), 3))
     velocity[:, 1] = np.random.default_rng(0).normal(0, 5, len(TRACK))
-    model = model_of(velocity=velocity)
+    roots = roots_of(velocity=velocity)
     # Towards the grid at v, ranges grow by v/c less: the carrier's share of a cycle per sample.
-    shift = velocity[:, 1].std() / 1500 * model.lines.carrier_cycles_per_m
+    shift = velocity[:, 1].std() / 1500 * roots.sampled.scene.lines.carrier_cycles_per_m
     wide, narrow = (
-        np.sqrt(each.share @ each.frequency**2) / model.lines.range_step_m
-        for each in (aligned_spectrum(model), model.spectrum)
+        np.sqrt(each.share @ each.frequency**2) / roots.sampled.scene.lines.range_step_m
+        for each in (
+            roots.stretch.spectrum(roots.sampled.scene.spectrum),
+            roots.sampled.scene.spectrum,
+        )
     )
     assert np.sqrt(wide**2 - narrow**2) == pytest.approx(shift, rel=0.1)
 
 
 def test_shifts_keep_the_power():
-    spectrum = model_of().spectrum
+    spectrum = roots_of().sampled.scene.spectrum
     shares = shares_of_bins(np.array([[-3.25, 2.0]]), np.array([[1.0, 3.0]]))
     # Of bins -4 to 4: a quarter lies between -4 and -3, nearer to the latter.
     assert shares == pytest.approx([0.0625, 0.1875, 0, 0, 0, 0, 0.75, 0, 0])
@@ -77,8 +80,8 @@ def test_shares_of_bins_have_the_mean_of_the_positions(position):
 
 def test_a_gain_for_another_band_errs():
     """A gain that makes up for filters at one frequency is wrong at a shifted one."""
-    still, moving = model_of(), model_of(velocity=[[0, 8.0, 0], [0, -8.0, 0]] * 100)
-    align = interpolation.design(4, 1.25, still.spectrum)
+    still, moving = roots_of(), roots_of(velocity=[[0, 8.0, 0], [0, -8.0, 0]] * 100)
+    align = interpolation.design(4, 1.25, still.sampled.scene.spectrum)
     gain = lambda frequency: 1 / align.response(frequency / 1.25) ** 3  # noqa: E731
     assert uncompensated(still, align, align, 2, 1.25, gain) == 0
     assert uncompensated(moving, align, align, 2, 1.25, gain) > 1e-5
@@ -90,6 +93,6 @@ def test_silent_channels_have_none():
     samples = lines.samples.copy()
     samples[100:300] = 0
     silent = dataclasses.replace(lines, samples=samples, rx_m=lines.rx_m + [0, 0, 20])
-    model = sampled(silent, grid, BeamWindow(20, "hann"))
-    assert stretch_of(model).shares is None
-    assert np.isfinite(aligned_spectrum(model).power).all()
+    roots = sampled(silent, grid, BeamWindow(20, "hann"))
+    assert roots.stretch.shares is None
+    assert np.isfinite(roots.stretch.spectrum(roots.sampled.scene.spectrum).power).all()

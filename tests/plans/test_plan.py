@@ -22,9 +22,9 @@ from factorizing import (
 from clsas.core.digests import grid_digest, lines_digest, with_digest
 from clsas.core.grid import Grid
 from clsas.core.sound_speed import SoundSpeed
+from clsas.factorized import measured_costs as costs
 from clsas.imaging import factorize, plan
 from clsas.opencl.device import open_device
-from clsas.factorized import measured_costs as costs
 from clsas.plans.plan import VERSION, Plan
 from clsas.sonar.beam import BeamWindow
 

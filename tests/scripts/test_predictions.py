@@ -4,9 +4,9 @@ import pytest
 from studies import predictions
 
 from clsas.core.grid import Grid
+from clsas.factorized import measured_costs as costs
 from clsas.imaging import plan
 from clsas.opencl.device import open_device
-from clsas.factorized import measured_costs as costs
 from clsas.trials import cases
 from clsas.trials.cases import Case
 

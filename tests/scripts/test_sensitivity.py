@@ -2,9 +2,9 @@ import pytest
 from studies import sensitivity
 from studies.scaling import scaled
 
-from clsas.opencl.device import open_device
 from clsas.factorized import search
 from clsas.factorized.costs import Costs
+from clsas.opencl.device import open_device
 
 
 def named(name):

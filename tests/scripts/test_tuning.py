@@ -32,4 +32,4 @@ def test_a_device_of_one_lane_has_work_groups_to_tune(monkeypatch):
     single = dataclasses.replace(device, info=info, _kernels={})
     named = {(each.module.__name__, each.name) for each in tuning.constants(single)}
     assert (stages.__name__, "_GROUP") in named
-    assert ("clsas.planning.memory", "_BATCH_BYTES") in named
+    assert ("clsas.factorized.costs", "_BATCH_BYTES") in named

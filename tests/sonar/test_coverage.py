@@ -10,8 +10,8 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.imaging import backproject, factorize, plan
 from clsas.factorized.costs import Costs
+from clsas.imaging import backproject, factorize, plan
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import UnreachedWarning, reaches
 

@@ -11,9 +11,9 @@ import numpy as np
 import clsas
 from api_calls.scene import Call, nothing, scene
 from clsas.core.digests import grid_digest
+from clsas.factorized.costs import Costs
 from clsas.mosaics.documents import read_document
 from clsas.mosaics.record import Record
-from clsas.factorized.costs import Costs
 
 
 def files(folder: Path) -> dict[str, Call]:
