@@ -1,15 +1,17 @@
-"""Fourier integrals and smooth edges, for simulation and pulse compression."""
+"""Non-uniform Fourier sums and integrals, and smooth edges."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
+import scipy.fft
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import erfc
+from scipy.sparse import csr_array
+from scipy.special import erfc, i0
 
 from clsas.core import validate
-from clsas.core.extras import needed
 
 # Half the width of a smooth edge in standard deviations. At its ends 6e-8 (-145 dB) remains.
 _EDGE_SIGMAS = 5.3
@@ -18,6 +20,7 @@ EDGE_PRODUCT = _EDGE_SIGMAS**2 / np.pi
 """Width of a smooth edge times the extent of its Fourier transform, both down to -145 dB."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+_OVERSAMPLING = 2.0  # of the grids of non-uniform sums: a plain choice
 
 
 def smooth_edge(position: ArrayLike) -> NDArray[np.float64]:
@@ -27,6 +30,92 @@ def smooth_edge(position: ArrayLike) -> NDArray[np.float64]:
     w, the Fourier transform falls below 6e-8 at `EDGE_PRODUCT`/w.
     """
     return 0.5 * erfc(_EDGE_SIGMAS * (2 * np.asarray(position) - 1) / np.sqrt(2))
+
+
+def taps_for(error_db: float, oversampling: float) -> int:
+    """Return the taps with which `gridding` has at most this relative rms error.
+
+    The formula bounds errors measured with 2 to 16 taps at an oversampling of 1.25 to 2.
+    """
+    return max(2, math.ceil((10 - error_db) / (27.3 * math.sqrt(1 - 1 / oversampling))))
+
+
+def gridding(places: NDArray[np.float64], length: int, taps: int, oversampling: float) -> csr_array:
+    """Return the matrix that interpolates a periodic signal, [places, length].
+
+    Parameters
+    ----------
+    places : float64 [n]
+        Where the signal is evaluated, in samples.
+    length : int
+        Samples of a period.
+    taps : int
+        Samples per evaluation.
+    oversampling : float
+        Sample rate over the two-sided bandwidth of the signal.
+
+    Notes
+    -----
+    The interpolated signal has its spectrum multiplied by `gridding_gain`. The transposed matrix
+    spreads values at the places onto the samples. The weights are those of the Kaiser-Bessel window
+    of Keiner, Kunis and Potts (2009).
+    """
+    columns = np.ceil(places - taps / 2).astype(np.int64)[:, None] + np.arange(taps)
+    weights = gridding_weights(columns - places[:, None], taps, oversampling)
+    ends = np.arange(len(places) + 1) * taps
+    return csr_array(
+        (weights.ravel(), (columns % length).ravel(), ends), shape=(len(places), length)
+    )
+
+
+def gridding_weights(
+    distance: NDArray[np.float64], taps: int, oversampling: float
+) -> NDArray[np.float64]:
+    """Return the weights of samples at distances of up to taps/2 samples."""
+    shape = _shape(taps, oversampling)
+    root = np.sqrt(np.maximum(1 - (2 / taps * distance) ** 2, 1e-30))
+    return np.exp(shape * (root - 1)) * -np.expm1(-2 * shape * root) / root
+
+
+def gridding_gain(
+    frequency: NDArray[np.float64], taps: int, oversampling: float
+) -> NDArray[np.float64]:
+    """Return the gain of `gridding` at frequencies in cycles per sample."""
+    shape = _shape(taps, oversampling)
+    turns = np.pi * taps * frequency
+    return np.pi * taps * np.exp(-shape) * i0(np.sqrt(np.maximum(shape**2 - turns**2, 0)))
+
+
+def _shape(taps: int, oversampling: float) -> float:
+    """Return the shape parameter of a Kaiser-Bessel window, which depends on the stop band."""
+    return np.pi * taps * (1 - 1 / (2 * oversampling))
+
+
+def fourier_series(
+    coefficients: NDArray[np.complexfloating], cycles: NDArray[np.float64], error_db: float = -260.0
+) -> NDArray[np.complex128]:
+    """Return sum over n of c_n exp(j 2 pi n x) for every x of `cycles` (non-uniform FFT of type 2).
+
+    Parameters
+    ----------
+    coefficients : complex [n]
+        c_0, c_1, ...
+    cycles : float64 [m]
+        x, in cycles.
+    error_db : float
+        Relative rms error.
+    """
+    count = len(coefficients)
+    taps = taps_for(error_db, _OVERSAMPLING)
+    length = scipy.fft.next_fast_len(math.ceil(_OVERSAMPLING * count) + taps)
+    middle = count // 2
+    gain = gridding_gain((np.arange(count) - middle) / length, taps, _OVERSAMPLING)
+    padded = np.zeros(length, np.complex128)
+    padded[:count] = coefficients / gain
+    signal = length * scipy.fft.ifft(np.roll(padded, -middle), overwrite_x=True)
+    turns = cycles - np.rint(cycles)
+    values = gridding(turns * length, length, taps, _OVERSAMPLING) @ signal
+    return values * np.exp(2j * np.pi * middle * turns)
 
 
 def fourier_integral(
@@ -60,15 +149,14 @@ def fourier_integral(
 
     Notes
     -----
-    The integral is a Gauss-Legendre quadrature with 16 points per panel of at most two cycles. A
-    type-3 non-uniform FFT computes the sum.
+    The integral is a Gauss-Legendre quadrature with 16 points per panel of at most two cycles. The
+    sum over the points is a non-uniform FFT of type 3: points are spread onto a grid that is dense
+    enough for all frequencies, and the series of the grid is evaluated.
     """
-    with needed("simulation and pulse compression"):
-        import finufft  # slow to import
-
     edges = np.asarray(edges, dtype=np.float64)
     at = np.asarray(at, dtype=np.float64)
-    fastest = rate + np.max(np.abs(at), initial=0.0)
+    highest = np.max(np.abs(at), initial=0.0)
+    fastest = rate + highest
     validate.memory("frequency_hz", 400 * fastest * (edges[-1] - edges[0]))  # 16 points per panel
     panels = np.ceil(fastest * np.diff(edges) / 2).astype(int) + 1
     ends = np.concatenate(
@@ -81,8 +169,13 @@ def fourier_integral(
     half = np.diff(ends)[:, None] / 2
     u = ((ends[:-1, None] + half) + half * _NODES).ravel()
     values = (half * _WEIGHTS).ravel() * function(u)
-    # OpenMP's threads do not survive a later fork, and the child process would wait for them.
-    result = finufft.nufft1d3(
-        2 * np.pi * u, values.astype(np.complex128), at.ravel(), isign=sign, eps=1e-13, nthreads=1
-    )
-    return np.reshape(result, at.shape)
+
+    taps = taps_for(-260.0, _OVERSAMPLING)
+    first, extent = u[0], u[-1] - u[0]
+    per_unit = 2 * _OVERSAMPLING * highest + 1 / extent
+    length = math.ceil(extent * per_unit) + 2 * taps
+    grid = gridding((u - first) * per_unit + taps, length, taps, _OVERSAMPLING).T @ values
+    v = at.ravel()
+    result = fourier_series(grid, sign * v / per_unit)
+    result *= np.exp(2j * np.pi * sign * v * (first - taps / per_unit))
+    return np.reshape(result / gridding_gain(v / per_unit, taps, _OVERSAMPLING), at.shape)

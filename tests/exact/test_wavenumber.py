@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from cases import along_x
 from tiers import few
+from wavenumber_sums import wavenumber_sum
 
 from clsas import (
     BeamWindow,
@@ -21,6 +22,7 @@ from clsas import (
     wavenumber,
 )
 from clsas.core import validate
+from clsas.exact import wavenumber as imager
 
 BAND = {"carrier_hz": 125e3, "bandwidth_hz": 15e3, "window": "hamming"}
 SPACING = 0.1
@@ -191,6 +193,30 @@ def test_lines_may_carry_their_carrier():
         relative_error_db(wavenumber(there, GRID, beam=HANN), wavenumber(lines, GRID, beam=HANN))
         <= -75
     )
+
+
+# Interpolation
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("beam", [None, BeamWindow(8, "hann")])
+def test_interpolations_have_the_error_that_is_asked_of_them(beam, monkeypatch):
+    wanted = wavenumber_sum(straight(), GRID, beam)
+    for accuracy_db in (-30, -40, -50, -60, -70, -80):
+        monkeypatch.setattr(imager, "ACCURACY_DB", accuracy_db)
+        assert relative_error_db(wavenumber(straight(), GRID, beam=beam), wanted) <= accuracy_db
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("first_m", "step_m"), [(57.0, 0.04), (57.3, 0.3)])
+def test_lines_that_reach_beyond_the_grid_are_cut_without_a_trace(first_m, step_m):
+    """Echoes from 42 to 78 m are left out, or wrap around, where they do not matter."""
+    points = scene(Grid.plane((-3, 3, 2), (42, 78, 2)), 1000)
+    lines = simulate_lines(TRACK, TRACK, points, **BAND)
+    grid = Grid.plane((-1, 1, 33), (first_m, first_m + 15 * step_m, 16))
+    image = wavenumber(lines, grid, beam=BeamWindow(16, "hann"))
+    wanted = wavenumber_sum(lines, grid, BeamWindow(16, "hann"))
+    assert relative_error_db(image, wanted) <= -80
 
 
 @pytest.mark.slow
