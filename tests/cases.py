@@ -9,7 +9,7 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
-from clsas.exact.reference import ideal
+from clsas.trials.reference import ideal
 from clsas.signal.spectrum import Spectrum
 
 SPARE = 160  # samples of a line beyond what a grid needs, at each end

@@ -21,6 +21,7 @@ EDGE_PRODUCT = _EDGE_SIGMAS**2 / np.pi
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _OVERSAMPLING = 2.0  # of the grids of non-uniform sums: a plain choice
+_PLACES_AT_ONCE = 1 << 13  # whose weights fit into caches
 
 
 def smooth_edge(position: ArrayLike) -> NDArray[np.float64]:
@@ -60,12 +61,28 @@ def gridding(places: NDArray[np.float64], length: int, taps: int, oversampling: 
     spreads values at the places onto the samples. The weights are those of the Kaiser-Bessel window
     of Keiner, Kunis and Potts (2009).
     """
-    columns = np.ceil(places - taps / 2).astype(np.int64)[:, None] + np.arange(taps)
-    weights = gridding_weights(columns - places[:, None], taps, oversampling)
-    ends = np.arange(len(places) + 1) * taps
-    return csr_array(
-        (weights.ravel(), (columns % length).ravel(), ends), shape=(len(places), length)
-    )
+    first = np.ceil(places - taps / 2)
+    distance = (first - places)[:, None] + np.arange(taps)
+    weights = gridding_weights(distance, taps, oversampling)
+    columns = (first % length).astype(np.int32)[:, None] + np.arange(taps, dtype=np.int32)
+    columns[columns >= length] -= length
+    ends = np.arange(len(places) + 1, dtype=np.int32) * taps
+    return csr_array((weights.ravel(), columns.ravel(), ends), shape=(len(places), length))
+
+
+def spread(
+    values: NDArray[np.complexfloating],
+    places: NDArray[np.float64],
+    length: int,
+    taps: int,
+    oversampling: float,
+) -> NDArray[np.complex128]:
+    """Return values [places] or [places, n], spread onto the samples of a period by `gridding`."""
+    total = np.zeros((length, *values.shape[1:]), np.complex128)
+    for first in range(0, len(places), _PLACES_AT_ONCE):
+        some = slice(first, first + _PLACES_AT_ONCE)
+        total += gridding(places[some], length, taps, oversampling).T @ values[some]
+    return total
 
 
 def gridding_weights(
@@ -73,8 +90,9 @@ def gridding_weights(
 ) -> NDArray[np.float64]:
     """Return the weights of samples at distances of up to taps/2 samples."""
     shape = _shape(taps, oversampling)
-    root = np.sqrt(np.maximum(1 - (2 / taps * distance) ** 2, 1e-30))
-    return np.exp(shape * (root - 1)) * -np.expm1(-2 * shape * root) / root
+    root = np.sqrt(np.maximum(1 - (2 / taps * distance) ** 2, 1e-6))
+    rising = np.exp(shape * (root - 1))
+    return (rising - np.exp(-2 * shape) / rising) / root  # sinh(shape root) / root
 
 
 def gridding_gain(
@@ -114,7 +132,10 @@ def fourier_series(
     padded[:count] = coefficients / gain
     signal = length * scipy.fft.ifft(np.roll(padded, -middle), overwrite_x=True)
     turns = cycles - np.rint(cycles)
-    values = gridding(turns * length, length, taps, _OVERSAMPLING) @ signal
+    values = np.empty(len(turns), np.complex128)
+    for first in range(0, len(turns), _PLACES_AT_ONCE):
+        some = slice(first, first + _PLACES_AT_ONCE)
+        values[some] = gridding(turns[some] * length, length, taps, _OVERSAMPLING) @ signal
     return values * np.exp(2j * np.pi * middle * turns)
 
 
@@ -174,7 +195,7 @@ def fourier_integral(
     first, extent = u[0], u[-1] - u[0]
     per_unit = 2 * _OVERSAMPLING * highest + 1 / extent
     length = math.ceil(extent * per_unit) + 2 * taps
-    grid = gridding((u - first) * per_unit + taps, length, taps, _OVERSAMPLING).T @ values
+    grid = spread(values, (u - first) * per_unit + taps, length, taps, _OVERSAMPLING)
     v = at.ravel()
     result = fourier_series(grid, sign * v / per_unit)
     result *= np.exp(2j * np.pi * sign * v * (first - taps / per_unit))

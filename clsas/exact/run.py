@@ -18,7 +18,7 @@ from clsas.exact.decision import Decision
 from clsas.exact.groups import Groups, GroupsEstimate
 from clsas.exact.kept import Kept
 from clsas.exact.lookup import lookup_options
-from clsas.exact.references import geometry_rows, references_of
+from clsas.trials.references import geometry_rows, references_of
 from clsas.exact.tiles import Tiles, item_pixels
 from clsas.opencl.buffers import (
     Slot,

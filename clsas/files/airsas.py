@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from clsas.core import reading, validate
-from clsas.core.extras import needed
+from clsas.core.fourier import fourier_series
 from clsas.core.lines import RangeLines
 from clsas.files import hdf5
 from clsas.files.hdf5 import FileFormatError
@@ -31,6 +31,7 @@ from clsas.sonar.system import Pulse
 SHARED = "characterization data"
 ACQUISITION, SENSORS = "acquistionParams.csv", "sensorCoordinates.csv"  # the data set's spelling
 # Rows of the acquisition parameters, from 0. Each has a name, a number, and further columns.
+_SERIES_ERROR_DB = -180.0  # of lines interpolated by Fourier series
 _RATE, _GROUP_DELAY, _START_HZ, _STOP_HZ, _DURATION, _TAPER = 0, 1, 7, 8, 9, 12
 
 
@@ -167,9 +168,6 @@ def at_one_speed(lines: RangeLines, speed_m_s: NDArray[np.float64]) -> RangeLine
     interpolated at these times, by a Fourier series, and multiplied by a phasor of phase
     4 pi fc r (1/c_i - 1/c). A point at rho then has the phase exp(-j 4 pi fc rho/c).
     """
-    with needed("channels that differ in the speed of sound"):
-        import finufft  # slow to import
-
     validate.memory("lines at one speed of sound", lines.samples.nbytes)
     speed = lines.sound_speed_m_s
     samples = np.array(lines.samples)
@@ -178,7 +176,8 @@ def at_one_speed(lines: RangeLines, speed_m_s: NDArray[np.float64]) -> RangeLine
         range_m = lines.first_range_m[channel] + np.arange(lines.length) * lines.range_step_m
         at = (range_m * speed / speed_m_s[channel] - range_m[0]) / lines.range_step_m
         series = fft.fftshift(fft.fft(samples[channel].astype(np.complex128), padded)) / padded
-        line = finufft.nufft1d2(2 * np.pi * at / padded, series, isign=1, eps=1e-9, nthreads=1)
+        line = fourier_series(series, at / padded, _SERIES_ERROR_DB)
+        line *= np.exp(-2j * np.pi * (padded // 2) * at / padded)  # the first frequency
         line[(at < 0) | (at > lines.length - 1)] = 0
         cycles = 2 * lines.carrier_hz * range_m * (1 / speed_m_s[channel] - 1 / speed)
         samples[channel] = line * np.exp(2j * np.pi * cycles)

@@ -17,9 +17,10 @@ from itertools import product
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy import signal
+from scipy import signal as filters
+from scipy.sparse import csr_array
 
-from clsas.core.extras import check_installed
+from clsas.core.fourier import gridding, gridding_gain, taps_for
 from clsas.core.grid import Grid
 from clsas.core.map_grids import Affine
 from clsas.maps.carrier import Carrier
@@ -31,14 +32,15 @@ MOST_ERROR_DB = -40.0
 _GOOD_DB = -60.0  # error from which a narrower guard is not worth its wider margin: a plain choice
 _GUARDS = (0.2, 0.1, 0.05)  # cycles per pixel
 _STOP_DB = 70.0  # attenuation of the filter's side lobes: below all errors that are stated
-_BETA = float(signal.kaiser_beta(_STOP_DB))  # of the Kaiser window that has it
+_BETA = float(filters.kaiser_beta(_STOP_DB))  # of the Kaiser window that has it
 _BLOCK = 256  # pixels along either side of the blocks whose spectrum is measured
 _MOST_BLOCKS = 32  # of them along either side of the image: a plain choice
 _USED = 0.4  # half the band over the sample rate at which images are interpolated well
 # Rows and columns of new pixels as large as those of the image that are interpolated at once. They
 # take 200 MB with the pixels around them and their spectrum: a plain choice.
 _WINDOW = 1024
-_ACCURACY = 1e-5  # of the non-uniform FFT
+_SUM_ERROR_DB, _OVERSAMPLING = -90.0, 1.5  # of the non-uniform FFT: plain choices
+_PLACES_AT_ONCE = 1 << 13  # whose weights fit into caches
 
 
 class InexactError(ValueError):
@@ -116,8 +118,6 @@ class Interpolation:
 
         Pixels are 0 where the image is 0, or ends within the margin.
         """
-        import finufft  # slow to import; `check_image` has found it
-
         matrix, first = lattice(self.affine, self.onto, (rows.start, columns.start))
         shape = rows.stop - rows.start, columns.stop - columns.start
         down, across = np.ogrid[: shape[0], : shape[1]]
@@ -135,19 +135,52 @@ class Interpolation:
         ]
         given = read(*box)
         row, column = row - box[0].start, column - box[1].start
-        sides = [scipy.fft.next_fast_len(n) for n in given.shape]
         base = self.carrier.without(given, (box[0].start, box[1].start))
-        spectrum = scipy.fft.fft2(base, sides, overwrite_x=True)
-        for axis, n in enumerate(sides):
-            spectrum *= np.expand_dims(_low_pass(n, self.guard), 1 - axis)
-        found = finufft.nufft2d2(
-            2 * np.pi / sides[0] * row, 2 * np.pi / sides[1] * column, spectrum, isign=1,
-            eps=_ACCURACY, modeord=1, upsampfac=1.25, nthreads=1,
-        )  # fmt: skip
-        found *= self.carrier.turns(matrix, first, shape)[inside] / spectrum.size
+        found = _interpolated(base, row, column, self.guard)
+        found *= self.carrier.turns(matrix, first, shape)[inside]
         received = given[np.rint(row).astype(int), np.rint(column).astype(int)] != 0
         pixels[inside] = found * received
         return pixels
+
+
+def _interpolated(
+    base: NDArray[np.complex64],
+    row: NDArray[np.float64],
+    column: NDArray[np.float64],
+    guard: float,
+) -> NDArray[np.complex64]:
+    """Return the low-pass filtered image between its pixels, by a non-uniform FFT of type 2."""
+    taps = taps_for(_SUM_ERROR_DB, _OVERSAMPLING)
+    sides = [scipy.fft.next_fast_len(n) for n in base.shape]
+    fine = [scipy.fft.next_fast_len(math.ceil(_OVERSAMPLING * n) + taps) for n in sides]
+    spectrum = scipy.fft.fft2(base, sides, overwrite_x=True)
+    kept = []
+    for axis, (n, more) in enumerate(zip(sides, fine, strict=True)):
+        frequency = np.rint(scipy.fft.fftfreq(n, 1 / n)).astype(int)
+        gain = _low_pass(n, guard) / gridding_gain(frequency / more, taps, _OVERSAMPLING) * more / n
+        spectrum *= np.expand_dims(gain, 1 - axis).astype(np.float32)
+        kept.append(frequency % more)
+    padded = np.zeros(fine, spectrum.dtype)
+    padded[np.ix_(*kept)] = spectrum
+    signal = scipy.fft.ifft2(padded, overwrite_x=True).ravel()
+
+    found = np.empty(len(row), np.complex64)
+    for first in range(0, len(row), _PLACES_AT_ONCE):
+        some = slice(first, first + _PLACES_AT_ONCE)
+        along = (
+            gridding(at[some] * (more / n), more, taps, _OVERSAMPLING)
+            for at, n, more in zip((row, column), sides, fine, strict=True)
+        )
+        (down, of_rows), (across, of_columns) = (
+            (each.indices.reshape(-1, taps), each.data.reshape(-1, taps).astype(np.float32))
+            for each in along
+        )
+        weights = of_rows[:, :, None] * of_columns[:, None, :]
+        places = down[:, :, None] * fine[1] + across[:, None, :]
+        ends = np.arange(len(weights) + 1) * taps**2
+        matrix = csr_array((weights.ravel(), places.ravel(), ends), (len(weights), len(signal)))
+        found[some] = matrix @ signal
+    return found
 
 
 def check_image(grid: Grid) -> None:
@@ -157,8 +190,6 @@ def check_image(grid: Grid) -> None:
     ------
     ValueError
         If it is not on a plane, or too small.
-    ImportError
-        If finufft is not installed.
     """
     if not grid.is_planar:
         raise ValueError(
@@ -170,7 +201,6 @@ def check_image(grid: Grid) -> None:
             f"source must have at least {least} rows and columns for complex pixels with north_up, "
             f"got {grid.shape[0]} x {grid.shape[1]}"
         )
-    check_installed("finufft", "north-up maps of complex pixels")
 
 
 def margin_of(guard: float) -> int:
@@ -180,7 +210,7 @@ def margin_of(guard: float) -> int:
 
 def _low_pass(n: int, guard: float) -> NDArray[np.float64]:
     """Return the filter at the frequencies of an FFT: a step convolved with a Kaiser window."""
-    window = signal.windows.kaiser(1001, _BETA)
+    window = filters.windows.kaiser(1001, _BETA)
     passed = 1 - np.cumsum(window) / window.sum()
     frequency = np.abs(scipy.fft.fftfreq(n))
     return np.interp(frequency, np.linspace(0.5 - guard, 0.5, len(passed)), passed)
@@ -192,7 +222,7 @@ def _mean_power(carrier: Carrier, read: Reader) -> NDArray[np.float64]:
     Edges of what was received are not band-limited. Blocks with them are left out if there are
     others.
     """
-    window = [signal.windows.blackmanharris(min(_BLOCK, n)) for n in carrier.shape]
+    window = [filters.windows.blackmanharris(min(_BLOCK, n)) for n in carrier.shape]
     whole, part = (np.zeros([len(each) for each in window]) for _ in range(2))
     for rows, columns in _blocks(carrier.shape):
         pixels = read(rows, columns)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from clsas.core import validate
-from clsas.core.extras import needed
+from clsas.core.fourier import fourier_series
 from clsas.core.lines import RangeLines
 from clsas.signal.compression import Window, band_window
 
@@ -20,6 +20,7 @@ _LEAST_OF_BAND = 1e-2
 # Phase error, cycles, at the ends of a line up to which one common frequency step is used. The
 # error of the image is then -104 dB.
 _EQUAL_STEPS = 1e-6
+_SUM_ERROR_DB = -180.0  # of sums over frequencies with steps of their own
 
 
 def from_phase_history(
@@ -225,14 +226,6 @@ def _at_own_steps(
     spectrum: NDArray[np.complex128], ratio: NDArray[np.float64], length: int
 ) -> NDArray[np.complex128]:
     """Return the sum over m of S_m exp(j 2 pi m n ratio/length), n from -length/2, per channel."""
-    with needed("channels that differ in their frequency step"):
-        import finufft  # slow to import
-
-    number = np.arange(length) - length // 2
-    middle = spectrum.shape[1] // 2
-    result = np.empty((len(spectrum), length), np.complex128)
-    for row, (line, scale) in enumerate(zip(spectrum, ratio, strict=True)):
-        angle = 2 * np.pi * scale / length * number
-        result[row] = finufft.nufft1d2(angle, line, isign=1, eps=1e-9, nthreads=1)
-        result[row] *= np.exp(1j * middle * angle)
-    return result
+    cycles = (np.arange(length) - length // 2) / length
+    rows = zip(spectrum, ratio, strict=True)
+    return np.stack([fourier_series(line, scale * cycles, _SUM_ERROR_DB) for line, scale in rows])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import reprs, validate
-from clsas.core.extras import needed
+from clsas.core.fourier import fourier_series
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,13 +89,7 @@ class Replica:
         TypeError, ValueError
             If the frequencies are not finite real numbers.
         """
-        with needed("pulse compression"):
-            import finufft  # slow to import
-
         frequency = validate.array("frequency_hz", frequency_hz, np.float64, None)
         cycles = frequency.ravel() / self.sample_rate_hz
-        # The transform counts from the middle of the samples.
-        middle = len(self.samples) // 2
-        values = finufft.nufft1d2(2 * np.pi * cycles, self.samples, isign=-1, eps=1e-13, nthreads=1)
-        values = values * np.exp(-2j * np.pi * cycles * middle) / self.sample_rate_hz
+        values = fourier_series(self.samples, -cycles) / self.sample_rate_hz
         return np.reshape(values, frequency.shape)

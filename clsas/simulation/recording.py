@@ -10,7 +10,7 @@ if these are requested (Ødegaard 2004, equations [8]-[12]). Delays are not roun
 90 samples (to -145 dB), so an echo has an end, and a receive window that cuts the echo keeps
 exactly the part inside. A pulse without energy beyond 0.4 sample rates passes G unchanged.
 
-The sum is one type-1 non-uniform FFT per channel (finufft). Scenes that tolerate an error of their
+The sum is one type-1 non-uniform FFT per channel. Scenes that tolerate an error of their
 echoes are summed only to that accuracy, in single precision where that suffices.
 """
 
@@ -20,13 +20,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import finufft
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
 from clsas.core import validate
-from clsas.core.fourier import EDGE_PRODUCT, smooth_edge
+from clsas.core.fourier import EDGE_PRODUCT, gridding_gain, smooth_edge, spread, taps_for
 from clsas.core.threads import in_threads
 from clsas.simulation.paths import Paths, PointBlock
 from clsas.simulation.patterns import interpolation_matrix
@@ -50,6 +49,8 @@ FOCUSED = (
 )
 
 _SUM_ERROR = 1e-9  # relative, of the non-uniform FFT
+_OVERSAMPLING = 2.0  # of its grid; 1.5 needs more taps and takes as long
+_SINGLE_ERROR = 1e-4  # from which float32 suffices, which rounds phases and sines to 1e-6
 _PATTERN_ERROR = 1e-6  # of interpolated element patterns
 _TOUCHING_M = 1e-9  # a point closer to an element than this has no direction
 
@@ -179,9 +180,7 @@ def _add(
         if not in_front.all():
             amplitudes, legs = amplitudes[in_front], legs.at(in_front)
             sines = [sine[in_front] for sine in sines]
-    # float32 rounds an angle by up to 2^-25 of its value, which becomes a phase error that is
-    # largest at the frequency modes/2.
-    single = block.error >= 1e-7 * modes
+    single = block.error >= _SINGLE_ERROR
     real = np.float32 if single else np.float64
     cycles = carrier_hz * legs.delay_s
     phase = (-2 * np.pi * (cycles - np.rint(cycles))).astype(real)
@@ -191,21 +190,23 @@ def _add(
     if paths.spreading:
         strengths /= legs.spreading_m2
     turns = windows.rate_hz / modes * (legs.delay_s - windows.start_s[channel])
-    angles = (2 * np.pi * (turns - np.rint(turns))).astype(real)
+    turns -= np.rint(turns)
     accuracy = max(_SUM_ERROR, block.error / 10)
     if patterns is None:
-        total += _point_sum(angles, strengths, modes, accuracy)
+        total += _point_sum(turns, strengths, modes, accuracy)
         return legs.focused
     sines = [sine.astype(real) for sine in sines]
     gains = patterns.gains(sines, max(_PATTERN_ERROR, block.error), real, modes)
-    sums = _point_sum(angles, strengths * gains, modes, accuracy).reshape(len(gains), modes)
+    sums = _point_sum(turns, strengths * gains, modes, accuracy).reshape(len(gains), modes)
     total += np.sum(interpolation_matrix(len(gains), modes) * sums, axis=0)
     return legs.focused
 
 
-def _point_sum(angles: NDArray, strengths: NDArray, modes: int, error: float) -> NDArray:
-    """Return sum_s strengths_s exp(-j k angle_s) for the frequencies k of the FFT."""
-    # The frequency grid fits into caches, so sorting the points would save no time.
-    return finufft.nufft1d1(
-        angles, strengths, modes, eps=error, isign=-1, modeord=1, nthreads=1, spread_sort=0
-    )
+def _point_sum(turns: NDArray, strengths: NDArray, modes: int, error: float) -> NDArray:
+    """Return sum_s strengths_s exp(-j 2 pi k turns_s) for the frequencies k of the FFT."""
+    taps = taps_for(20 * math.log10(error), _OVERSAMPLING)
+    length = fft.next_fast_len(math.ceil(_OVERSAMPLING * modes) + taps)
+    grid = spread(strengths.T, turns * length, length, taps, _OVERSAMPLING)
+    frequency = np.rint(fft.fftfreq(modes, 1 / modes)).astype(int)
+    gain = gridding_gain(frequency / length, taps, _OVERSAMPLING)
+    return fft.fft(grid.T, overwrite_x=True)[..., frequency % length] / gain

@@ -15,7 +15,7 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
-from clsas.exact import reference
+from clsas.trials import reference
 from clsas.forming import SceneImager, form_exactly
 from clsas.imaging import Imager, factorize, plan
 from clsas.interferometry.heights import heights

@@ -34,7 +34,6 @@ ROOMS = ("factorized", "aperture", "exact")
 MODULES = ("clsas.signal.spectrum", "clsas.signal.ambiguity", "clsas.signal.interpolation")
 FIXED = {
     "clsas.factorized.measured_costs": "measures costs, which are given for the cases",
-    "clsas.exact.reference": "the float64 reference",
     "clsas.exact.wavenumber": "another imager, which has its own tool",
     "STACK HELD CHUNK GUARD PHASES _GROUP _FINE VECTOR_ROOM": "layouts that kernels share",
     "_FAR _LARGEST_HALF _LEAST_HALF _MOST_EXPONENT _SINGULAR": "limits of number formats",

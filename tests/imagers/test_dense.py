@@ -13,7 +13,7 @@ from tiers import also, thinned
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
-from clsas.exact import reference
+from clsas.trials import reference
 from clsas.factorized import planner
 from clsas.factorized.costs import Costs
 from clsas.factorized.sectors import Roots

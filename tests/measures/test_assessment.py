@@ -13,7 +13,6 @@ from clsas import SoundSpeed
 from clsas.cli import main
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
-from clsas.exact.reference import ideal
 from clsas.files import scene_files as config
 from clsas.measures.assessment import assess, survey_lines
 from clsas.measures.effects import BEAM, ENDS, KEYS, PATTERN, SINGLE, SWAY, track_errors_m
@@ -21,6 +20,7 @@ from clsas.signal.refraction import homogeneous
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import APART, MOTION, REFRACTION, RELIEF
 from clsas.sonar.system import line_array
+from clsas.trials.reference import ideal
 
 CHANNELS, CARRIER, STEP = 96, 300e3, 0.012
 APERTURE = along_x(CHANNELS, 0.02)

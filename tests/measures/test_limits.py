@@ -8,12 +8,12 @@ from tiers import few
 
 import clsas
 from clsas.core.geometry import bistatic_range_m
-from clsas.exact.reference import ideal
 from clsas.files.scene_files import built_in_scene, parse_scene
 from clsas.measures.limits_result import LABELS, Limit
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.system import Pulse, Sonar, line_array
 from clsas.sonar.track import Pointing, Track
+from clsas.trials.reference import ideal
 
 WIDE = Sonar.thesis_wide_beam()
 TRACK = Track.straight([-2.376, 0, 0], [2, 0, 0], 10, 0.264)

@@ -10,8 +10,7 @@ from peers import codes, compare, focus, scenes, workers
 from studies import focusing
 
 import clsas
-from clsas.exact import reference
-from clsas.trials import cases
+from clsas.trials import cases, reference
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 

@@ -7,8 +7,8 @@ from cases import noise
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.wavelengths import band_wavelength_m
-from clsas.exact.reference import ideal
 from clsas.signal.spectrum import measure_spectrum
+from clsas.trials.reference import ideal
 
 GRID = Grid.plane((-0.1, 0.1, 3), (15, 15.2, 3))
 

@@ -25,9 +25,9 @@ from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.exact import reference
+from clsas.trials import reference
 from clsas.exact.groups import Groups
-from clsas.exact.reference import ideal
+from clsas.trials.reference import ideal
 from clsas.exact.tiles import Tiles
 from clsas.forming import form_exactly
 from clsas.imaging import backproject

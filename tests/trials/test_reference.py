@@ -11,8 +11,8 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
-from clsas.exact import reference
-from clsas.exact.reference import ideal, sampled_error_db
+from clsas.trials import reference
+from clsas.trials.reference import ideal, sampled_error_db
 
 TRACK = along_x(7, 0.3)
 RX = TRACK + np.array([0.1, -0.05, 0.2])

@@ -9,7 +9,7 @@ import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.core import validate
-from clsas.core.extras import needed
+from clsas.core.fourier import fourier_series
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
@@ -26,7 +26,7 @@ Progress = Callable[[int, int], None] | None
 Evaluate = Callable[[NDArray[np.complex128], NDArray[np.float64]], NDArray[np.complex128]]
 
 _PAIRS_AT_ONCE = 1 << 18  # pairs of points and channels; bounds memory
-_SUM_ERROR = 1e-12  # relative error of non-uniform FFTs
+_SUM_ERROR_DB = -240.0  # of non-uniform FFTs
 
 
 def same_interpolator(
@@ -116,9 +116,6 @@ def ideal(
     spectral centre of the lines. A line does not contribute to points beyond its first or last
     sample. A type-2 non-uniform FFT evaluates the polynomial to twelve digits.
     """
-    with needed("the float64 reference"):
-        import finufft  # slow to import
-
     validate.instance("lines", lines, RangeLines)
     padding = validate.count("padding", padding, least=0)
     if beam is not None:
@@ -126,19 +123,18 @@ def ideal(
     modes = scipy.fft.next_fast_len(lines.length + 2 * padding)
     shift = round(measure_spectrum(lines).centre * modes)
 
+    lowest = shift - modes // 2  # frequency, cycles per `modes` samples
+
     def evaluate(
         samples: NDArray[np.complex128], position: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
-        # Frequencies of finufft start at -(modes // 2), so the spectrum is rolled to be about its
-        # centre.
-        spectra = np.roll(scipy.fft.fft(samples, modes, axis=1), modes // 2 - shift, axis=1)
+        spectra = np.roll(scipy.fft.fft(samples, modes, axis=1), -lowest, axis=1) / modes
         values = np.zeros(position.shape, np.complex128)
-        for line, spectrum, at in zip(values, spectra / modes, position, strict=True):
+        for line, spectrum, at in zip(values, spectra, position, strict=True):
             inside = (at >= 0) & (at <= lines.length - 1)
-            angle = 2 * np.pi / modes * at[inside]
-            line[inside] = np.exp(1j * shift * angle) * finufft.nufft1d2(
-                angle, spectrum, isign=1, eps=_SUM_ERROR, nthreads=1
-            )
+            cycles = at[inside] / modes
+            turns = np.exp(2j * np.pi * lowest * cycles)
+            line[inside] = turns * fourier_series(spectrum, cycles, _SUM_ERROR_DB)
         return values
 
     return _sum_channels(lines, points_m, evaluate, progress, beam)
