@@ -9,8 +9,8 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
-from clsas.trials.reference import ideal
 from clsas.signal.spectrum import Spectrum
+from clsas.trials.reference import ideal
 
 SPARE = 160  # samples of a line beyond what a grid needs, at each end
 TAPER = 100  # of them, over how many a line fades

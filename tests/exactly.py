@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from clsas.trials import reference
 from clsas.exact.decision import ACCURACY_DB, Decision, decide
 from clsas.factorized.sampled import SampledRoots, SampledScene
 from clsas.forming import SceneImager
 from clsas.opencl.device import Device, open_device
 from clsas.plans.factorization import ExactImage
 from clsas.scene import Scene
+from clsas.trials import reference
 
 
 @dataclass(frozen=True, eq=False)

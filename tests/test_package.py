@@ -16,7 +16,7 @@ from clsas import cli
 from clsas.core import extras
 
 ROOT = Path(__file__).parents[1]
-SLOW = ("matplotlib", "h5py", "pyopencl", "scipy", "pydantic", "rich", "numpy", "finufft")
+SLOW = ("matplotlib", "h5py", "pyopencl", "scipy", "pydantic", "rich", "numpy")
 
 
 def imported(program):

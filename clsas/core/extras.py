@@ -8,21 +8,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 _FILES = ("h5py>=3.16", "pydantic>=2.6")
-_SIGNAL = ("finufft>=2.2",)
 _XARRAY = ("xarray>=2024.11",)
 _MOSAIC = (*_FILES, *_XARRAY, "zarr>=3.1.3", "numcodecs>=0.16.6,!=0.17.0")
 
 PACKAGES = {
     "pocl": ("pyopencl[pocl]>=2024.2.7",),
     "files": _FILES,
-    "signal": _SIGNAL,
     "plot": ("matplotlib>=3.10",),
     "xarray": _XARRAY,
-    "cli": (*_FILES, *_SIGNAL, "click>=8.1", "rich>=13.0"),
+    "cli": (*_FILES, "click>=8.1", "rich>=13.0"),
     "mosaic": _MOSAIC,
     "workers": (*_MOSAIC, "distributed>=2024.1", "cryptography>=42.0"),
     "maps": (*_FILES, *_XARRAY, "rasterio>=1.4", "pyproj>=3.6", "h5netcdf>=1.3"),
-    "radar": (*_FILES, *_SIGNAL, "sarkit>=1.8", "lxml>=5.1"),
+    "radar": (*_FILES, "sarkit>=1.8", "lxml>=5.1"),
     "water": ("gsw>=3.6",),
 }
 """Requirements of every extra, as `pyproject.toml` has them. Extras that others include come first:

@@ -39,7 +39,7 @@ _USED = 0.4  # half the band over the sample rate at which images are interpolat
 # Rows and columns of new pixels as large as those of the image that are interpolated at once. They
 # take 200 MB with the pixels around them and their spectrum: a plain choice.
 _WINDOW = 1024
-_SUM_ERROR_DB, _OVERSAMPLING = -90.0, 1.5  # of the non-uniform FFT: plain choices
+_SUM_ERROR_DB, _OVERSAMPLING = -80.0, 1.5  # of the non-uniform FFT: plain choices
 _PLACES_AT_ONCE = 1 << 13  # whose weights fit into caches
 
 

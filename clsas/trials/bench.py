@@ -15,7 +15,6 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
-from clsas.trials import reference
 from clsas.forming import SceneImager, form_exactly
 from clsas.imaging import Imager, factorize, plan
 from clsas.interferometry.heights import heights
@@ -29,7 +28,7 @@ from clsas.plans.factorization import ExactImage
 from clsas.scene import Scene
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
-from clsas.trials import cases, dunes, wreck
+from clsas.trials import cases, dunes, reference, wreck
 from clsas.trials.cases import Case
 from clsas.trials.dense_cases import DenseCase
 

@@ -9,8 +9,8 @@ from cases import APERTURE, CARRIER, STEP, along_x, noise, patch, thesis_lines
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
-from clsas.trials.reference import ideal
 from clsas.imaging import backproject
+from clsas.trials.reference import ideal
 
 
 @pytest.fixture

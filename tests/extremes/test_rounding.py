@@ -26,8 +26,8 @@ from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.trials.reference import sampled_error_db
 from clsas.imaging import backproject
+from clsas.trials.reference import sampled_error_db
 
 FAR = np.array([1e7, -1e7, 1e7])
 

@@ -13,7 +13,6 @@ from tiers import also, thinned
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
-from clsas.trials import reference
 from clsas.factorized import planner
 from clsas.factorized.costs import Costs
 from clsas.factorized.sectors import Roots
@@ -22,6 +21,7 @@ from clsas.imaging import backproject, factorize, plan
 from clsas.opencl.device import open_device
 from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
+from clsas.trials import reference
 from clsas.trials.selftest import driven
 
 SHAPES = {"passes": "strips"}  # sheets otherwise

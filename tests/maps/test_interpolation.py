@@ -15,7 +15,6 @@ from clsas.maps.collection import Collection
 from clsas.maps.interpolation import MOST_ERROR_DB, margin_of
 
 rasterio = pytest.importorskip("rasterio")
-pytest.importorskip("finufft")
 
 CARRIER_HZ, BAND_HZ = 100e3, 30e3
 MIDDLE_M = np.array([0.0, 35.0, 0.0])

@@ -25,9 +25,7 @@ from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.trials import reference
 from clsas.exact.groups import Groups
-from clsas.trials.reference import ideal
 from clsas.exact.tiles import Tiles
 from clsas.forming import form_exactly
 from clsas.imaging import backproject
@@ -36,6 +34,8 @@ from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import INTERVALS, SHAPES, BeamWindow
 from clsas.sonar.system import element_pattern
 from clsas.sonar.visibility import BeamTrack, sines
+from clsas.trials import reference
+from clsas.trials.reference import ideal
 
 FINE = {"taps": 8, "upsampling": 4}
 X = (1.0, 0, 0)

@@ -16,12 +16,12 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
-from clsas.trials.reference import ideal
 from clsas.imaging import backproject
 from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.simplify import APART, MOTION, RELIEF, SHARE, leave_out, simplify
 from clsas.sonar.visibility import sines
+from clsas.trials.reference import ideal
 
 LEAST_PIXELS = 1 << 15
 CHANNELS, CARRIER, STEP = 96, 300e3, 0.012
