@@ -181,7 +181,7 @@ IMAGERS = (
         (narrow,),
         asked_db=-75,
         same_db=-110,
-        linear_db=-100,
+        linear_db=-80,
         is_quick=False,
     ),
     Imager(
@@ -191,7 +191,7 @@ IMAGERS = (
         (near,),
         asked_db=-60,
         same_db=-110,
-        linear_db=-100,
+        linear_db=-80,
         known=near,
     ),
 )
