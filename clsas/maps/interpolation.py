@@ -144,7 +144,7 @@ class Interpolation:
 
 
 def _interpolated(
-    base: NDArray[np.complex64],
+    base: NDArray[np.complexfloating],
     row: NDArray[np.float64],
     column: NDArray[np.float64],
     guard: float,
