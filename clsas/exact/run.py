@@ -18,6 +18,7 @@ from clsas.exact.decision import Decision
 from clsas.exact.groups import Groups, GroupsEstimate
 from clsas.exact.kept import Kept
 from clsas.exact.lookup import lookup_options
+from clsas.exact.references import geometry_rows, references_of
 from clsas.exact.tiles import Tiles, item_pixels
 from clsas.opencl.buffers import (
     Slot,
@@ -34,7 +35,6 @@ from clsas.opencl.device import Device
 from clsas.scene import Scene
 from clsas.sonar.beam import INTERVALS, normalising
 from clsas.sonar.visibility import BeamTrack
-from clsas.exact.references import geometry_rows, references_of
 
 _SINE_ROUNDING = 1e-5  # upper bound on the device's rounding error of a sine
 _MOST_KEPT_BYTES = 256 << 20  # of references that are kept: more than 20 million of 12 bytes each
