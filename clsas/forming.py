@@ -12,7 +12,7 @@ from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
 from clsas.exact.decision import ACCURACY_DB, Decision, decide
 from clsas.exact.run import ExactImager
-from clsas.factorized.imager import FactorizedImager
+from clsas.factorized.stages import FactorizedImager
 from clsas.opencl.device import Device, open_device
 from clsas.plans.factorization import ExactImage
 from clsas.plans.plan import Plan

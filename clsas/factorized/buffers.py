@@ -1,4 +1,4 @@
-"""Names, shapes and types of the buffers of a factorized image on a device.
+"""The buffers of a factorized image on a device: their names, shapes and types.
 
 The run allocates from these lists, and the prediction of memory adds them up.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pyopencl as cl
 
 from clsas.opencl.buffers import (
     GUARD,
@@ -25,6 +26,27 @@ CHUNK = 32
 """Channels that the stage kernel adds up before it writes its sums, and resumes unfinished ones."""
 LEAST_BATCH = 2
 """Least number of roots formed together if memory allows, so that commands are few."""
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceLines:
+    """Upsampled lines on a device.
+
+    Attributes
+    ----------
+    samples : Buffer
+    pitch : int
+        Samples from one line to the next.
+    half_precision : bool
+        True if these lines, and those that stages form, are in half precision.
+    gain : float
+        Power of 2 by which the samples were multiplied; 1 in single precision.
+    """
+
+    samples: cl.Buffer
+    pitch: int
+    half_precision: bool
+    gain: float
 
 
 @dataclass(frozen=True)

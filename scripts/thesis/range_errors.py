@@ -11,7 +11,7 @@ from clsas.aperture.nearest import NearestBeams
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.surface import surface_of
 from clsas.core.wavelengths import band_wavelength_m
-from clsas.factorized.tree import Division
+from clsas.factorized.tree import Tree
 
 
 def range_errors_m(
@@ -49,14 +49,14 @@ def range_errors_m(
         raise ValueError("plan must be made with stages, for these lines and a plane grid")
     order = np.argsort(track.coordinate, kind="stable")
     ends_m = lines.tx_m[order], lines.rx_m[order]
-    division = Division(surface_of(grid), image.sides)
+    tree = Tree(surface_of(grid), image.sides)
     index = np.asarray(pixels, np.int64)
-    points_m = np.asarray(grid.origin_m) + index @ division.surface.steps_m
+    points_m = np.asarray(grid.origin_m) + index @ tree.surface.steps_m
     errors_m = -pairwise_range_m(points_m, *ends_m)
     position_m = lines.phase_centres_m[order]
     beam = np.arange(lines.channels)  # the beam of the previous stage to which each channel belongs
     for level, (side, beams) in enumerate(zip(image.sides, image.aperture.factors, strict=True)):
-        centres_m = division.centres_m(level, index // side * side)
+        centres_m = tree.centres_m(level, index // side * side)
         errors_m += pairwise_range_m(centres_m, *ends_m)[:, beam]
         starts = np.arange(0, len(position_m), beams)
         counts = np.diff(np.append(starts, len(position_m)))

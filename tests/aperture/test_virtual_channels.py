@@ -6,7 +6,7 @@ from clsas.aperture.mean_track import mean_track
 from clsas.aperture.phase_rates import PhaseBoxes, cycles_per_extent
 from clsas.aperture.virtual_channels import interpolated_channels, summed_neighbours
 from clsas.core.surface import surface_of
-from clsas.factorized.tree import Division
+from clsas.factorized.tree import Tree
 from clsas.signal import interpolation
 from clsas.signal.spectrum import Spectrum
 
@@ -20,11 +20,11 @@ def interpolation_error_db(case, side, aperture, root=(128, 128)):
     rng = np.random.default_rng(0)
     track, centres_m = mean_track(lines, WAVELENGTH), lines.phase_centres_m
     surface = surface_of(grid)
-    division = Division(surface, (root, side))
+    tree = Tree(surface, (root, side))
     cycles_per_m = lines.carrier_cycles_per_m
     wrong = total = 0.0
-    for corner in division.roots[:2]:
-        middle_m = division.centres_m(0, corner[None])
+    for corner in tree.roots[:2]:
+        middle_m = tree.centres_m(0, corner[None])
         coordinate, _ = track.apparent_coordinates(middle_m, centres_m)
         extents, nearest_m = surface.extents(root), surface.radius_m(side)
         boxes = PhaseBoxes(surface.steps_m, middle_m, extents, cycles_per_m, nearest_m)
@@ -33,7 +33,7 @@ def interpolation_error_db(case, side, aperture, root=(128, 128)):
         virtual = interpolated_channels(track, rate, coordinate, aperture)
         between = virtual.base[0][:, None] + np.arange(virtual.taps)
         of_channels = track.positions_m(virtual.ordered(coordinate)[0])
-        leaves_m = division.centres_m(1, division.corners(1, corner[None]))[0]
+        leaves_m = tree.centres_m(1, tree.corners(1, corner[None]))[0]
         for centre_m in leaves_m[rng.integers(0, len(leaves_m), 6)]:
             offset = rng.integers(0, side, (40, 2)) - (np.array(side) - 1) / 2
             pixels_m = centre_m + offset @ np.stack([grid.row_step_m, grid.column_step_m])

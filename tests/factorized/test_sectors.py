@@ -4,9 +4,7 @@ from factorizing import BEAMS, EXACT_IS_SLOW, around, over, swaying
 from studies.scaling import scaled
 
 from clsas.core.geometry import bistatic_range_m
-from clsas.factorized import visibility
-from clsas.factorized.geometry import geometry_of
-from clsas.factorized.sectors import references, sector_of
+from clsas.factorized.tree import geometry_of, references, sector_of, visible_stretches
 from clsas.forming import scene_of_plan
 from clsas.imaging import plan
 from clsas.sonar.beam import BeamWindow
@@ -53,7 +51,7 @@ def any_track(request, wide):
 
 @pytest.mark.slow
 def test_channels_are_as_many_as_planned(wide, wide_plan):
-    sector = sector_of(wide, wide.division.roots)
+    sector = sector_of(wide, 0, len(wide.roots))
     for level, (need, stage) in enumerate(zip(sector.needs, wide_plan.stages, strict=False)):
         formed = (need.end - need.begin).sum() * stage.samples
         assert 0.75 <= formed / stage.operations <= 1.35, f"stage {level + 1}"
@@ -63,7 +61,7 @@ def test_channels_are_as_many_as_planned(wide, wide_plan):
 
 @pytest.mark.slow
 def test_both_ends_of_the_track_are_alike(wide):
-    sector = sector_of(wide, wide.division.roots)
+    sector = sector_of(wide, 0, len(wide.roots))
     need = sector.needs[-1]
     x_m = sector.root_m[:, 0]
     assert abs(x_m.min() + x_m.max()) < 0.1  # metres; pixels are symmetric except for half a pixel
@@ -72,7 +70,7 @@ def test_both_ends_of_the_track_are_alike(wide):
 
 
 def test_virtual_channels_without_contributions_are_not_formed(wide):
-    sector = sector_of(wide, wide.division.roots)
+    sector = sector_of(wide, 0, len(wide.roots))
     counts = np.full(len(sector.roots), sector.coordinate.shape[1])
     for virtual, need in zip(sector.virtual, sector.needs, strict=True):
         assert (need.end <= counts[:, None]).all()
@@ -83,10 +81,10 @@ def test_virtual_channels_without_contributions_are_not_formed(wide):
 @pytest.mark.exhaustive
 def test_subimages_use_what_their_parents_have(any_track):
     wide = any_track
-    sector = sector_of(wide, wide.division.roots)
+    sector = sector_of(wide, 0, len(wide.roots))
     for level in range(1, len(sector.needs)):
         need, above = sector.needs[level], sector.needs[level - 1]
-        parents, used = wide.division.parents(level), need.end > need.begin
+        parents, used = wide.tree.parents(level), need.end > need.begin
         assert (need.begin >= above.first[:, parents])[used].all()
         assert (need.end <= above.last[:, parents])[used].all()
 
@@ -99,10 +97,9 @@ def test_roots_do_not_depend_on_those_prepared_beside_them(case):
     lines, grid = case()
     chosen = plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW)
     geometry = geometry_of(scene_of_plan(lines, grid, chosen), chosen.factorization)
-    roots = geometry.division.roots
-    together = sector_of(geometry, roots)
-    for index in range(len(roots)):
-        alone = sector_of(geometry, roots[index : index + 1])
+    together = sector_of(geometry, 0, len(geometry.roots))
+    for index in range(len(geometry.roots)):
+        alone = sector_of(geometry, index, index + 1)
         for level, virtual in enumerate(alone.virtual):
             count = int(alone.needs[level].last.max())
             for name in ("first", "last", "begin", "end"):
@@ -119,16 +116,16 @@ def test_leaves_are_visible_from_wherever_they_are_alone():
     lines, grid = beside()
     chosen = plan(lines, grid, tolerance_db=-40, beam=HANN, costs=EXACT_IS_SLOW)
     geometry = geometry_of(scene_of_plan(lines, grid, chosen), chosen.factorization)
-    sector = sector_of(geometry, geometry.division.roots)
+    sector = sector_of(geometry, 0, len(geometry.roots))
     last = len(chosen.sides) - 1
-    leaves = geometry.division.corners(last, sector.roots)
+    leaves = geometry.tree.corners(last, sector.roots)
     half_m = np.array(chosen.sides[-1])[:, None] / 2
     half_m = half_m * [grid.row_step_m, grid.column_step_m]
-    start, stop = visibility.visible_stretches(
+    start, stop = visible_stretches(
         chosen.factorization.limits,
         geometry.track,
         geometry.along,
-        geometry.division.centres_m(last, leaves),
+        geometry.tree.centres_m(last, leaves),
         half_m,
     )
     need, coordinate = sector.needs[-1], sector.virtual[-1].coordinate
@@ -151,7 +148,7 @@ def test_leaves_are_visible_from_wherever_they_are_alone():
 @pytest.mark.slow
 def test_references_are_ranges_and_phases(wide):
     lines, resampling = wide.lines, wide.factorization.resampling
-    sector = sector_of(wide, wide.division.roots[:3])
+    sector = sector_of(wide, 0, 3)
     found = references(wide, sector)
     line = found["order"]
     range_m = bistatic_range_m(sector.root_m[:, None], lines.tx_m[line], lines.rx_m[line])

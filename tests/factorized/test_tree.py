@@ -5,11 +5,11 @@ from factorizing import BEAMS, EXACT_IS_SLOW, around, over
 
 from clsas.core.image_error import relative_error_db
 from clsas.core.surface import surface_of
-from clsas.factorized import sectors, tree
-from clsas.factorized.tree import Division
+from clsas.factorized import tree
+from clsas.factorized.tree import Tree, channel_ranges
 from clsas.imaging import backproject, factorize, plan
 
-# Division
+# Subimages
 
 
 SIDES = ((64, 48), (32, 16), (16, 4))
@@ -17,33 +17,33 @@ SIDES = ((64, 48), (32, 16), (16, 4))
 
 @pytest.mark.parametrize("shape", [(1, 1), (64, 48), (65, 49), (200, 100)])
 def test_roots_hold_every_pixel_once(shape):
-    division = Division(surface_of(around(0, 40, shape=shape)), SIDES)
+    subimages = Tree(surface_of(around(0, 40, shape=shape)), SIDES)
     count = np.zeros((384, 384), int)
-    for row, column in division.roots:
+    for row, column in subimages.roots:
         count[row : row + 64, column : column + 48] += 1
     assert (count[: shape[0], : shape[1]] == 1).all()
-    assert all(row < shape[0] and column < shape[1] for row, column in division.roots)
+    assert all(row < shape[0] and column < shape[1] for row, column in subimages.roots)
 
 
 @pytest.mark.parametrize("level", [1, 2])
 def test_subimages_fill_their_parents(level):
-    division = Division(surface_of(around(0, 40, shape=(150, 100))), SIDES)
-    parents = division.corners(level - 1, division.roots)
-    children = division.corners(level, division.roots)
-    inside = children - parents[:, division.parents(level)]
+    subimages = Tree(surface_of(around(0, 40, shape=(150, 100))), SIDES)
+    parents = subimages.corners(level - 1, subimages.roots)
+    children = subimages.corners(level, subimages.roots)
+    inside = children - parents[:, subimages.parents(level)]
     assert (inside >= 0).all()
     assert (inside + SIDES[level] <= SIDES[level - 1]).all()
     for root in children:
-        assert len({tuple(corner) for corner in root}) == division.per_root(level)
+        assert len({tuple(corner) for corner in root}) == subimages.per_root(level)
 
 
 def test_a_centre_is_the_mean_of_pixels():
     grid = around(3, 40, shape=(150, 100))
     surface = surface_of(grid)
-    division = Division(surface, SIDES)
-    corners = division.corners(1, division.roots[:1])
+    subimages = Tree(surface, SIDES)
+    corners = subimages.corners(1, subimages.roots[:1])
     positions_m = grid.positions_m()
-    for (row, column), centre_m in zip(corners[0], division.centres_m(1, corners)[0], strict=True):
+    for (row, column), centre_m in zip(corners[0], subimages.centres_m(1, corners)[0], strict=True):
         pixels_m = positions_m[row : row + 32, column : column + 16].reshape(-1, 3)
         np.testing.assert_allclose(centre_m, pixels_m.mean(axis=0), atol=1e-12)
         assert np.linalg.norm(pixels_m - centre_m, axis=1).max() <= surface.radius_m(SIDES[1])
@@ -56,17 +56,17 @@ def with_all_channels(lines, grid, chosen):
     """Return an image whose subimages combine all channels and have all virtual channels."""
     formed, needed = [], []
 
-    def widened(division, virtual, coordinate, visible, inside):
+    def widened(subimages, virtual, coordinate, visible, inside):
         everywhere = np.full_like(visible[0], -np.inf), np.full_like(visible[1], np.inf)
         every_leaf = np.ones_like(inside)
-        found = tree.channel_ranges(division, virtual, coordinate, everywhere, every_leaf)
-        usual = tree.channel_ranges(division, virtual, coordinate, visible, inside)
+        found = channel_ranges(subimages, virtual, coordinate, everywhere, every_leaf)
+        usual = channel_ranges(subimages, virtual, coordinate, visible, inside)
         for counts, ranges in ((formed, found), (needed, usual)):
             counts += [(each.last - each.first).sum() for each in ranges]
         return found
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sectors, "channel_ranges", widened)
+        patch.setattr(tree, "channel_ranges", widened)
         image = factorize(lines, grid, chosen)
     assert sum(formed) > sum(needed) > 0
     return image

@@ -7,8 +7,7 @@ from clsas.aperture.beam_directions import directions_of
 from clsas.aperture.mean_track import mean_track
 from clsas.core.grid import Grid
 from clsas.core.surface import surface_of
-from clsas.factorized import visibility
-from clsas.factorized.tree import Division
+from clsas.factorized.tree import Tree, visible_stretches
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import Visibility
 
@@ -19,12 +18,10 @@ def test_a_visible_stretch_holds_every_channel_of_some_weight():
     lines, grid = made(near)
     beam, track = BEAMS[0], mean_track(lines, WAVELENGTH)
     along = directions_of(beam, beam.directions(lines), track).along
-    division = Division(surface_of(grid), ((16, 16),))
-    corners = division.roots[:, None]
+    tree = Tree(surface_of(grid), ((16, 16),))
+    corners = tree.roots[:, None]
     half_m = 8 * np.stack([grid.row_step_m, grid.column_step_m])
-    begin, end = visibility.visible_stretches(
-        beam.limits, track, along, division.centres_m(0, corners), half_m
-    )
+    begin, end = visible_stretches(beam.limits, track, along, tree.centres_m(0, corners), half_m)
     coordinate = np.linspace(0, 1, 2001)
     position_m = track.positions_m(coordinate)
     direction = directions_of(beam, beam.directions(lines), track).at(coordinate)
@@ -49,7 +46,7 @@ def test_visible_stretches_are_hardly_longer_than_they_must_be(beam, range_m):
     random = np.random.default_rng(1)
     centres_m = random.uniform((-70, 0.7 * range_m, -1), (70, 1.3 * range_m, 1), (300, 3))
     half_m = range_m * np.array([[0.02, 0, 0], [0, 0.01, 0]])
-    begin, end = visibility.visible_stretches(beam.limits, track, along, centres_m, half_m)
+    begin, end = visible_stretches(beam.limits, track, along, centres_m, half_m)
     coordinate = np.linspace(0, 1, 4001)
     spacing = 2 / 256  # of the samples at which visibility is evaluated
     direction = directions_of(beam, beam.directions(lines), track).at(coordinate)

@@ -15,7 +15,7 @@ from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.factorized import planner
 from clsas.factorized.costs import Costs
-from clsas.factorized.sectors import Roots
+from clsas.factorized.tree import geometry_of, sector_of
 from clsas.forming import scene_of_plan
 from clsas.imaging import backproject, factorize, plan
 from clsas.opencl.device import open_device
@@ -205,11 +205,10 @@ def test_virtual_channels_are_as_many_as_predicted(name):
     """Filters of each stage extend past the ends of those before: these count too."""
     lines, grid = scene(name)
     chosen = planned(name, -60, depth=3)
-    roots = Roots(scene_of_plan(lines, grid, chosen), chosen.factorization)
-    sectors = list(roots.sectors(100, 100))
+    geometry = geometry_of(scene_of_plan(lines, grid, chosen), chosen.factorization)
+    sector = sector_of(geometry, 0, len(geometry.roots))
     for level, stage in enumerate(chosen.stages[:-1]):
-        needs = [sector.needs[level] for sector in sectors]
-        counts = np.concatenate([(need.last - need.first).ravel() for need in needs])
+        counts = sector.needs[level].last - sector.needs[level].first
         assert stage.channels == pytest.approx(counts[counts > 0].mean(), rel=0.25)
 
 

@@ -13,7 +13,7 @@ from tiers import thinned
 import clsas
 from clsas.core.image_error import relative_error_db
 from clsas.core.validate import ClsasWarning
-from clsas.factorized import sectors
+from clsas.factorized import stages
 from clsas.forming import form, scene_of_plan
 from clsas.imaging import backproject, plan
 
@@ -77,13 +77,13 @@ def test_geometry_is_found_once(scene, monkeypatch):
     lines, grid = made(scene)
     chosen, found = planned(lines, grid), []
     for name in ("sector_of", "geometry_of", "leaf_groups"):
-        real = getattr(sectors, name)
+        real = getattr(stages, name)
 
         def counted(*arguments, real=real, name=name):
             found.append(name)
             return real(*arguments)
 
-        monkeypatch.setattr(sectors, name, counted)
+        monkeypatch.setattr(stages, name, counted)
     imager = clsas.Imager(lines, grid, chosen)
     imager(lines)
     first = len(found)
