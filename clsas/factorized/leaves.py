@@ -46,7 +46,7 @@ Finish = Callable[[], int]
 
 
 class _Leaves:
-    """What leaves on a plane and off a plane share.
+    """Lines, tables and kernel options of leaves, on a plane and off a plane alike.
 
     Parameters
     ----------
@@ -212,58 +212,12 @@ class PlaneLeaves(_Leaves):
         samples : Buffer
             The lines.
         """
-        geometry, surface, factorization = (
-            self.geometry,
-            self.geometry.surface,
-            self.geometry.factorization,
-        )
-        roots, (height, width), tile = (
-            sector.roots[batch],
-            factorization.sides[0],
-            factorization.tile,
-        )
-        count = len(roots) * self.per_root
-
-        # Ranges are expanded about the centres of tiles.
-        stride = sector.most_channels[-1]
-        most = max(stride, factorization.most_channels[-1])
-        if not self.aligned:
-            self.work.wait()  # the host fills references, which the batch before may still read
-        buffers = self.work.make(tile_buffers(count, most, geometry.beam, aligned=self.aligned))
-        expanded = {
-            "ranges": tables["ranges"],
-            "first_range": batch.start * self.per_root,
-            "expansions": buffers["expansions"],
-            "channel_pitch": channel_pitch(stride),
-        }
-        row_m, column_m = surface.steps_m[:2]
-        drift = [geometry.drift @ step * geometry.samples_per_m for step in (column_m, row_m)]
-        self.device.run(
-            self.expand,
-            (channel_pitch(stride) // self.device.info.width, count),
-            **expanded,
-            geometry=tables["geometry"],
-            geometry_pitch=sector.virtual[-1].coordinate.size + VECTOR_ROOM,
-            centres=self.centres,
-            column_step=column_m,
-            row_step=row_m,
-            samples_per_m=geometry.samples_per_m,
-            drift=drift,
-            **self.beam_table.origin,
-            wait_for=tables.filled,
-        )
-
-        # The positions of the centres in the lines.
-        references: dict[str, Any] = {"centre_sample": self.level.centre}
-        if not self.aligned:
-            references = {}
-            for name, values in self._references(sector, batch).items():
-                self.work.fill(name, values)
-                references[f"reference_{name}"] = buffers[name]
+        roots, shape = sector.roots[batch], self.image.shape
+        (height, width), tile = self.geometry.tree.sides[0], self.geometry.factorization.tile
+        expanded = self._expand(tables, sector, batch)
 
         # Pixels go into the image itself if the device shares it with the host, and no root extends
         # past it.
-        shape = surface.plane.shape
         if self.shared is not None and bool(np.all(roots + (height, width) <= shape)):
             corners, columns = roots, shape[1]
             pixels: dict[str, Any] = {"pixels": self.shared}
@@ -272,10 +226,9 @@ class PlaneLeaves(_Leaves):
             pixels = self._pixels(tables, len(roots) * height * width)
         event = self.device.run(
             self.backproject,
-            (tile[0] * tile[1] // item_pixels(self.device.info.width), count),
+            (tile[0] * tile[1] // item_pixels(self.device.info.width), len(roots) * self.per_root),
             lines=samples,
             **expanded,
-            **references,
             **self.arguments,
             **pixels,
             corners=self.device.upload(corners.astype(np.int32)),
@@ -286,7 +239,7 @@ class PlaneLeaves(_Leaves):
             wait_for=self.work.filled,
         )
 
-        # Other pixels are read into the image, and all sums of weights beside it.
+        # Other pixels are read into the image, and sums of weights beside it.
         parts, ready = self._parts(roots), [event]
         weights: list[NDArray[np.complex64]] = []
         if pixels["pixels"] is not self.shared:
@@ -303,38 +256,57 @@ class PlaneLeaves(_Leaves):
         def finish() -> int:
             cl.wait_for_events(ready)
             for part, each in zip(parts, weights, strict=bool(weights)):
-                self.image[part] *= normalising(each.real, geometry.lines.channels)
+                self.image[part] *= normalising(each.real, self.geometry.lines.channels)
             return sum(self.image[part].size for part in parts)
 
         return finish
 
-    def blank(self, sector: Sector, batch: slice) -> Finish:
-        """Return a function that sets the pixels of roots without visible channels to 0."""
+    def _expand(self, tables: Slot, sector: Sector, batch: slice) -> dict[str, Any]:
+        """Start expanding ranges about the centres of tiles; return what backprojection needs."""
+        geometry, work = self.geometry, self.work
+        channels, tiles = sector.most_channels[-1], (batch.stop - batch.start) * self.per_root
+        pitch = channel_pitch(channels)
+        # Most tiles fit from the start, as in the stages.
+        most = max(channels, geometry.factorization.most_channels[-1])
+        if not self.aligned:
+            work.wait()  # the host fills references, which the batch before may still read
+        buffers = work.make(tile_buffers(tiles, most, geometry.beam, aligned=self.aligned))
+        expanded: dict[str, Any] = {
+            "ranges": tables["ranges"],
+            "first_range": batch.start * self.per_root,
+            "expansions": buffers["expansions"],
+            "channel_pitch": pitch,
+        }
+        row_m, column_m = geometry.surface.steps_m[:2]
+        drift_m = [geometry.drift @ step for step in (column_m, row_m)]
+        self.device.run(
+            self.expand,
+            (pitch // self.device.info.width, tiles),
+            **expanded,
+            geometry=tables["geometry"],
+            geometry_pitch=sector.virtual[-1].coordinate.size + VECTOR_ROOM,
+            centres=self.centres,
+            column_step=column_m,
+            row_step=row_m,
+            samples_per_m=geometry.samples_per_m,
+            drift=[each * geometry.samples_per_m for each in drift_m],
+            **self.beam_table.origin,
+            wait_for=tables.filled,
+        )
+        if self.aligned:
+            return expanded | {"centre_sample": self.level.centre}
+        for name, values in self._references(sector, batch, pitch).items():
+            work.fill(name, values)
+            expanded[f"reference_{name}"] = buffers[name]
+        return expanded
 
-        def finish() -> int:
-            parts = self._parts(sector.roots[batch])
-            for part in parts:
-                self.image[part] = 0
-            return sum(self.image[part].size for part in parts)
-
-        return finish
-
-    def complete(self) -> None:
-        """Hand the image back to the host, once all pixels are finished."""
-        if self.shared is not None:
-            flags, shape = cl.map_flags.READ, self.image.shape
-            mapped: Any = cl.enqueue_map_buffer(  # PyOpenCL's types are of NumPy's older ones
-                self.device.queue, self.shared, flags, 0, shape, np.dtype(np.complex64)
-            )[0]
-            mapped.base.release()
-
-    def _references(self, sector: Sector, batch: slice) -> dict[str, NDArray]:
+    def _references(self, sector: Sector, batch: slice, pitch: int) -> dict[str, NDArray]:
         """Return where the lines of leaves have the centres of tiles, by names of kernel tables.
 
-        Arrays are [roots, tiles, channels]: the sample, the position between samples, and the phase
+        Arrays are [roots, tiles, pitch]: the sample, the position between samples, and the phase
         in cycles.
         """
-        geometry, pitch = self.geometry, channel_pitch(sector.most_channels[-1])
+        geometry = self.geometry
         shape = batch.stop - batch.start, self.per_root, pitch
         sample = np.full(shape, self.level.centre, np.int32)
         fraction, phase = np.zeros((2, *shape), np.float32)
@@ -381,6 +353,26 @@ class PlaneLeaves(_Leaves):
             region=(8 * columns, rows, 1),
             is_blocking=False,
         )
+
+    def blank(self, sector: Sector, batch: slice) -> Finish:
+        """Return a function that sets the pixels of roots without visible channels to 0."""
+
+        def finish() -> int:
+            parts = self._parts(sector.roots[batch])
+            for part in parts:
+                self.image[part] = 0
+            return sum(self.image[part].size for part in parts)
+
+        return finish
+
+    def complete(self) -> None:
+        """Hand the image back to the host, once all pixels are finished."""
+        if self.shared is not None:
+            flags, shape = cl.map_flags.READ, self.image.shape
+            mapped: Any = cl.enqueue_map_buffer(  # PyOpenCL's types are of NumPy's older ones
+                self.device.queue, self.shared, flags, 0, shape, np.dtype(np.complex64)
+            )[0]
+            mapped.base.release()
 
 
 class SurfaceLeaves(_Leaves):

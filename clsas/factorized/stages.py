@@ -105,15 +105,16 @@ class FactorizedImager:
         uploaded = upload(
             lines, factorization, device, largest, half_precision=factorization.half_precision
         )
-        uploaded = in_enough_precision(uploaded, lines, self.geometry, device, largest)
+        geometry = self.geometry
+        uploaded = in_enough_precision(uploaded, lines, geometry, device, largest)
         work = Slot(device)
-        stages = Stages(uploaded, self.geometry, device, work)
+        stages = Stages(uploaded, geometry, device, work)
         leaves = self._leaves(uploaded, work, pixels)
 
         # Some batches are under way at a time, so that the device works on one sector while the
         # host prepares the next. It fills one set of tables while the other is in use.
         at_once = factorization.roots_at_once
-        batches = -(-len(self.geometry.roots) // at_once)
+        batches = -(-len(geometry.roots) // at_once)
         ahead = math.ceil(_AHEAD_S * batches / max(self.plan.predicted_seconds, 1e-9))
         under_way: deque[Finish] = deque()
         slots = itertools.cycle([Slot(device), Slot(device)])
@@ -146,7 +147,7 @@ class FactorizedImager:
 
     @cached_property
     def geometry(self) -> Geometry:
-        """What all subimages share."""
+        """Mean track, channels and subimages, found when they are first needed."""
         return geometry_of(self.scene, self.plan.factorization, self._track)
 
     def _leaves(

@@ -3,9 +3,10 @@
 Factorized backprojection is fast because subimages form a tree, along which subapertures merge from
 stage to stage (McCorkle and Rofheart 1996; Yegulalp 1999; Ulander, Hellsten and Stenström 2003).
 
-`geometry_of` finds what all subimages share. The roots of the tree are then prepared sector by
-sector: `sector_of` places the virtual channels of their subimages and finds the channels that each
-combines, and `references` computes by how much the raw channels are shifted and turned.
+`geometry_of` finds what all subimages share: the mean track and its channels. The roots of the tree
+are then prepared in sectors. `sector_of` places the virtual channels of their subimages and finds
+the channels that each combines. `references` computes by how much the raw channels are shifted and
+turned.
 """
 
 from __future__ import annotations
@@ -112,9 +113,10 @@ class Tree:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """What all subimages share, in float64, with channels in the order of the track.
+    """Mean track, channels and subimages of an image, in float64.
 
-    It contains no samples, and serves any number of images.
+    Channels are in the order of the track. The geometry contains no samples, and serves any number
+    of images.
 
     Attributes
     ----------
@@ -372,7 +374,7 @@ def sector_of(geometry: Geometry, first: int, stop: int) -> Sector:
     if isinstance(aperture, NearestBeams):
         virtual = aperture.virtual_channels(coordinate, geometry.phase_centres_m[channels])
     else:
-        virtual = _interpolated_channels(geometry, roots, root_m, coordinate, across)
+        virtual = _virtual_channels(geometry, roots, root_m, coordinate, across)
 
     if visible is not None:
         needs = channel_ranges(tree, virtual, coordinate, visible, inside)
@@ -471,7 +473,7 @@ def visible_stretches(
     return begin.reshape(shape), end.reshape(shape)
 
 
-def _interpolated_channels(
+def _virtual_channels(
     geometry: Geometry,
     roots: NDArray[np.int64],
     root_m: NDArray[np.float64],
