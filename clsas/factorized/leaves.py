@@ -45,7 +45,7 @@ Finish = Callable[[], int]
 """Waits for pixels, puts them in place, and returns their number."""
 
 
-class _Leaves:
+class Leaves:
     """Lines, tables and kernel options of leaves, on a plane and off a plane alike.
 
     Parameters
@@ -161,8 +161,8 @@ class _Leaves:
         return found
 
 
-class PlaneLeaves(_Leaves):
-    """Leaves on a plane, formed in tiles; the parameters are those of `_Leaves`."""
+class PlaneLeaves(Leaves):
+    """Leaves on a plane, formed in tiles; the parameters are those of `Leaves`."""
 
     def __init__(
         self,
@@ -375,10 +375,10 @@ class PlaneLeaves(_Leaves):
             mapped.base.release()
 
 
-class SurfaceLeaves(_Leaves):
+class SurfaceLeaves(Leaves):
     """Leaves off a plane, formed in groups of points.
 
-    The methods are those of `PlaneLeaves`, and the parameters those of `_Leaves` and the groups of
+    The methods are those of `PlaneLeaves`, and the parameters those of `Leaves` and the groups of
     points in all leaves.
     """
 

@@ -385,12 +385,12 @@ class Stages:
             per_root = tree.per_root(level)
             children = (batch.stop - batch.start) * per_root
             parents: dict[str, Any]
-            if level == 0:
+            if level == 0:  # raw lines, with the shifts and phases that the host has computed
                 kernel = self._first
                 names = ("order", "start", "nu", "cycles", *(["ramp"] if geometry.ramps else []))
                 parents = {"parent_pitch": self.lines.pitch}
                 parents |= {name: tables[name] for name in names}
-            else:
+            else:  # lines of virtual channels, which the kernel aligns by their positions
                 kernel, before = self._later, self.levels[level - 1]
                 parents = {
                     "parent_pitch": before.pitch,
