@@ -6,13 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from clsas.aperture.mean_track import MeanTrack
 from clsas.core.grid import Grid
 from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
 from clsas.exact.decision import ACCURACY_DB, Decision, decide
 from clsas.exact.run import ExactImager
 from clsas.factorized.stages import FactorizedImager
+from clsas.factorized.track import MeanTrack
 from clsas.opencl.device import Device, open_device
 from clsas.plans.factorization import ExactImage
 from clsas.plans.plan import Plan

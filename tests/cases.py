@@ -205,11 +205,10 @@ def burst(index, centre):
     return np.exp(-(((index - 60) / 8) ** 2) + 2j * np.pi * centre * (index - 60))
 
 
-def track_lines(tx, rx=None):
-    """Lines of one sample from antennas [channels, 3]."""
-    return RangeLines(
-        np.ones((len(tx), 1), complex), 1.0, 1.0, tx, tx if rx is None else rx, 1e5, 1500.0
-    )
+def track_lines(tx, rx=None, velocity=None):
+    """Lines of one sample from antennas [channels, 3], of which only the geometry matters."""
+    rx = tx if rx is None else rx
+    return RangeLines(np.ones((len(tx), 1), complex), 1.0, 1.0, tx, rx, 1e5, 1500.0, velocity)
 
 
 def lattice(seabed):

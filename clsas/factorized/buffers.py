@@ -106,7 +106,7 @@ def stage_tables(
     ramps : bool
         True if phases of raw channels are turned along their lines.
     bands : int
-        Number of bands of channels; see `clsas.aperture.virtual_channels.Bands`.
+        Number of bands of channels; see `clsas.factorized.virtual_channels.Bands`.
     rows : bool
         True if virtual channels lie in the rows of a sheet.
     """

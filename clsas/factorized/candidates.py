@@ -15,11 +15,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from clsas.aperture.filters import FilterRates, Filters, steering_spectrum
-from clsas.aperture.interpolated import InterpolatedAperture
-from clsas.aperture.mean_track import MeanTrack
-from clsas.aperture.nearest import NearestBeams
-from clsas.aperture.predicted_channels import BEAM_MARGIN
 from clsas.core.decibels import in_db, power
 from clsas.factorized.buffers import Level
 from clsas.factorized.costs import (
@@ -44,6 +39,7 @@ from clsas.factorized.errors import (
     with_arithmetic,
     with_range_filters,
 )
+from clsas.factorized.filters import FilterRates, Filters, steering_spectrum
 from clsas.factorized.sampled import SampledRoots, Side
 from clsas.factorized.search import (
     Allowed,
@@ -55,6 +51,9 @@ from clsas.factorized.search import (
     root_limits,
     search,
 )
+from clsas.factorized.track import MeanTrack
+from clsas.factorized.tree import BEAM_MARGIN
+from clsas.factorized.virtual_channels import InterpolatedAperture, NearestBeams
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
 from clsas.opencl.device import Device
@@ -597,7 +596,7 @@ class StageChannels:
         Upper bound on the virtual channels of a subimage.
     bands : int
         Upper bound on the bands of the stage's channels; see
-        `clsas.aperture.virtual_channels.Bands`.
+        `clsas.factorized.virtual_channels.Bands`.
     """
 
     used: float

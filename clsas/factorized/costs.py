@@ -404,7 +404,7 @@ class BufferSizes:
     most_channels : tuple of int
         Largest number of virtual channels of a subimage, stage by stage.
     bands : tuple of int
-        Bands of channels, stage by stage: see `clsas.aperture.virtual_channels.Bands`.
+        Bands of channels, stage by stage: see `clsas.factorized.virtual_channels.Bands`.
     line_pitch : int
         Samples of an upsampled line including the zeros around it.
     filtered : bool

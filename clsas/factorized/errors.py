@@ -18,14 +18,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial.distance import cdist
 
-from clsas.aperture.beam_directions import interpolated_directions
-from clsas.aperture.dense_channels import strip_channels
-from clsas.aperture.filters import LONGEST_UPSAMPLING_SHARE, UPSAMPLING_SHARE, Filters, Gain
-from clsas.aperture.interpolated import InterpolatedAperture
-from clsas.aperture.mean_track import MeanTrack
-from clsas.aperture.nearest import NearestBeams, stage_errors_m
-from clsas.aperture.phase_rates import drift, stretches
-from clsas.aperture.virtual_channels import VirtualChannels, interpolated_channels
 from clsas.core.decibels import in_db, power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.wavelengths import wavelength_m
@@ -33,6 +25,8 @@ from clsas.exact.layout import ROUNDING
 from clsas.exact.lookup import lookup_room
 from clsas.exact.tiles import BLOCKS
 from clsas.factorized.buffers import CHUNK
+from clsas.factorized.filters import LONGEST_UPSAMPLING_SHARE, UPSAMPLING_SHARE, Filters, Gain
+from clsas.factorized.phase_rates import drift, interpolated_directions, stretches
 from clsas.factorized.sampled import (
     SAMPLED_PIXELS,
     SPREAD_POINTS,
@@ -42,6 +36,15 @@ from clsas.factorized.sampled import (
     mean_over_relief,
     pixels_m,
     sampled_channels,
+)
+from clsas.factorized.track import MeanTrack
+from clsas.factorized.virtual_channels import (
+    InterpolatedAperture,
+    NearestBeams,
+    VirtualChannels,
+    interpolated_channels,
+    stage_errors_m,
+    strip_channels,
 )
 from clsas.opencl import phases
 from clsas.opencl.device import Device

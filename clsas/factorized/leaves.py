@@ -15,7 +15,6 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from clsas.aperture.mean_track import MeanTrack
 from clsas.core.decibels import power
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.wavelengths import wavelength_m
@@ -23,6 +22,7 @@ from clsas.exact.groups import Groups, groups_within
 from clsas.exact.lookup import lookup_options
 from clsas.exact.tiles import BLOCKS, Tiles, item_pixels
 from clsas.factorized.buffers import DeviceLines, Level, leaf_tables, tile_buffers
+from clsas.factorized.track import MeanTrack
 from clsas.factorized.tree import Geometry, Sector, Tree
 from clsas.opencl.buffers import (
     VECTOR_ROOM,

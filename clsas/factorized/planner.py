@@ -13,10 +13,6 @@ from dataclasses import InitVar, dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.aperture.dense_tracks import shapes_after
-from clsas.aperture.filters import ALIGN_TAPS
-from clsas.aperture.mean_track import MeanTrack
-from clsas.aperture.nearest import NearestBeams
 from clsas.core import validate
 from clsas.core.decibels import in_db, power
 from clsas.core.digests import grid_digest, lines_digest
@@ -42,8 +38,11 @@ from clsas.factorized.costs import (
     worthwhile,
 )
 from clsas.factorized.errors import MARGIN_DB, leaf_error, nearest_errors
+from clsas.factorized.filters import ALIGN_TAPS
 from clsas.factorized.sampled import SampledRoots, SampledScene, Side, points_at_m
 from clsas.factorized.search import MOST_STAGES, Allowed
+from clsas.factorized.track import MeanTrack, shapes_after
+from clsas.factorized.virtual_channels import NearestBeams
 from clsas.opencl.device import Device
 from clsas.plans.factorization import UNREACHED
 from clsas.plans.plan import Plan

@@ -16,16 +16,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from clsas.aperture.beam_directions import BeamDirections, beam_rate, directions_of
-from clsas.aperture.dense_channels import SheetRates, sheet_beam_rates, sheet_rates
-from clsas.aperture.dense_tracks import Shape, mean_track_of, simplest_track
-from clsas.aperture.mean_track import MeanTrack
-from clsas.aperture.phase_rates import PhaseBoxes, cycles_per_extent, drift, own_drift, stretches
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import SAMPLED_CHANNELS, antennas_of, some_channels, steepest
 from clsas.core.surface import LEAST_SIDE, Surface, within_roots
 from clsas.core.wavelengths import band_wavelength_m, cycles_per_m_at
 from clsas.exact.tiles import item_pixels
+from clsas.factorized.phase_rates import (
+    BeamDirections,
+    PhaseBoxes,
+    SheetRates,
+    beam_rate,
+    cycles_per_extent,
+    directions_of,
+    drift,
+    own_drift,
+    sheet_beam_rates,
+    sheet_rates,
+    stretches,
+)
+from clsas.factorized.track import MeanTrack, Shape, mean_track_of, simplest_track
 from clsas.scene import Scene
 from clsas.signal.spectrum import OUTSIDE, Spectrum, shares_of_bins
 from clsas.sonar.visibility import Visibility
@@ -67,7 +76,7 @@ class SampledScene:
     ----------
     scene : Scene
     shape : str
-        Shape of the mean track: see `clsas.aperture.dense_tracks`.
+        Shape of the mean track: see `clsas.factorized.track`.
     track : MeanTrack
     channel_power : float64 [channels]
         Energy of each line over the mean of all.
@@ -250,7 +259,7 @@ class SampledScene:
 
     @cached_property
     def own_drift(self) -> NDArray[np.float64] | None:
-        """`clsas.aperture.phase_rates.own_drift` of the lines."""
+        """`clsas.factorized.phase_rates.own_drift` of the lines."""
         return own_drift(self.scene.lines)
 
     @cached_property

@@ -16,13 +16,6 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.aperture.filters import (
-    ALIGN_TAPS,
-    APERTURE_TAPS,
-    LONGEST_UPSAMPLING_SHARE,
-    FilterRates,
-    choose,
-)
 from clsas.core.decibels import in_db, power
 from clsas.factorized.buffers import LEAST_BATCH
 from clsas.factorized.costs import (
@@ -34,6 +27,13 @@ from clsas.factorized.costs import (
     upsampling,
 )
 from clsas.factorized.errors import leaf_error, root_error
+from clsas.factorized.filters import (
+    ALIGN_TAPS,
+    APERTURE_TAPS,
+    LONGEST_UPSAMPLING_SHARE,
+    FilterRates,
+    choose,
+)
 from clsas.factorized.sampled import (
     INNER_POINTS,
     SampledRoots,

@@ -14,9 +14,6 @@ import pyopencl as cl
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from clsas.aperture.dense_channels import band_table
-from clsas.aperture.mean_track import MeanTrack
-from clsas.aperture.virtual_channels import VirtualChannels
 from clsas.core import validate
 from clsas.core.lines import RangeLines, some_channels
 from clsas.factorized.buffers import (
@@ -28,7 +25,9 @@ from clsas.factorized.buffers import (
     stage_tables,
 )
 from clsas.factorized.leaves import Finish, LeafGroups, PlaneLeaves, SurfaceLeaves, leaf_groups
+from clsas.factorized.track import MeanTrack
 from clsas.factorized.tree import Geometry, Sector, geometry_of, references, sector_of
+from clsas.factorized.virtual_channels import VirtualChannels, band_table
 from clsas.opencl import phases
 from clsas.opencl.buffers import (
     GUARD,

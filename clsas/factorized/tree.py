@@ -18,24 +18,38 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from clsas.aperture.beam_directions import BeamDirections, beam_rate, directions_of
-from clsas.aperture.dense_channels import all_channels, sheet_beam_rates, sheet_rates
-from clsas.aperture.dense_tracks import mean_track_of
-from clsas.aperture.mean_track import MeanTrack
-from clsas.aperture.nearest import NearestBeams
-from clsas.aperture.phase_rates import PhaseBoxes, cycles_per_extent, drift, own_drift, stretches
-from clsas.aperture.predicted_channels import BEAM_MARGIN
-from clsas.aperture.virtual_channels import ChannelRanges, VirtualChannels
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import RangeLines, antennas_of
 from clsas.core.surface import Surface
 from clsas.core.wavelengths import band_wavelength_m
+from clsas.factorized.phase_rates import (
+    BeamDirections,
+    PhaseBoxes,
+    beam_rate,
+    cycles_per_extent,
+    directions_of,
+    drift,
+    own_drift,
+    sheet_beam_rates,
+    sheet_rates,
+    stretches,
+)
+from clsas.factorized.track import MeanTrack, mean_track_of
+from clsas.factorized.virtual_channels import (
+    ChannelRanges,
+    NearestBeams,
+    VirtualChannels,
+    all_channels,
+)
 from clsas.opencl.buffers import MARGIN
 from clsas.plans.factorization import Factorization
 from clsas.scene import Scene
 from clsas.signal.ray_corrections import Corrections
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import BeamTrack, Boxes
+
+BEAM_MARGIN = 1 / 16
+"""Width by which finding visibility for a rectangle of leaves may widen it, in beam widths."""
 
 _ON_TRACK = 1e-4  # distance within which channels lie on the mean track, wavelengths
 _SHAPES = {"strips": "several passes", "sheet": "a sheet"}
@@ -141,7 +155,7 @@ class Geometry:
         Directions of the beam at `track.samples`.
     drift : float64 [3]
     own_drift : float64 [channels, 3] or None
-        See `clsas.aperture.phase_rates`.
+        See `clsas.factorized.phase_rates`.
     samples_per_m, cycles_per_m : float
         Samples and phase of the upsampled lines per metre of range from the mean track.
     nearest_m : float or None

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
 
-from clsas.aperture.interpolated import InterpolatedAperture
-from clsas.aperture.nearest import NearestBeams
 from clsas.core import reprs, validate
 from clsas.core.fields import CONFIG, Constraint, Count, Number, Size, Whole
+from clsas.factorized.virtual_channels import InterpolatedAperture, NearestBeams
 from clsas.opencl.phases import TERMS
 from clsas.signal.fields import RangeFilter, StoredResampling, StoredUpsampler
 from clsas.signal.interpolation import PHASES

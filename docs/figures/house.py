@@ -16,14 +16,14 @@ FLOORS = (
     (
         (
             ("exact", "the image, whatever it takes\ntiles, backprojection"),
-            ("aperture", "which few stand for many?\nmean track, virtual channels"),
+            ("aperture", "how many channels?\nnumbers of virtual channels"),
             ("plans", "what has been decided?\nplan, predictions"),
         ),
         RED,
     ),
     (
         (
-            ("factorized", "the image, fast\ngeometry, tree, stages, leaves"),
+            ("factorized", "the image, fast\ntrack, virtual channels, tree, leaves"),
             ("planning", "which way is the fastest?\nwork, errors, search, Imager"),
         ),
         RED,

@@ -24,7 +24,7 @@ from range_errors import range_errors_m
 
 import clsas
 from clsas import plot
-from clsas.aperture import nearest
+from clsas.factorized.virtual_channels import stage_errors_m
 from clsas.opencl.device import Device, open_device
 from clsas.sonar.system import Sonar, line_array
 
@@ -139,7 +139,7 @@ class Scene:
 
     def error_m(self, stages: Stages) -> float:
         """Return the range error of all stages according to [45], metres."""
-        return sum(nearest.stage_errors_m(stages, SPACING_M, self.side_m, NEAREST_M))
+        return sum(stage_errors_m(stages, SPACING_M, self.side_m, NEAREST_M))
 
     def range_errors_m(self, plan: clsas.Plan) -> np.ndarray:
         """Return range errors of a nearest-beam plan at 1016 pixels, metres [pixels, channels]."""

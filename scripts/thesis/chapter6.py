@@ -20,7 +20,7 @@ from range_errors import range_errors_m
 from scipy.spatial.distance import cdist
 
 import clsas
-from clsas.aperture import nearest
+from clsas.factorized.virtual_channels import stage_errors_m
 from clsas.opencl.device import Device, open_device
 from clsas.simulation import seabeds
 from clsas.sonar.visibility import BeamTrack, Boxes, sines
@@ -118,7 +118,7 @@ class Scene:
         nearest_m = cdist(edges_m, self.lines.phase_centres_m).min()
         steps_m = np.linalg.norm([grid.row_step_m, grid.column_step_m], axis=1)
         side_m = float(np.max(steps_m * grid.shape))
-        return sum(nearest.stage_errors_m(STAGES, SPACING_M, side_m, nearest_m))
+        return sum(stage_errors_m(STAGES, SPACING_M, side_m, nearest_m))
 
     def measured_m(self, patch: clsas.Patch) -> float:
         """Return the largest range error of a patch over visible channels, metres."""

@@ -6,7 +6,7 @@ from functools import partial
 import chapter5
 from chapter5 import equal_stages
 
-from clsas.aperture import nearest
+from clsas.factorized import virtual_channels
 
 TOLERANCES_DB = (-20, -30, -40, -50)
 
@@ -25,7 +25,7 @@ def main() -> None:
         elif key in range(2, 8):
             samples = [stage.samples for stage in plans[key].stages[:-1]]
             counts = (scene.lines.channels, samples, scene.grid.size)
-            stages, operations = key, sum(nearest.operations(equal_stages(key), *counts))
+            stages, operations = key, sum(virtual_channels.operations(equal_stages(key), *counts))
         else:
             stages = len(plans[key].sides) + 1
             operations = sum(s.operations for s in plans[key].stages) or exact

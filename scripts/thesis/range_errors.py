@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import clsas
-from clsas.aperture.mean_track import mean_track
-from clsas.aperture.nearest import NearestBeams
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.surface import surface_of
 from clsas.core.wavelengths import band_wavelength_m
+from clsas.factorized.track import mean_track
 from clsas.factorized.tree import Tree
+from clsas.factorized.virtual_channels import NearestBeams
 
 
 def range_errors_m(

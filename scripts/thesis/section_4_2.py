@@ -8,7 +8,7 @@ import chapter5
 from chapter5 import equal_stages
 
 import clsas
-from clsas.aperture import nearest
+from clsas.factorized.virtual_channels import operations
 
 STAGES = [(2, 2), (2, 2)]
 SAMPLES = (3757, 1990)  # samples that the subimages of the thesis need in its two stages
@@ -94,8 +94,8 @@ def main() -> None:
     plan = scene.plan(stages=STAGES)
     own = [stage.samples for stage in plan.stages[:-1]]
     cases = {
-        "thesis's": (nearest.operations(STAGES, 640, SAMPLES, 1024**2), 640 * 1024**2),
-        "here": (nearest.operations(STAGES, channels, own, pixels), channels * pixels),
+        "thesis's": (operations(STAGES, 640, SAMPLES, 1024**2), 640 * 1024**2),
+        "here": (operations(STAGES, channels, own, pixels), channels * pixels),
     }
     forms = {"worked example": list, "eq. 44 as printed": as_printed}
     counted = {

@@ -17,7 +17,7 @@ from chapter5 import ACCURACY_DB, WAVELENGTH_M, decibels
 from range_errors import range_errors_m
 
 import clsas
-from clsas.aperture import nearest
+from clsas.factorized.virtual_channels import stage_errors_m
 from clsas.opencl.device import Device
 
 CHANNELS, SPACING_M = 1024, WAVELENGTH_M / 4
@@ -103,7 +103,7 @@ def main() -> None:
             if not 2 <= beams // ratio <= scene.pixels // LEAST_PIXELS:
                 continue
             sum_m = beams * SPACING_M
-            formula_m = sum(nearest.stage_errors_m(stages, SPACING_M, scene.side_m, NEAREST_M))
+            formula_m = sum(stage_errors_m(stages, SPACING_M, scene.side_m, NEAREST_M))
             errors_m = scene.range_errors_m(stages)
             largest_m = float(np.abs(errors_m).max())
             rms_m = math.sqrt(np.mean(errors_m**2))

@@ -13,13 +13,13 @@ from factorizing import (
     swaying,
 )
 
-from clsas.aperture.beam_directions import directions_of
-from clsas.aperture.mean_track import mean_track
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.surface import surface_of
 from clsas.factorized import tree
+from clsas.factorized.phase_rates import directions_of
+from clsas.factorized.track import mean_track
 from clsas.factorized.tree import (
     Tree,
     channel_ranges,

@@ -38,6 +38,63 @@ _RATES = tuple(np.geomspace(1, 12, 16))  # at which errors of filters are evalua
 _BINS = 64  # frequencies of the spectrum of steering functions
 
 
+def choose(
+    spectrum: Spectrum,
+    align_taps: int,
+    aperture_taps: int,
+    stages: int,
+    most_db: float,
+    dimensions: int = 1,
+) -> FilterRates | None:
+    """Return the lowest rates at which the joint error of all interpolations is at most `most_db`.
+
+    There are two interpolations in each stage, three on a sheet, and one at the end. The result is
+    None if no rate suffices.
+    """
+    each_db = most_db - 10 * math.log10(stages + interpolations(stages, dimensions) + 1)
+    upsampling = _least_rate(align_taps, each_db, spectrum, "scatter_db")
+    oversampling = _least_rate(aperture_taps, each_db, _STEERING, "error_db")
+    if upsampling is None or oversampling is None:
+        return None
+    final_taps = next(
+        taps
+        for taps in _FINAL_TAPS
+        if (_least_rate(taps, each_db, spectrum, "scatter_db") or math.inf) <= upsampling
+    )
+    return FilterRates(align_taps, upsampling, aperture_taps, oversampling, final_taps, dimensions)
+
+
+def interpolations(stages: int, dimensions: int) -> float:
+    """Return the factor by which the error power of the aperture filter counts in an image.
+
+    Errors of interpolation along and across a sheet have the same sign at low phase rates, so that
+    in part they add up themselves, rather than their powers.
+    """
+    if dimensions == 1:
+        return stages
+    count = stages * dimensions
+    return count * (1 + _COHERENT * (count - 1))
+
+
+def _least_rate(taps: int, most_db: float, spectrum: Spectrum, error: str) -> float | None:
+    """Return the lowest rate at which a filter's error is at most `most_db`, or None."""
+    errors = _errors_db(taps, error, spectrum.frequency.tobytes(), spectrum.power.tobytes())
+    if errors[-1] > most_db:
+        return None
+    if errors[0] <= most_db:
+        return _RATES[0]
+    # Errors fall with the rate. The margins for rounding are half a per cent and a tenth of a dB.
+    return 1.005 * float(np.exp(np.interp(0.1 - most_db, -errors, np.log(_RATES))))
+
+
+@functools.lru_cache(maxsize=64)
+def _errors_db(taps: int, error: str, frequency: bytes, power: bytes) -> NDArray[np.float64]:
+    """Return the errors of filters at all `_RATES`."""
+    spectrum = Spectrum(0.0, np.frombuffer(frequency), np.frombuffer(power))
+    found = [getattr(each, error) for each in interpolation.designs(taps, _RATES, spectrum)]
+    return np.minimum.accumulate(found)
+
+
 def steering_spectrum(of_highest: ArrayLike = 1.0, power: ArrayLike = 1.0) -> Spectrum:
     """Return the power spectrum of steering functions along the aperture.
 
@@ -62,38 +119,6 @@ def steering_spectrum(of_highest: ArrayLike = 1.0, power: ArrayLike = 1.0) -> Sp
 
 
 _STEERING = steering_spectrum()
-
-
-@dataclass(frozen=True)
-class Filters:
-    """Designed filters.
-
-    Attributes
-    ----------
-    align : Interpolator
-        Filter in range, of the stages.
-    aperture : Interpolator
-        Filter along the aperture.
-    final : Interpolator
-        Filter in range, of the last backprojection.
-    """
-
-    align: Interpolator
-    aperture: Interpolator
-    final: Interpolator
-
-
-def edges_gain(align: Interpolator, final: Interpolator, stages: int, ratio: float) -> Gain:
-    """Return the gain that compensates for range interpolation of lines upsampled by a ratio.
-
-    Interpolation attenuates the edges of the band a little in every stage.
-    """
-
-    def gain(frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-        response = align.response(frequency / ratio) ** stages * final.response(frequency / ratio)
-        return np.clip(1 / response, 1 / _MOST_GAIN, _MOST_GAIN)
-
-    return gain
 
 
 @dataclass(frozen=True)
@@ -159,59 +184,33 @@ class FilterRates:
         return Filters(align, aperture, final)
 
 
-def interpolations(stages: int, dimensions: int) -> float:
-    """Return the factor by which the error power of the aperture filter counts in an image.
+@dataclass(frozen=True)
+class Filters:
+    """Designed filters.
 
-    Errors of interpolation along and across a sheet have the same sign at low phase rates, so that
-    in part they add up themselves, rather than their powers.
+    Attributes
+    ----------
+    align : Interpolator
+        Filter in range, of the stages.
+    aperture : Interpolator
+        Filter along the aperture.
+    final : Interpolator
+        Filter in range, of the last backprojection.
     """
-    if dimensions == 1:
-        return stages
-    count = stages * dimensions
-    return count * (1 + _COHERENT * (count - 1))
+
+    align: Interpolator
+    aperture: Interpolator
+    final: Interpolator
 
 
-def choose(
-    spectrum: Spectrum,
-    align_taps: int,
-    aperture_taps: int,
-    stages: int,
-    most_db: float,
-    dimensions: int = 1,
-) -> FilterRates | None:
-    """Return the lowest rates at which the joint error of all interpolations is at most `most_db`.
+def edges_gain(align: Interpolator, final: Interpolator, stages: int, ratio: float) -> Gain:
+    """Return the gain that compensates for range interpolation of lines upsampled by a ratio.
 
-    There are two interpolations in each stage, three on a sheet, and one at the end. The result is
-    None if no rate suffices.
+    Interpolation attenuates the edges of the band a little in every stage.
     """
-    each_db = most_db - 10 * math.log10(stages + interpolations(stages, dimensions) + 1)
-    upsampling = _least_rate(align_taps, each_db, spectrum, "scatter_db")
-    oversampling = _least_rate(aperture_taps, each_db, _STEERING, "error_db")
-    if upsampling is None or oversampling is None:
-        return None
-    final_taps = next(
-        taps
-        for taps in _FINAL_TAPS
-        if (_least_rate(taps, each_db, spectrum, "scatter_db") or math.inf) <= upsampling
-    )
-    return FilterRates(align_taps, upsampling, aperture_taps, oversampling, final_taps, dimensions)
 
+    def gain(frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+        response = align.response(frequency / ratio) ** stages * final.response(frequency / ratio)
+        return np.clip(1 / response, 1 / _MOST_GAIN, _MOST_GAIN)
 
-def _least_rate(taps: int, most_db: float, spectrum: Spectrum, error: str) -> float | None:
-    """Return the lowest rate at which a filter's error is at most `most_db`, or None."""
-    key = spectrum.frequency.tobytes(), spectrum.power.tobytes()
-    errors = _errors_db(taps, error, *key)
-    if errors[-1] > most_db:
-        return None
-    if errors[0] <= most_db:
-        return _RATES[0]
-    # Errors fall with the rate. The margins for rounding are half a per cent and a tenth of a dB.
-    return 1.005 * float(np.exp(np.interp(0.1 - most_db, -errors, np.log(_RATES))))
-
-
-@functools.lru_cache(maxsize=64)
-def _errors_db(taps: int, error: str, frequency: bytes, power: bytes) -> NDArray[np.float64]:
-    """Return the errors of filters at all `_RATES`."""
-    spectrum = Spectrum(0.0, np.frombuffer(frequency), np.frombuffer(power))
-    found = [getattr(each, error) for each in interpolation.designs(taps, _RATES, spectrum)]
-    return np.minimum.accumulate(found)
+    return gain

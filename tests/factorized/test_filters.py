@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from clsas.aperture import filters
-from clsas.aperture.filters import choose, steering_spectrum
+from clsas.factorized import filters
+from clsas.factorized.filters import choose, steering_spectrum
 from clsas.signal.spectrum import Spectrum
 
 LINES = Spectrum(0.0, (np.arange(128) + 0.5) / 256, np.repeat([1 / 96, 0.0], [96, 32]))

@@ -1,1 +1,0 @@
-"""The aperture: mean tracks, and the few virtual channels that stand for many channels."""
