@@ -409,7 +409,7 @@ def stretches(
     normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
     along = along - (along @ normal)[..., None] * normal
     square = np.einsum("pci,pci->pc", along, along)
-    # Directly below the track, ranges hardly grow in the plane; the bound avoids a division by 0.
+    # Directly below the track, ranges do not grow in the plane; the bound avoids a division by 0.
     return np.einsum("pci,pci->pc", more, along) / np.maximum(square, 1e-3)
 
 

@@ -30,6 +30,7 @@ Shape = Literal["track", "strips", "sheet"]
 # The effects of half and twice these values were measured by `scripts/bench sensitivity`.
 # Samples of a single curve at which rates are evaluated. With half, errors are 0.1 dB larger.
 _SAMPLES = 257
+_STRIP_SAMPLES = 40  # the same on each strip, and on lines across a sheet
 # Samples past either end, each twice as far as the one before. With half, images take up to 16 %
 # more time.
 _SAMPLES_BEYOND = 12
@@ -37,8 +38,6 @@ ALONG_AT = (0.0, 0.5, 1.0)
 """Coordinates across a sheet of the lines along it at which rates are evaluated."""
 ACROSS_AT = tuple(np.linspace(0, 1, 9))
 """Aperture coordinates of the lines across a sheet at which rates are evaluated."""
-STRIP_SAMPLES = 40
-"""Samples at which rates are evaluated on each strip, and on lines across a sheet."""
 APART = 16.0
 """Difference of aperture coordinates between strips; samples past their ends must not overlap."""
 _SAME_PLACE_M = 1e-9  # channels that are closer to the mean track lie on it
@@ -46,8 +45,7 @@ _SAME_PLACE_M = 1e-9  # channels that are closer to the mean track lie on it
 # One curve
 _CHANNELS_PER_KNOT = 16
 _MOST_INTERVALS = 64
-CLOSE_ENOUGH = 0.01
-"""Rms distance of phase centres from a mean track that is close enough, wavelengths."""
+_CLOSE_ENOUGH = 0.01  # rms distance of phase centres at which a curve is accepted, wavelengths
 _SCREENED = 512  # channels by which a single curve is accepted or rejected
 _FAR_OFF = 2.0  # rms distance per axis at which one curve is rejected, wavelengths
 
@@ -316,7 +314,7 @@ class MeanTrack:
         )
         knots = np.repeat([0.0, 1.0], degree + 1)
         spline = BSpline(knots, bernstein @ powers, degree)
-        return MeanTrack(spline, np.zeros(0), sampled=STRIP_SAMPLES)
+        return MeanTrack(spline, np.zeros(0), sampled=_STRIP_SAMPLES)
 
     @functools.cached_property
     def lines_along(self) -> tuple[MeanTrack, ...]:
@@ -398,7 +396,7 @@ def mean_track(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
         off_m = np.sqrt(np.mean(np.sum((tried(along) - position_m) ** 2, axis=1)))
         if off_m < 0.8 * spline_off_m:
             spline, spline_off_m = tried, off_m
-        if spline_off_m <= CLOSE_ENOUGH * wavelength_m:
+        if spline_off_m <= _CLOSE_ENOUGH * wavelength_m:
             break
         intervals *= 2
 
@@ -434,7 +432,7 @@ def strips(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
             return None
         splines.append(track.spline)
         coordinate[channels] = APART * number + track.coordinate
-    return MeanTrack(splines[0], coordinate, tuple(splines[1:]), sampled=STRIP_SAMPLES)
+    return MeanTrack(splines[0], coordinate, tuple(splines[1:]), sampled=_STRIP_SAMPLES)
 
 
 def _passes_between_jumps(centres_m: NDArray[np.float64]) -> list[NDArray[np.int64]]:

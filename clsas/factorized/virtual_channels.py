@@ -343,7 +343,7 @@ def equal_phase_steps(
         visible = np.flatnonzero(inside[root] > 0)
         inside[root] = np.interp(every, visible, inside[root, visible]) if visible.size else 1.0
 
-    # Where phases hardly turn, virtual channels do not lie much farther apart than elsewhere.
+    # Where phases turn slowly, virtual channels do not lie much farther apart than elsewhere.
     mean = inside.mean(axis=1, keepdims=True)
     inside = np.maximum(inside, np.maximum(_LEAST_RATE * mean, _LEAST_CHANNELS / per_cycle))
 
