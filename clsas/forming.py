@@ -9,7 +9,7 @@ import numpy as np
 from clsas.core.grid import Grid
 from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
-from clsas.exact.decision import ACCURACY_DB, Decision, decide
+from clsas.exact.decide import ACCURACY_DB, Decision, decide
 from clsas.exact.run import ExactImager
 from clsas.factorized.stages import FactorizedImager
 from clsas.factorized.track import MeanTrack

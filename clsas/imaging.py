@@ -20,7 +20,7 @@ from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.lines import RangeLines
-from clsas.exact.decision import ACCURACY_DB, BEST_ACCURACY_DB
+from clsas.exact.decide import ACCURACY_DB, BEST_ACCURACY_DB
 from clsas.factorized.costs import Costs
 from clsas.factorized.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, Request, planned
 from clsas.forming import Progress, SceneImager, form, scene_of_plan

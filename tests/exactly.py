@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from clsas.exact.decision import ACCURACY_DB, Decision, decide
+from clsas.exact.decide import ACCURACY_DB, Decision, decide
 from clsas.factorized.sampled import SampledRoots, SampledScene
 from clsas.forming import SceneImager
 from clsas.opencl.device import Device, open_device

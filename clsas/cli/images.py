@@ -28,7 +28,7 @@ from clsas.cli.parameters import HDF5
 from clsas.cli.wording import command
 from clsas.core import validate
 from clsas.core.image import holds_any
-from clsas.exact.decision import ACCURACY_DB
+from clsas.exact.decide import ACCURACY_DB
 from clsas.factorized.planner import WORST_TOLERANCE_DB
 from clsas.files.scene_tables import PLAN_KEYS
 from clsas.forming import SceneImager, scene_of_plan

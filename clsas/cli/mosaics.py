@@ -27,7 +27,7 @@ from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart, keep_ou
 from clsas.cli.wording import command
 from clsas.core.extras import needed
 from clsas.core.threads import uninterrupted
-from clsas.exact.decision import ACCURACY_DB
+from clsas.exact.decide import ACCURACY_DB
 from clsas.files.scene_files import SceneFile, simulation_digest
 from clsas.files.scene_tables import PLAN_KEYS
 from clsas.mosaics.documents import check_place

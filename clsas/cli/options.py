@@ -12,7 +12,7 @@ import click
 
 from clsas.cli.parameters import AXIS, INPUT, PERCENTILES, RATIO, STAGES, Output
 from clsas.core import validate
-from clsas.exact.decision import BEST_ACCURACY_DB
+from clsas.exact.decide import BEST_ACCURACY_DB
 from clsas.factorized.planner import (
     BEST_TOLERANCE_DB,
     WORST_TOLERANCE_DB,

@@ -11,11 +11,9 @@ from typing import Any, get_args
 import numpy as np
 
 from clsas.core import validate
-from clsas.exact.blocks import Blocks, band_parts, blocks_of
-from clsas.exact.buffers import block_buffers, part_buffers
-from clsas.exact.decision import decide
-from clsas.exact.groups import Groups, GroupsEstimate
-from clsas.exact.tiles import STACK, Tiles, item_pixels
+from clsas.exact.decide import decide
+from clsas.exact.layout import STACK, Groups, GroupsEstimate, Tiles, item_pixels
+from clsas.exact.run import Blocks, band_parts, block_buffers, blocks_of, part_buffers
 from clsas.factorized.buffers import (
     LEAST_BATCH,
     leaf_tables,

@@ -21,9 +21,8 @@ from scipy.spatial.distance import cdist
 from clsas.core.decibels import in_db, power
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.wavelengths import wavelength_m
-from clsas.exact.layout import ROUNDING
-from clsas.exact.lookup import lookup_room
-from clsas.exact.tiles import BLOCKS
+from clsas.exact.decide import ROUNDING
+from clsas.exact.layout import BLOCKS, lookup_room
 from clsas.factorized.buffers import CHUNK
 from clsas.factorized.filters import LONGEST_UPSAMPLING_SHARE, UPSAMPLING_SHARE, Filters, Gain
 from clsas.factorized.phase_rates import drift, interpolated_directions, stretches

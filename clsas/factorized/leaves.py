@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 from clsas.core.decibels import power
 from clsas.core.geometry import bistatic_range_m
 from clsas.core.wavelengths import wavelength_m
-from clsas.exact.groups import Groups, groups_within
-from clsas.exact.lookup import lookup_options
-from clsas.exact.tiles import BLOCKS, Tiles, item_pixels
+from clsas.exact.layout import BLOCKS, Groups, Tiles, groups_within, item_pixels, lookup_options
 from clsas.factorized.buffers import DeviceLines, Level, leaf_tables, tile_buffers
 from clsas.factorized.track import MeanTrack
 from clsas.factorized.tree import Geometry, Sector, Tree

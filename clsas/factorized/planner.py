@@ -20,7 +20,7 @@ from clsas.core.georeference import placed
 from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines, some_channels
 from clsas.core.wavelengths import wavelength_m
-from clsas.exact.decision import ACCURACY_DB
+from clsas.exact.decide import ACCURACY_DB
 from clsas.factorized import measured_costs
 from clsas.factorized.candidates import (
     EDGES_SHARE,

@@ -20,7 +20,7 @@ from clsas.core.geometry import pairwise_range_m
 from clsas.core.lines import SAMPLED_CHANNELS, antennas_of, some_channels, steepest
 from clsas.core.surface import LEAST_SIDE, Surface, within_roots
 from clsas.core.wavelengths import band_wavelength_m, cycles_per_m_at
-from clsas.exact.tiles import item_pixels
+from clsas.exact.layout import item_pixels
 from clsas.factorized.phase_rates import (
     BeamDirections,
     PhaseBoxes,

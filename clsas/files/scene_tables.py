@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from clsas.core import validate
-from clsas.exact.decision import BEST_ACCURACY_DB
+from clsas.exact.decide import BEST_ACCURACY_DB
 from clsas.factorized.planner import checked_pairs, tolerance_in_db
 from clsas.files.georeference_table import GeoreferenceTable
 from clsas.files.grid_tables import GridTable

@@ -17,7 +17,7 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
-from clsas.exact.decision import ACCURACY_DB
+from clsas.exact.decide import ACCURACY_DB
 from clsas.factorized.filters import ALIGN_TAPS, APERTURE_TAPS
 from clsas.factorized.planner import (
     BEST_TOLERANCE_DB,

@@ -12,7 +12,7 @@ import numpy as np
 
 from clsas.core import validate
 from clsas.core.lines import RangeLines
-from clsas.exact.decision import BEST_ACCURACY_DB
+from clsas.exact.decide import BEST_ACCURACY_DB
 from clsas.factorized.planner import TOLERANCE_DB, checked_pairs, tolerance_in_db
 from clsas.mosaics.documents import is_there, read_document
 from clsas.mosaics.provenance import REQUESTS, beam_json

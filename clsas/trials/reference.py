@@ -15,7 +15,7 @@ from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.wavelengths import wavelength_m
-from clsas.exact.decision import Decision
+from clsas.exact.decide import Decision
 from clsas.signal.ray_delays import delays_s
 from clsas.signal.readout import interpolated
 from clsas.signal.spectrum import measure_spectrum

@@ -18,7 +18,7 @@ from scipy import stats
 import clsas
 from clsas import plot
 from clsas.core.image_error import levels
-from clsas.exact.decision import ACCURACY_DB
+from clsas.exact.decide import ACCURACY_DB
 from clsas.forming import form
 from clsas.measures.shadows import dark_level_db
 from clsas.opencl.device import open_device

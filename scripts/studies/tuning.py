@@ -25,8 +25,8 @@ def constants(device: Device) -> list[Constant]:
     """Return the constants that affect imaging times on a device."""
     batch = "_CACHED_BYTES" if device.info.kind == "cpu" else "_BATCH_BYTES"
     names = [
-        ("exact.blocks", "_CHANNELS_AT_ONCE"),
-        ("exact.blocks", "_PART_BYTES"),
+        ("exact.run", "_CHANNELS_AT_ONCE"),
+        ("exact.run", "_PART_BYTES"),
         ("factorized.costs", batch),
         ("factorized.stages", "_GROUPS_PER_UNIT"),
     ]

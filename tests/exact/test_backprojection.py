@@ -33,9 +33,7 @@ from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.exact.groups import Groups
-from clsas.exact.lookup import lookup_options, lookup_room
-from clsas.exact.tiles import BLOCKS, HELD, STACK, Tiles
+from clsas.exact.layout import BLOCKS, HELD, STACK, Groups, Tiles, lookup_options, lookup_room
 from clsas.imaging import backproject
 from clsas.opencl.device import list_devices
 from clsas.simulation.scenes import PointTargets

@@ -8,7 +8,7 @@ from cases import along_x, lines_over
 import clsas
 from clsas import BeamWindow, ClsasWarning, Grid, SoundSpeed
 from clsas.core.decibels import in_db
-from clsas.exact.groups import gather
+from clsas.exact.layout import gather
 from clsas.signal.ray_delays import RaySample, delays_s, sample_pixels
 from clsas.signal.refraction import homogeneous
 from clsas.sonar.simplify import REFRACTION

@@ -25,8 +25,7 @@ from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
-from clsas.exact.groups import Groups
-from clsas.exact.tiles import Tiles
+from clsas.exact.layout import Groups, Tiles
 from clsas.forming import form_exactly
 from clsas.imaging import backproject
 from clsas.simulation.scenes import PointTargets
