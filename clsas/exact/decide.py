@@ -144,7 +144,7 @@ def decide(
     cycles_per_m = math.hypot(
         cycles_per_m_at(lines, spectrum.centre), _BAND_RMS / lines.range_step_m
     )
-    fullness = 1.0
+    fullness = 1.0  # relative errors of a beam's weights grow by the inverse
     if beam is not None and scene.along is not None:
         some = some_channels(lines.channels, _SAMPLED_CHANNELS)
         sine = sines(grid.spread(_SAMPLED_PIXELS), lines.phase_centres_m[some], scene.along[some])
@@ -191,14 +191,7 @@ def decide(
     if isinstance(layout, GroupsEstimate):
         return Decision(layout, interpolator, resampling, phase_terms, one_cubic=False)
 
-    # Squares of larger distances would overflow float32.
-    points_m = np.concatenate([antennas_m, layout.centres_m(slice(None))])
-    extent_m = float(np.ptp(points_m, axis=0).max())
-    if extent_m > validate.FARTHEST_M:
-        raise ValueError(
-            f"lines and grid must lie within {validate.FARTHEST_M:g} m of each other, "
-            f"got {extent_m:g} m"
-        )
+    _check_distances(antennas_m, layout)
     one_cubic = False
     if beam is not None:
         nearest_m = max(layout.nearest_m(lines.phase_centres_m) - layout.radius_m, 1e-30)
@@ -296,3 +289,14 @@ def rounding_error(channels: int) -> float:
     """
     excess = _ONE_CHANNEL / channels if channels <= _FEW_CHANNELS else 0.0
     return ROUNDING * math.sqrt(1 + excess)
+
+
+def _check_distances(antennas_m: NDArray[np.float64], layout: Tiles | Groups) -> None:
+    """Raise ValueError for distances so large that their squares overflow float32."""
+    points_m = np.concatenate([antennas_m, layout.centres_m(slice(None))])
+    extent_m = float(np.ptp(points_m, axis=0).max())
+    if extent_m > validate.FARTHEST_M:
+        raise ValueError(
+            f"lines and grid must lie within {validate.FARTHEST_M:g} m of each other, "
+            f"got {extent_m:g} m"
+        )

@@ -110,7 +110,7 @@ class ExactImager:
         """
         layout, device, beam, blocks = self.layout, self.device, self.scene.beam, self.blocks
         part_pixels, normalise = layout.part_pixels, beam is not None and beam.normalise
-        backprojection = _Backprojection(self.scene, self.decision, device, lines, blocks)
+        backprojection = _Backprojection(self, lines)
         at_nodes_m: dict[int, NDArray[np.float64]] = {}
         pixels = np.empty(layout.parts * part_pixels, np.complex64)
         report = progress or (lambda done, pairs: None)
@@ -211,23 +211,15 @@ class ExactImager:
 class _Backprojection:
     """Backprojection on a device: its kernels, their buffers, and arguments that stay the same."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        decision: Decision,
-        device: Device,
-        lines: RangeLines,
-        blocks: Blocks,
-    ) -> None:
-        assert not isinstance(decision.layout, GroupsEstimate)
-        self.scene, self.device, self.lines, self.blocks = scene, device, lines, blocks
-        self.layout: Tiles | Groups = decision.layout
-        self.resampling, beam = decision.resampling, scene.beam
-        self.samples_per_m = self.resampling.samples_per_m(lines)
+    def __init__(self, imager: ExactImager, lines: RangeLines) -> None:
+        self.scene, self.layout, self.blocks = imager.scene, imager.layout, imager.blocks
+        self.device, self.lines, self.resampling = imager.device, lines, imager.decision.resampling
+        device, decision, beam = imager.device, imager.decision, imager.scene.beam
         self.origin_m = self.layout.centres_m(slice(0, 1))[0]
+        self.samples_per_m = self.resampling.samples_per_m(lines)
         self.beam = beam_table(device, beam, lines)
         self.arguments = {
-            "line_pitch": blocks.pitch,
+            "line_pitch": self.blocks.pitch,
             "cycles_per_sample": self.resampling.cycles_per_m(lines) / self.samples_per_m,
             "filter": filter_table(device, decision.interpolator.coefficients),
             "phase_polynomials": phase_polynomials(device, decision.phase_terms),
@@ -308,6 +300,8 @@ class _Backprojection:
         """
         device, layout, beam = self.device, self.layout, self.beam
         line_slot, slot = self.line_slot, next(self.part_slots)
+
+        # Upload where the parts lie, which lines they need, and what the host has computed of them.
         slot.wait()
         count = parts.stop - parts.start
         most = int((ranges[:, 1] - ranges[:, 0]).max())
@@ -333,7 +327,7 @@ class _Backprojection:
         uploaded = line_slot.filled + slot.filled
         items: tuple[int, ...]
         if isinstance(layout, Tiles):
-            # Expand ranges about the centres of tiles.
+            # Ranges are expanded about the centres of tiles first.
             device.run(
                 self.expand,
                 (channel_pitch(most) // device.info.width, count),
