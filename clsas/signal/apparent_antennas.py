@@ -5,6 +5,7 @@ See `clsas.signal.refraction` for the method.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -149,18 +150,26 @@ class Change:
         return np.asarray(value, np.float64)
 
     def lines(self, lines: RangeLines, sound_speed_m_s: float) -> RangeLines:
-        """Return lines of the geometry in homogeneous water, with samples over changed ranges."""
+        """Return lines of the geometry in homogeneous water, with samples over changed ranges.
+
+        Where offsets change by a share of the range, so do the frequencies of echoes, the carrier
+        included. Lines get as many more samples as their band then needs.
+        """
         changed = self.antennas(lines, slice(None))
+        highest = 2 * lines.carrier_hz / sound_speed_m_s + 0.5 / changed.range_step_m
+        finer = 1 + 2 * highest * self._steepest * changed.range_step_m
+        length = 1 + math.ceil((lines.length - 1) * finer)
+        changed = replace(changed, range_step_m=changed.range_step_m / finer)
         everyone = np.arange(lines.channels)
         first_m = changed.first_range_m.copy()
         for _ in range(FLIGHT_STEPS):  # so that the first sample stays the first
             first_m = changed.first_range_m - self.offsets_m(everyone, first_m[:, None])[:, 0]
-        samples = np.empty(lines.samples.shape, np.complex64)
+        samples = np.empty((lines.channels, length), np.complex64)
         readout = Readout.of(lines, self.accuracy_db)
-        steps_m = changed.range_step_m * np.arange(lines.length)
+        steps_m = changed.range_step_m * np.arange(length)
         cycles_per_m = 2 * lines.carrier_hz / sound_speed_m_s
         scale = lines.sound_speed_m_s / sound_speed_m_s
-        rows = max(1, _CHANGED_AT_ONCE // lines.length)
+        rows = max(1, _CHANGED_AT_ONCE // length)
         for first in range(0, lines.channels, rows):
             some = everyone[first : first + rows]
             range_m = first_m[some, None] + steps_m
@@ -169,6 +178,14 @@ class Change:
             values = readout.read(some, scale * (range_m + offset_m))
             samples[some] = values * np.exp(2j * np.pi * (turns - np.rint(turns)))
         return replace(changed, samples=samples, first_range_m=first_m)
+
+    @property
+    def _steepest(self) -> float:
+        """Largest change of an offset per metre of range."""
+        half_m = np.maximum(np.diff(self.limits_m), 1e-9) / 2
+        scaled = np.linspace(-1, 1, _NODES)
+        slopes = chebyshev.chebval(scaled, chebyshev.chebder(self.coefficients)) / half_m
+        return float(np.abs(slopes).max())
 
     def error(self, sample: RaySample, points_m: NDArray[np.float64] | None = None) -> float:
         """Return the squared phase error of the worst sample pixel, rad^2.

@@ -158,8 +158,8 @@ def homogeneous(
     grid : Grid
     beam : BeamWindow or None
     allowed_db : float or None
-        Allowed relative rms error of the image, dB. With None, or if straight rays are not within
-        a small share of its power, there are apparent antennas.
+        Allowed relative rms error of the image, dB. Straight rays are used if they err by a small
+        share of its power, or less than apparent antennas. With None, there are apparent antennas.
     corrected : bool
         Whether the image will have the `corrections`. The pixels of a level grid may then be given
         as points.
@@ -189,11 +189,10 @@ def homogeneous(
         middle = profile.mean_m_s(float(lines.tx_m[0, 2]), float((low[2] + high[2]) / 2))
         return Homogeneous(grid, beam, middle)
     straight = StraightRays.of(sample)
-    mean_m_s, mean_error = straight.sound_speed_m_s, straight.error
+    plain = Homogeneous(grid, beam, straight.sound_speed_m_s, None, straight.error, straight)
     allowed = 0.0 if allowed_db is None else power(allowed_db)
-    if mean_error <= SHARE * allowed:
-        found = Homogeneous(grid, beam, mean_m_s, None, mean_error, straight)
-        found, of_steps = _with_beam(found, lines, sample)
+    if straight.error <= SHARE * allowed:
+        found, of_steps = _with_beam(plain, lines, sample)
         return replace(found, error=found.error + of_steps)
     change = Change.of(lines, sample, allowed_db, sample.middle_m)
     best = Homogeneous(grid, beam, change.sound_speed_m_s, change, change.error(sample), straight)
@@ -205,8 +204,11 @@ def homogeneous(
             best = replace(best, grid=moved, change=change, error=error)
     if corrected and best.error > _CORRECTED * allowed:
         best = _corrected(best, lines, grid, sample)
-    best, of_steps = _with_beam(best, lines, sample)
     best = replace(best, error=best.error + power(change.accuracy_db))
+    # In water of nearly one speed, moving receivers may err more at their apparent positions.
+    if allowed and plain.error <= best.error:
+        best = plain
+    best, of_steps = _with_beam(best, lines, sample)
     if allowed and best.error > allowed / 2:
         validate.warn(
             f"refraction alone causes an error of up to {in_db(best.error):.0f} dB in some pixels, "

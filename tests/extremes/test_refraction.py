@@ -9,6 +9,7 @@ import pytest
 from bent import travel_times
 from cases import along_x, lines_over
 from factorizing import EXACT_IS_SLOW
+from sums import BentChannels, Points, Sampling
 from tiers import also, few
 
 import clsas
@@ -286,6 +287,41 @@ BEAMS = [
     clsas.BeamWindow(8, "hann", along=[1, 0, 0]),
     clsas.BeamWindow(8, "tukey", 1.0, along=[1, 0, 0]),
 ]
+
+
+CLOSE = {
+    "heave": (0.02, [0, 3.9, 4.3, 5, 6, 7, 30], [1500, 1499, 1495, 1494, 1490, 1489, 1489], 0.6),
+    "gradient": (0.03, [0, 30], [1500, 1530], 0.0),
+    "narrow": (0.005, [0, 4, 7, 30], [1490, 1490, 1496, 1497], 0.3),
+}
+
+
+@pytest.mark.parametrize("name", few(CLOSE, often=["heave"]))
+def test_narrow_bands_from_steep_to_flat_rays(name):
+    """Range axes change by percents of the range, and carriers by more than the sampled band."""
+    fraction, depth_m, speed_m_s, heave_m = CLOSE[name]
+    x = np.linspace(-1.5, 1.5, 30)
+    tx = np.column_stack([x, 0 * x, -4.2 + heave_m * np.sin(4 * x)])
+    channels = BentChannels(
+        tx, tx, None, np.ones(30), np.tile([1.0, 0, 0], (30, 1)),
+        depth_m=np.array(depth_m, float), speed_m_s=np.array(speed_m_s, float), surface_z_m=0.0,
+    )  # fmt: skip
+    grid = Grid.plane((-1, 1, 12), (3, 40, 40), -8.2)
+    pixels_m = grid.positions_m().reshape(-1, 3)
+    range_m = channels.ranges_m(pixels_m)
+    centre = 2 / NOMINAL * 100e3
+    sampling = Sampling(centre, fraction * centre, centre, 0.6 / (fraction * centre))
+    rng = np.random.default_rng(0)
+    points_m = pixels_m[rng.choice(len(pixels_m), 12)] + 0.003 * rng.normal(size=(12, 3))
+    amplitude = rng.normal(size=(12, 2)) @ [1, 1j]
+    span_m = float(range_m.min()), float(range_m.max())
+    echoes = Points.of(channels, sampling, points_m, amplitude, 0.0, span_m)
+    lines = RangeLines(
+        echoes.samples(), echoes.first_m, sampling.step_m, tx, tx, 100e3, NOMINAL,
+        sound_speed=SoundSpeed(depth_m, speed_m_s),
+    )  # fmt: skip
+    image = clsas.backproject(lines, grid, accuracy_db=-60)
+    assert oracle.error_db(image.pixels.ravel(), echoes.received(range_m).sum(axis=0)) < -60
 
 
 @pytest.mark.slow

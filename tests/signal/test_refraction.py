@@ -177,6 +177,25 @@ def test_straight_rays_are_chosen_by_the_tolerance():
     assert np.array_equal(straight.tx_m, lines.tx_m)
 
 
+@pytest.mark.filterwarnings("ignore:refraction alone")
+@pytest.mark.parametrize(
+    ("velocity", "apart_m", "depths_m", "speeds_m_s"),
+    [
+        ([-1.8, 0.0, -0.5], 0.1, [0, 7, 8, 60], [1490, 1490.02, 1489.99, 1490.01]),
+        ([0.4, 2.6, -0.9], 0.05, [0, 60], [1500, 1501.5]),
+        ([3.0, 0.0, 0.2], 0.2, [0, 8, 9, 60], [1500, 1500, 1499.9, 1499.9]),
+    ],
+)
+def test_apparent_antennas_never_err_more_than_straight_rays(
+    velocity, apart_m, depths_m, speeds_m_s
+):
+    close = Grid.plane((-2, 2, 33), (3, 9, 41), -10.0)
+    rx = TRACK + np.array([apart_m, 0, 0.3 * apart_m])
+    lines = over(close, rx=rx, velocity=velocity, profile=SoundSpeed(depths_m, speeds_m_s))
+    water = homogeneous(lines, close, None, -80)
+    assert water.error <= water.straight.error
+
+
 def test_resampled_lines_are_those_at_the_delays():
     """A tone on its carrier stays one, whatever is mixed out."""
     lines = over(carrier_hz=100e3)
