@@ -61,6 +61,14 @@ def thinned(profile: SoundSpeed) -> SoundSpeed:
     return profile
 
 
+def vertical_errors_s(profile: SoundSpeed, z_m: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Return by how much thinning shortens travel times from the first depth to heights, [...]."""
+    fewer = thinned(profile)
+    away = 1 / profile.speed_m_s - 1 / np.interp(profile.depth_m, fewer.depth_m, fewer.speed_m_s)
+    error_s = np.append(0.0, np.cumsum(np.diff(profile.depth_m) * (away[:-1] + away[1:]) / 2))
+    return np.interp(profile.surface_z_m - z_m, profile.depth_m, error_s)
+
+
 def _profile(
     depth: NDArray[np.float64], speed: NDArray[np.float64], given: SoundSpeed
 ) -> SoundSpeed:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from clsas.core.lines import RangeLines
 from clsas.core.rays import Rays, rays, shadow
 from clsas.core.sound_speed import SoundSpeed
-from clsas.signal.ray_delays import FLIGHT_STEPS, RaySample, at_speed, straight_m
+from clsas.signal.ray_delays import FLIGHT_STEPS, RaySample, at_speed, straight_m, times_s
 from clsas.signal.readout import Readout
 
 _NODES = 48  # distances from which the change of a range axis follows
@@ -223,7 +223,7 @@ def _times(
     profile: SoundSpeed, distance_m: NDArray[np.float64], z_m: NDArray[np.float64], level_m: float
 ) -> NDArray[np.float64]:
     """Return the travel times from heights to distances on a level; both arrays broadcast."""
-    return _rays_to(profile, distance_m, z_m, level_m).time_s
+    return times_s(profile, _rays_to(profile, distance_m, z_m, level_m), z_m, level_m)
 
 
 def _rays_to(

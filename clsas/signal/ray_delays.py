@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from clsas.core.geometry import pairwise_range_m
 from clsas.core.grid import Grid, spread_indices
 from clsas.core.lines import RangeLines, some_channels
-from clsas.core.rays import rays, shadow
+from clsas.core.rays import Rays, rays, shadow
 from clsas.core.sound_speed import SoundSpeed
+from clsas.core.thinning import FEW, vertical_errors_s
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines
 
@@ -25,6 +26,7 @@ FLIGHT_STEPS = 4
 """Iterations for a moving receiver. Each multiplies the error by v/c, which is below 0.05."""
 
 _CHANNELS = 48  # sample channels, beside the first, the last, and those at extreme heights
+_LEVEL = 1e-2  # sine of an angle below which rays count as level
 _BEYOND_BEAM = 0.05  # sine by which a sample pixel may lie outside the beam
 
 
@@ -81,7 +83,30 @@ def one_way_s(
         nearest = dark[distance[dark].argmin()]
         place = distance[nearest], antennas_m[nearest, 2], points_m[nearest, 2]
         raise ValueError(f"sound_speed: {shadow(profile, *map(float, place))}")
-    return found.time_s
+    return times_s(profile, found, antennas_m[:, 2], points_m[:, 2])
+
+
+def times_s(
+    profile: SoundSpeed,
+    found: Rays,
+    one_z_m: NDArray[np.float64],
+    other_z_m: NDArray[np.float64] | float,
+) -> NDArray[np.float64]:
+    """Return the times of rays between heights, with what thinning the profile left out, seconds.
+
+    By Fermat's principle, rays of the thinned profile serve for the given one. Where a ray falls at
+    an angle, its time errs by the vertical error over the sine, at the lower end less the upper.
+    """
+    time_s = found.time_s
+    if len(profile.depth_m) <= FEW:
+        return time_s
+    for z_m, slope_s_m in (one_z_m, found.one_slope_s_m), (other_z_m, found.other_slope_s_m):
+        sine = -slope_s_m * profile.at(z_m)
+        error_s = np.broadcast_to(vertical_errors_s(profile, z_m), sine.shape)
+        time_s = time_s + np.divide(
+            error_s, sine, out=np.zeros_like(sine), where=np.abs(sine) > _LEVEL
+        )
+    return time_s
 
 
 def in_beam(

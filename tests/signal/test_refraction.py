@@ -12,6 +12,7 @@ from clsas.exact.layout import gather
 from clsas.signal.ray_delays import RaySample, delays_s, sample_pixels
 from clsas.signal.refraction import homogeneous
 from clsas.sonar.simplify import REFRACTION
+from clsas.trials import oracle
 
 PROFILE = SoundSpeed([0, 12, 15, 60], [1505, 1504, 1494, 1490])
 SEABED = -25.0
@@ -194,6 +195,28 @@ def test_apparent_antennas_never_err_more_than_straight_rays(
     lines = over(close, rx=rx, velocity=velocity, profile=SoundSpeed(depths_m, speeds_m_s))
     water = homogeneous(lines, close, None, -80)
     assert water.error <= water.straight.error
+
+
+DEPTHS = np.linspace(0, 60, 300)
+
+
+@pytest.mark.parametrize(
+    ("speed_m_s", "tx"),
+    [
+        (1500 - 8 / (1 + np.exp((14 - DEPTHS) / 1.5)), heaving()),
+        (1500 - 6 * np.exp(-(((DEPTHS - 15) / 4) ** 2)), TRACK),
+        (1510 - 9 * np.tanh(DEPTHS / 20) - 3 * np.tanh((DEPTHS - 16) / 4), heaving()),
+    ],
+)
+def test_delays_in_profiles_of_many_depths(speed_m_s, tx):
+    """Rays take thinned profiles, but their times are those of all depths."""
+    profile = SoundSpeed(DEPTHS, speed_m_s)
+    lines = over(tx=tx, profile=profile)
+    channel, points = np.arange(0, 150, 20), GRID.spread(3)[:8]
+    distance_m = np.hypot(*(points - tx[channel])[:, :2].T)
+    time_s, _ = oracle.rays(DEPTHS, speed_m_s, distance_m, -tx[channel, 2], 25.0)
+    assert np.abs(delays_s(lines, channel, points) - 2 * time_s).max() < 2.5e-10
+    assert error_db(lines)[0] < -78
 
 
 def test_resampled_lines_are_those_at_the_delays():
