@@ -78,6 +78,16 @@ def _jittered(rng: Generator, n: int, spacing_m: float, wave_m: float) -> Apertu
     return Aperture(position_m, straight.along, straight.range_m)
 
 
+def _heaving(rng: Generator, n: int, spacing_m: float, wave_m: float) -> Aperture:
+    """A straight track with a heave of up to a tenth of the range, along waves or at random."""
+    straight = _straight(rng, n, spacing_m, wave_m)
+    position_m = straight.position_m.copy()
+    waves = np.sin(2 * np.pi * (log_uniform(rng, 0.5, 10) * np.linspace(0, 1, n) + rng.random()))
+    heave_m = straight.range_m * log_uniform(rng, 0.002, 0.05)
+    position_m[:, 2] += heave_m * (waves if rng.random() < 0.7 else rng.uniform(-1, 1, n))
+    return Aperture(position_m, straight.along, straight.range_m)
+
+
 def _curved(rng: Generator, n: int, spacing_m: float, wave_m: float) -> Aperture:
     turn = rng.uniform(0.2, 2.0) * rng.choice([-1, 1])
     angle = np.linspace(-turn / 2, turn / 2, n)
@@ -177,6 +187,7 @@ def _star(rng: Generator, n: int, spacing_m: float, wave_m: float) -> Aperture:
 _SHAPES: dict[str, Callable[[Generator, int, float, float], Aperture]] = {
     "straight": _straight,
     "jittered": _jittered,
+    "heaving": _heaving,
     "curved": _curved,
     "ring": _ring,
     "arc": _arc,

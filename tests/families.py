@@ -135,6 +135,10 @@ FAMILIES = {
     "profiles and reliefs": Family(
         spacing=WIDE, grid=("relief", "points"), water=PROFILES, antennas=("monostatic", "near"),
     ),
+    "profiles with heave and motion": Family(
+        band=(0.005, 0.3), spacing=WIDE, aperture=("heaving",), antennas=("monostatic", "near"),
+        velocity=("at rest", "even"), grid=("plane", "from close to far"), water=PROFILES,
+    ),
     "anything": Family(
         band=(0.005, 1.9),
         on_carrier=0.3,
@@ -336,6 +340,10 @@ def _pixels(
         extent_m = min(extent_m, fine_m)
     aspect = log_uniform(rng, 0.4, 2.5)
     sides_m = extent_m * aspect**0.5, extent_m / aspect**0.5
+    if kind == "from close to far":
+        near_m = rng.uniform(0.5, 2) * -centre_m[2]
+        sides_m = sides_m[0], abs(centre_m[1] - near_m)
+        centre_m[1] = (centre_m[1] + near_m) / 2
     if kind == "points":
         count = int(rng.integers(300, 3000))
         thick_m = extent_m * rng.choice([0.01, 0.3])

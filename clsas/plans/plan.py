@@ -256,6 +256,8 @@ class Plan:
         if not self.is_exact:
             # Sampled lines contain no higher frequencies; a higher bound would only need memory.
             most = abs(lines.carrier_cycles_per_m) + 1 / lines.range_step_m
+            if lines.sound_speed is not None:  # slower water at the seabed has shorter wavelengths
+                most *= 2
             given = self.factorization.highest_cycles_per_m
             validate.number("highest_cycles_per_m", given, "cycles/m", most=most)
 

@@ -401,6 +401,20 @@ def test_an_imager_takes_other_samples():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("speed_m_s", [1465, *also(1440, 1380)])
+def test_a_plan_of_a_narrow_band_over_slow_water_can_be_used(speed_m_s):
+    """Wavelengths are shorter there than at the nominal speed, by more than the sampled band."""
+    grid = Grid.plane((-2, 2, 60), (60, 64, 60), -20)
+    lines = lines_over(grid, along_x(150, 0.08, z=-6.0), carrier_hz=100e3, step_m=0.8)
+    lines = replace(
+        lines, sound_speed=SoundSpeed([0, 8, 10, 70], [1500, 1499, speed_m_s + 1, speed_m_s])
+    )
+    plan = clsas.plan(lines, grid, tolerance_db=-30, costs=EXACT_IS_SLOW)
+    assert not plan.is_exact
+    plan.check(lines, grid)
+
+
+@pytest.mark.slow
 def test_a_plan_belongs_to_the_profile():
     lines, grid, _ = made(QUICK)
     plan = clsas.plan(lines, grid, tolerance_db=-40)
