@@ -47,6 +47,7 @@ ROUNDING = 2.2e-7
 """Rms error of a phase, radians, per cycle over the radius of a part. Measured with many
 channels."""
 
+_ROUNDED = 2.0**-24 / math.sqrt(12)  # rms error of a float32 from 0.5 to 1, samples
 _GEOMETRY_SHARE_DB = -12.0  # error power that the geometry may add, over that of the image: 6 %
 
 # Channels, and pixels along either side of the grid, for which the beam's fullness is evaluated.
@@ -178,15 +179,21 @@ def decide(
         samples_per_m = upsampling / lines.range_step_m
         return costs[lookup_options(device, layout, lines, samples_per_m, taps)["PERMUTE"]]
 
-    interpolator = interpolation.choose(
+    choose = partial(
+        interpolation.choose,
         spectrum,
         scene.ambiguity.rest_db(accuracy_db, 0.0 if estimate else scene.left_out_error),
         taps=taps,
-        upsampling=upsampling,
         other_error=math.hypot(geometry_error, phases.error(phase_terms)),
         pixels_per_sample=grid.size / lines.length,
         lookup_cost=lookup_cost,
     )
+    interpolator = choose(upsampling=upsampling)
+    # A wave is a small part of a sample if the band is narrow, and positions are rounded.
+    rounding = 2 * np.pi * cycles_per_m * lines.range_step_m * _ROUNDED
+    if upsampling is None and rounding > geometry_error * interpolator.upsampling:
+        enough = min(rounding / geometry_error, interpolation.MOST_UPSAMPLING)
+        interpolator = choose(upsampling=enough)
     resampling = interpolation.resampling(lines.length, interpolator, spectrum)
     if isinstance(layout, GroupsEstimate):
         return Decision(layout, interpolator, resampling, phase_terms, one_cubic=False)

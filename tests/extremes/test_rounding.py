@@ -21,12 +21,15 @@ from cases import (
     thesis_lines,
 )
 from exactly import execute, prepare, same_interpolator
+from sums import SPEED_M_S, Channels, Points, Sampling
+from tiers import few
 
 from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.core.validate import ClsasWarning
 from clsas.imaging import backproject
+from clsas.trials import oracle
 from clsas.trials.reference import sampled_error_db
 
 FAR = np.array([1e7, -1e7, 1e7])
@@ -267,3 +270,25 @@ def test_one_channel_rounds_no_more_than_many(device, bearing_rad, step_m):
     prepared = prepare(lines, grid, device=device, accuracy_db=-85)
     reference = partial(same_interpolator, prepared)
     assert sampled_error_db(execute(prepared), reference) <= -89
+
+
+@pytest.mark.parametrize(
+    ("fraction", "accuracy_db"), few([(1e-4, -80), (3e-4, -84), (5e-5, -75)], often=[(1e-4, -80)])
+)
+def test_bands_of_a_few_hertz(fraction, accuracy_db):
+    """A wave is less than a thousandth of a sample, whose positions are rounded."""
+    tx = along_x(60, 0.02)
+    channels = Channels(tx, tx, None, np.ones(60), np.tile([1.0, 0, 0], (60, 1)))
+    grid = Grid.plane((-0.5, 0.5, 60), (8, 9, 60))
+    pixels_m = grid.positions_m().reshape(-1, 3)
+    range_m = channels.ranges_m(pixels_m)
+    centre = 2 / SPEED_M_S * 100e3
+    sampling = Sampling(centre, fraction * centre, centre, 0.625 / (fraction * centre))
+    span_m = float(range_m.min()), float(range_m.max())
+    points_m = pixels_m[[300, 1200, 2333]] + [0.003, 0.001, 0]
+    amplitude = np.array([1, 0.5j, -0.7])
+    echoes = Points.of(channels, sampling, points_m, amplitude, 0.0, span_m)
+    lines = RangeLines(echoes.samples(), echoes.first_m, sampling.step_m, tx, tx, 100e3, SPEED_M_S)
+    image = backproject(lines, grid, accuracy_db=accuracy_db)
+    ideal = echoes.received(range_m).sum(axis=0)
+    assert oracle.error_db(image.pixels.ravel(), ideal) < accuracy_db
