@@ -71,7 +71,7 @@ def assembling(path: str | os.PathLike) -> Iterator[Path]:
         As for `replacing`.
     """
     path, before = _target(Path(path))
-    with _temporary(path, Path.mkdir) as (folder, _):
+    with _temporary(path, Path.mkdir, path.parent) as (folder, _):
         folder.chmod(stat.S_IRWXU)  # nobody else can read the file before it has its mode
         made = folder / path.name
         yield made
@@ -180,7 +180,7 @@ def _exchanged(first: Path, second: Path) -> bool:
 @contextmanager
 def staging(folder: Path) -> Iterator[Path]:
     """Yield an empty temporary folder within a folder, for files to move from; then remove it."""
-    with _temporary(folder / "staging", Path.mkdir) as (temporary, _):
+    with _temporary(folder, Path.mkdir, folder) as (temporary, _):
         yield temporary
 
 
@@ -256,12 +256,17 @@ def sync_folder(path: Path) -> None:
 
 
 @contextmanager
-def _temporary(path: Path, make: Callable[[Path], object]) -> Iterator[tuple[Path, int]]:
-    """Yield a locked temporary beside `path` and its descriptor; remove it if it still exists."""
-    temporary = None
+def _temporary(
+    path: Path, make: Callable[[Path], object], folder: Path | None = None
+) -> Iterator[tuple[Path, int]]:
+    """Yield a locked temporary beside `path` and its descriptor; remove it if it still exists.
+
+    If `folder` is given, the temporary is a folder in it, and its files will move there.
+    """
+    temporary = (folder or path.parent) / _PATTERN.replace("*", uuid.uuid4().hex)
     try:
-        _remove_leftovers(path.parent)
-        temporary, descriptor = _claim(path.parent, make)
+        _remove_leftovers(temporary.parent)
+        descriptor = _claim(temporary, make)
         try:
             yield temporary, descriptor
         finally:  # also on Ctrl-C
@@ -269,16 +274,17 @@ def _temporary(path: Path, make: Callable[[Path], object]) -> Iterator[tuple[Pat
             os.close(descriptor)
     except OSError as error:
         # The error of a full disk names no file, and a temporary name would not help the user.
-        named = error.filename
-        ours = named is None or (isinstance(named, str | Path) and Path(named).match(_PATTERN))
-        if error.errno is not None and ours:
-            raise type(error)(error.errno, error.strerror, str(path)) from error
-        raise
+        named = temporary if error.filename is None else error.filename
+        _, ours, within = str(named).partition(temporary.name)
+        if error.errno is None or not ours:
+            raise
+        meant = folder if within and folder else path
+        raise type(error)(error.errno, error.strerror, f"{meant}{within}") from error
 
 
-def _claim(folder: Path, make: Callable[[Path], object]) -> tuple[Path, int]:
+def _claim(path: Path, make: Callable[[Path], object]) -> int:
+    """Make a temporary, and return its locked descriptor."""
     while True:
-        path = folder / _PATTERN.replace("*", uuid.uuid4().hex)
         make(path)
         with suppress(FileNotFoundError):
             descriptor = _open(path)
@@ -286,7 +292,7 @@ def _claim(folder: Path, make: Callable[[Path], object]) -> tuple[Path, int]:
                 fcntl.flock(descriptor, fcntl.LOCK_EX)
             # Another process may have removed it as a leftover before it was locked.
             if path.exists():
-                return path, descriptor
+                return descriptor
             os.close(descriptor)
 
 

@@ -11,7 +11,14 @@ import sys
 import pytest
 
 from clsas.core import atomic
-from clsas.core.atomic import creating, locked, replacing, replacing_folder
+from clsas.core.atomic import (
+    assembling,
+    creating,
+    locked,
+    replacing,
+    replacing_folder,
+    staging,
+)
 
 
 @pytest.mark.parametrize("names", [None, "the temporary one"])
@@ -30,6 +37,45 @@ def test_a_full_disk_names_the_file_that_was_to_be_written(tmp_path, names):
     assert caught.value.filename == str(path)
     assert [each.name for each in tmp_path.iterdir()] == ["image.h5"]
     assert path.read_text() == "before"
+
+
+@pytest.mark.parametrize(
+    ("write", "within", "named"),
+    [
+        (creating, "x/zarr.json", "made/x/zarr.json"),
+        (replacing_folder, "tiles/0/1.png", "made/tiles/0/1.png"),
+        (staging, "focus.h5", "made/focus.h5"),
+        (staging, None, "made"),
+        (assembling, "", "made"),
+        (assembling, ".aux.xml", "made.aux.xml"),
+    ],
+)
+def test_an_error_in_a_temporary_folder_names_the_later_file(tmp_path, write, within, named):
+    made = tmp_path / "made"
+    if write is staging:
+        made.mkdir()
+
+    def fill():
+        with write(made) as part:
+            name = f"{part}{within}" if write is assembling else within and str(part / within)
+            raise OSError(errno.EDQUOT, "Disk quota exceeded", name)
+
+    with pytest.raises(OSError, match="quota") as caught:
+        fill()
+    assert (caught.value.errno, caught.value.filename) == (errno.EDQUOT, str(tmp_path / named))
+    assert not list(tmp_path.rglob("*.part"))
+
+
+@pytest.mark.parametrize("name", ["focus.h5", "image.png"])
+def test_a_full_disk_names_a_file_in_a_folder_whose_files_are_to_move(tmp_path, name):
+    def write():
+        with staging(tmp_path) as folder, replacing(folder / name) as part:
+            part.write_text("half")
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OSError, match="No space") as caught:
+        write()
+    assert caught.value.filename == str(tmp_path / name)
 
 
 def killed_in(statement, folder):
