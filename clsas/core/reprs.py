@@ -24,10 +24,10 @@ _PREFIXES = {
     "m": ((1e-6, "µm"), (1e-3, "mm"), (0.1, "m")),  # metres from 0.1 m on, as people say it
     "s": ((1e-6, "µs"), (1e-3, "ms"), (1.0, "s")),
     "Hz": ((1.0, "Hz"), (1e3, "kHz"), (1e6, "MHz"), (1e9, "GHz")),
-    "bytes": ((1.0, "bytes"), (2**20, "MiB"), (2**30, "GiB")),
+    "bytes": ((1.0, "bytes"), (2**10, "KiB"), (2**20, "MiB"), (2**30, "GiB")),
 }
 _SCALES = {"µm": 1e-6, "mm": 1e-3, "µs": 1e-6, "ms": 1e-3}
-_SCALES |= {"kHz": 1e3, "MHz": 1e6, "GHz": 1e9, "MiB": 2**20, "GiB": 2**30}
+_SCALES |= {"kHz": 1e3, "MHz": 1e6, "GHz": 1e9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 _DIGITS = {"s": 4, "bytes": 4, "dB": 4}  # significant digits; other units, such as metres, have 6
 _MOST_ITEMS = 4  # longer tuples and arrays are described by their size
 

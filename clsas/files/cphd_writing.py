@@ -114,9 +114,10 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
 
 def write_vectors(sarkit: Any, file: Any, tree: Any, vectors: NDArray, signal: NDArray) -> None:
     """Write a CPHD document with the vectors and the signal of its only channel."""
-    with sarkit.Writer(file, sarkit.Metadata(xmltree=tree)) as writer:
-        writer.write_pvp(_CHANNEL, vectors)
-        writer.write_signal(_CHANNEL, signal)
+    # As a context manager, the writer would print a warning about missing arrays after an error.
+    writer = sarkit.Writer(file, sarkit.Metadata(xmltree=tree))
+    writer.write_pvp(_CHANNEL, vectors)
+    writer.write_signal(_CHANNEL, signal)
 
 
 def _vectors(lines: RangeLines, origin_m: NDArray) -> tuple[NDArray, NDArray[np.complex64]]:

@@ -9,10 +9,7 @@ are averaged themselves. Memory is bounded by the window.
 
 from __future__ import annotations
 
-import errno
 import math
-import os
-import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -33,7 +30,7 @@ from clsas.maps.bands import Band, bands_of
 from clsas.maps.carrier import Carrier
 from clsas.maps.collection import Collection
 from clsas.maps.encoding import Encoding, colour_table
-from clsas.maps.geotiff_checks import FULL_BYTES, check_space, check_whole
+from clsas.maps.geotiff_checks import check_space, check_whole, raise_cause
 from clsas.maps.interpolation import InexactError, Interpolation
 from clsas.maps.orientation import Orientation
 from clsas.maps.resampling import Resampling, north_up, steps_m
@@ -122,10 +119,7 @@ def write(
         except Exception as error:
             if not type(error).__module__.startswith("rasterio"):
                 raise
-            # GDAL prints the cause of a failed write, but does not report it.
-            if shutil.disk_usage(folder).free < FULL_BYTES:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
-            raise OSError(errno.EIO, f"GDAL cannot write the file ({error})") from error
+            raise_cause(folder, str(error))
         source.check_unchanged()
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import errno
 import itertools
 import math
-import os
 import shutil
+import tempfile
 from pathlib import Path
+from typing import NoReturn
 
 from clsas.core import reprs
 
-FULL_BYTES = 1 << 24
-"""Free space of a disk on which a write failed because it is full."""
+_FULL_BYTES = 1 << 24  # free space below which a disk may be too full for what GDAL writes at once
 
 
 def check_space(folder: Path, least_bytes: int) -> None:
@@ -48,4 +48,14 @@ def check_whole(path: Path) -> None:
                         for name in ("BLOCK_OFFSET", "BLOCK_SIZE")
                     )
                     if not place or place + length > size_bytes:
-                        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                        raise_cause(path.parent, "a tile is missing")
+
+
+def raise_cause(folder: Path, reported: str) -> NoReturn:
+    """Raise the OSError of a write of GDAL that failed, of which GDAL prints the cause only.
+
+    It is that of a full disk or quota if the folder has one, or else says what was reported.
+    """
+    with tempfile.TemporaryFile(dir=folder) as file:
+        file.write(bytes(_FULL_BYTES))
+    raise OSError(errno.EIO, f"GDAL cannot write the file ({reported})")

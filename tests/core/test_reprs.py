@@ -169,6 +169,8 @@ def test_numbers_have_prefixes_that_suit_them():
     assert reprs.quantity(0, "Hz") == "0 Hz"
     assert reprs.quantity(1.25e9, "Hz") == "1.25 GHz"
     assert reprs.quantity(3 << 29, "bytes") == "1.5 GiB"
+    assert reprs.quantity(205_517, "bytes") == "200.7 KiB"
+    assert reprs.quantity(1023, "bytes") == "1023 bytes"
     assert reprs.quantity(float("-inf"), "dB") == "-inf dB"
     assert reprs.span(-0.0, 1 / 3, "m") == "0 to 0.333333 m"
 

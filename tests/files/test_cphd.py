@@ -1,5 +1,6 @@
 """CPHD files in both domains, monostatic and bistatic, written and read."""
 
+import errno
 import subprocess
 import sys
 from dataclasses import replace
@@ -411,3 +412,17 @@ def test_damaged_files_end_in_one_error_or_in_lines(tmp_path):
     whole = (tmp_path / "pass.cphd").read_bytes()
     # Header, XML and vectors.
     assert refused(whole, tmp_path / "damaged.cphd", number=100, flips=5, within=9000) > 50
+
+
+@pytest.mark.parametrize("written", ["write_pvp", "write_signal"])
+def test_a_full_disk_is_the_only_message(tmp_path, monkeypatch, caplog, written):
+    """The writer's own warning about arrays that are missing would hide the cause."""
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(sarkit.cphd.Writer, written, full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*a\.cphd'"):
+        write_cphd(tmp_path / "a.cphd", sonar_lines())
+    assert not caplog.records
+    assert not list(tmp_path.iterdir())

@@ -1,6 +1,7 @@
 """GeoTIFF of images and mosaics: where pixels land, what they are, what errors leave behind."""
 
 import errno
+import io
 import os
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from tiers import also
 
 import clsas
 from clsas.core.validate import ClsasWarning
+from clsas.maps import geotiff, geotiff_checks
 
 pyproj = pytest.importorskip("pyproj")
 rasterio = pytest.importorskip("rasterio")
@@ -280,6 +282,34 @@ def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch, free):
     with pytest.raises(OSError, match=r"the export needs .* of free space") as caught:
         clsas.export(image, tmp_path / "a.tif")
     assert caught.value.errno == errno.ENOSPC
+    assert caught.value.filename == str(tmp_path / "a.tif")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("full", [errno.ENOSPC, errno.EDQUOT, None])
+@pytest.mark.parametrize("noticed", ["on a write", "by missing tiles"])
+def test_a_failed_write_of_gdal_tells_a_full_disk_or_quota(tmp_path, monkeypatch, full, noticed):
+    """GDAL reports neither, and leaves out tiles that it cannot write when it closes a file."""
+    image, _ = scene(UTM_NORTH)
+
+    def write(export, path, *_):
+        if noticed == "on a write":
+            raise rasterio.errors.RasterioIOError("Write failed. See previous exception for details.")
+        profile = {"driver": "GTiff", "dtype": "uint8", "count": 1, "sparse_ok": True}
+        with warnings.catch_warnings(action="ignore"):  # it has no georeference
+            rasterio.open(path, "w", width=99, height=99, **profile).close()
+            geotiff_checks.check_whole(path)
+
+    def temporary(**_):
+        if full:
+            raise OSError(full, os.strerror(full))
+        return io.BytesIO()
+
+    monkeypatch.setattr(geotiff._Export, "write", write)
+    monkeypatch.setattr("tempfile.TemporaryFile", temporary)
+    with pytest.raises(OSError, match="" if full else "GDAL cannot write the file") as caught:
+        clsas.export(image, tmp_path / "a.tif")
+    assert caught.value.errno == (full or errno.EIO)
     assert caught.value.filename == str(tmp_path / "a.tif")
     assert not list(tmp_path.iterdir())
 
