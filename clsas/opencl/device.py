@@ -14,6 +14,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from textwrap import indent
 from typing import Any
 
 import numpy as np
@@ -25,10 +26,10 @@ from clsas.opencl.kernels import Kernel, kernel_parameters, kernel_source, whole
 from clsas.opencl.refusals import (
     POCL,
     DeviceError,
+    check_cache,
     check_process,
     no_device,
     no_match,
-    not_built,
     prepare_caches,
 )
 
@@ -188,11 +189,14 @@ class Device:
         text = whole_source(f"{name}.cl")
         parameters = kernel_parameters(text, name, options)
         start = time.perf_counter()
+        what = f"{self.info.label} could not build {name}.cl with {' '.join(definitions)}"
         try:
             program = _built(self.context, text, ["-cl-mad-enable", *definitions])
+        except DeviceError as error:
+            raise DeviceError(f"{what}: {error}") from error
         except cl.RuntimeError as error:
-            what = f"{self.info.label} could not build {name}.cl with {' '.join(definitions)}"
-            raise not_built(what, self.info.platform, error) from error
+            log = indent(str(error), "  ", lambda line: True)
+            raise DeviceError(f"{what}:\n{log}") from error
         # Program.all_kernels is avoided, because PyOpenCL never releases the kernels it returns.
         compiled = cl.Kernel(program, name)
         self._build_times_s.append(time.perf_counter() - start)
@@ -320,7 +324,16 @@ def aligned(make: Callable[..., np.ndarray], shape: tuple[int, ...], kind: DType
 
 
 def _built(context: cl.Context, text: str, options: Sequence[str] = ()) -> cl.Program:
-    """Return a built program."""
+    """Return a built program.
+
+    Raises
+    ------
+    DeviceError
+        If PoCL has too little space, for which LLVM would end the process.
+    pyopencl.RuntimeError
+        If the driver's compiler refuses the program.
+    """
+    check_cache(context.devices[0].platform.name)
     with warnings.catch_warnings():
         # Some compilers print a greeting. If a build fails, the error contains the log in any case.
         warnings.simplefilter("ignore", cl.CompilerWarning)
@@ -364,7 +377,7 @@ def _compiled_vectors(device: cl.Device) -> tuple[int, bool]:
         context = cl.Context([device])
         kernel = cl.Kernel(_built(context, kernel_source("vector_size.cl")), "vector_size")
         size = kernel.get_work_group_info(cl.kernel_work_group_info.COMPILE_WORK_GROUP_SIZE, device)
-    except cl.Error:  # the error is reported when a kernel is built for an image
+    except (cl.Error, DeviceError):  # the error is reported when a kernel is built for an image
         return 4, False
     lanes, permute, _ = size
     return (lanes, permute == 2) if lanes in (8, 16) else (4, False)

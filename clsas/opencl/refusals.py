@@ -7,7 +7,6 @@ import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from textwrap import indent
 from typing import TYPE_CHECKING
 
 import pyopencl as cl
@@ -31,7 +30,9 @@ No OpenCL device was found. Any one of the following provides one:
 POCL = "Portable Computing Language"
 """Name of PoCL's platform."""
 _POCL_VARIABLE = "POCL_CACHE_DIR"
-_KERNEL_BYTES = 1 << 16  # arbitrary size of a kernel on disk, for which a full disk has no room
+# Space that PoCL needs to build a kernel. Those of an image took up to 1.2 MiB at a time, most of
+# which PoCL frees again. If less is left, LLVM ends the process.
+_KERNEL_BYTES = 4 << 20
 
 
 class DeviceError(RuntimeError):
@@ -57,11 +58,10 @@ def no_match(what: str, devices: Sequence[DeviceInfo]) -> DeviceError:
     return DeviceError(f"No device matches {what}{why and f'. {why}'}")
 
 
-def not_built(what: str, platform: str, error: cl.Error) -> DeviceError:
-    """Return the error for a build that failed, with the log of the platform's driver."""
+def check_cache(platform: str) -> None:
+    """Raise DeviceError if a platform has no cache folder, or no space in it, to build a kernel."""
     if platform == POCL and (why := _pocl_problem()):
-        return DeviceError(f"{what}: {why}")
-    return DeviceError(f"{what}:\n{indent(str(error), '  ', lambda line: True)}")
+        raise DeviceError(why)
 
 
 def _platforms() -> list[cl.Platform]:
@@ -102,7 +102,7 @@ def prepare_caches() -> str:
     """
     try:
         for name in ("pytools", "pyopencl"):
-            made_private(user_caches() / name, "XDG_CACHE_HOME")
+            _check_space(made_private(user_caches() / name, "XDG_CACHE_HOME"))
     except OSError:
         # The variable PYOPENCL_NO_CACHE is read when PyOpenCL is imported, which is too early.
         cl._PYOPENCL_NO_CACHE = True
@@ -122,11 +122,17 @@ def _pocl_problem() -> str:
         return why
     folder = os.environ[_POCL_VARIABLE]
     try:
-        with tempfile.TemporaryFile(dir=folder) as file:
-            file.write(bytes(_KERNEL_BYTES))
+        _check_space(Path(folder))
     except OSError as error:
         return (
-            f"PoCL cannot write its cache folder {folder!r} ({error.strerror}). Set the "
-            f"environment variable {_POCL_VARIABLE} to a folder that can be written"
+            f"PoCL cannot write {_KERNEL_BYTES >> 20} MiB to its cache folder {folder!r} "
+            f"({error.strerror}). Set the environment variable {_POCL_VARIABLE} to a folder that "
+            "can be written"
         )
     return ""
+
+
+def _check_space(folder: Path) -> None:
+    """Raise OSError if there is no space for a kernel in a folder, or it cannot be written."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        file.write(bytes(_KERNEL_BYTES))

@@ -294,7 +294,9 @@ def test_a_failed_write_of_gdal_tells_a_full_disk_or_quota(tmp_path, monkeypatch
 
     def write(export, path, *_):
         if noticed == "on a write":
-            raise rasterio.errors.RasterioIOError("Write failed. See previous exception for details.")
+            raise rasterio.errors.RasterioIOError(
+                "Write failed. See previous exception for details."
+            )
         profile = {"driver": "GTiff", "dtype": "uint8", "count": 1, "sparse_ok": True}
         with warnings.catch_warnings(action="ignore"):  # it has no georeference
             rasterio.open(path, "w", width=99, height=99, **profile).close()

@@ -135,34 +135,44 @@ def test_a_cache_that_pocl_cannot_write_is_named(anew, no_folder):
         ("CLSAS_CACHE", no_folder),
     ):
         anew(**{variable: folder})
-        for error in (
-            refusals.no_device(),
-            refusals.not_built("image.cl", refusals.POCL, ValueError("a log")),
-        ):
+        with pytest.raises(DeviceError) as caught:
+            refusals.check_cache(refusals.POCL)
+        for error in (refusals.no_device(), caught.value):
             assert f"PoCL cannot be used: the cache folder {folder}" in str(error)
             assert f"environment variable {variable}" in str(error)
             assert "pip install" not in str(error)
-        other = refusals.not_built("image.cl", "NVIDIA CUDA", ValueError("a log"))
-        assert str(other) == "image.cl:\n  a log"
+        refusals.check_cache("NVIDIA CUDA")
 
 
-def test_a_cache_that_is_full_is_named(anew, tmp_path, monkeypatch):
+@pytest.mark.parametrize("full", [errno.ENOSPC, errno.EDQUOT])
+def test_a_cache_that_is_full_is_named_before_anything_is_built(anew, tmp_path, monkeypatch, full):
+    """LLVM ends the process if it cannot write a kernel."""
+    device = open_device()
     assert anew(POCL_CACHE_DIR=tmp_path / "cache") == ""
 
-    def full(**_):
-        raise OSError(errno.ENOSPC, "No space left on device")
+    def temporary(**_):
+        raise OSError(full, os.strerror(full))
 
-    monkeypatch.setattr("tempfile.TemporaryFile", full)
-    said = str(refusals.not_built("image.cl", refusals.POCL, ValueError("a log")))
-    assert f"PoCL cannot write its cache folder '{tmp_path / 'cache'}' (No space" in said
+    monkeypatch.setattr("tempfile.TemporaryFile", temporary)
+    monkeypatch.setattr(pyopencl, "Program", lambda *_: pytest.fail("it was built"))
+    monkeypatch.setattr(refusals, "POCL", device.info.platform)
+    with pytest.raises(DeviceError, match=r"could not build peak.cl with -D.*: PoCL") as caught:
+        device.kernel("peak", WIDTH=1, CHAINS=3)
+    said = str(caught.value)
+    assert f"PoCL cannot write 4 MiB to its cache folder '{tmp_path / 'cache'}' (" in said
+    assert os.strerror(full) in said
     assert "environment variable POCL_CACHE_DIR" in said
+
+
+def test_a_kernel_that_is_refused_comes_with_the_log_of_the_compiler():
+    with pytest.raises(DeviceError, match=r"could not build peak.cl with -Dfloat=3:\n  .*\n"):
+        open_device().kernel("peak", float=3)
 
 
 def test_with_a_cache_the_error_is_another(anew, tmp_path):
     anew(POCL_CACHE_DIR=tmp_path / "made" / "anew")
     assert "pip install" in str(refusals.no_device())
-    said = str(refusals.not_built("image.cl", refusals.POCL, ValueError("a log")))
-    assert said == "image.cl:\n  a log"
+    refusals.check_cache(refusals.POCL)
 
 
 def test_pocl_keeps_kernels_in_the_cache_folder_unless_another_is_named(
@@ -186,6 +196,21 @@ def test_pyopencl_uses_its_cache_only_if_it_is_private(anew, open_folder, tmp_pa
         anew(XDG_CACHE_HOME=folder, CLSAS_CACHE=tmp_path / "cache")
         assert is_used != pyopencl._PYOPENCL_NO_CACHE
     assert not list(open_folder.iterdir())
+
+
+@pytest.mark.parametrize("full", [errno.ENOSPC, errno.EDQUOT])
+def test_pyopencl_uses_no_cache_that_is_full(anew, tmp_path, monkeypatch, full):
+    """Its data base would raise an error that names no file."""
+    folders = []
+
+    def temporary(dir):
+        folders.append(Path(dir))
+        raise OSError(full, os.strerror(full))
+
+    monkeypatch.setattr("tempfile.TemporaryFile", temporary)
+    anew(XDG_CACHE_HOME=tmp_path / "caches", CLSAS_CACHE=tmp_path / "cache")
+    assert pyopencl._PYOPENCL_NO_CACHE
+    assert folders == [tmp_path / "caches" / "pytools"]
 
 
 ACCOUNT = 4242  # has no entry in the list of users
