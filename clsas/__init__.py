@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from clsas.core.sound_speed import SoundSpeed
     from clsas.core.validate import ClsasWarning
     from clsas.exact.wavenumber import wavenumber
+    from clsas.factorized.plan import Plan
     from clsas.files.airsas import read_airsas
     from clsas.files.cphd import read_cphd
     from clsas.files.cphd_writing import write_cphd
@@ -50,7 +51,6 @@ if TYPE_CHECKING:
     from clsas.navigation.known_points import Calibration, calibrate_track
     from clsas.navigation.micronavigation import Micronavigation, micronavigate
     from clsas.opencl.device import DeviceError, list_devices
-    from clsas.plans.plan import Plan
     from clsas.processing.chain import Processed, process
     from clsas.signal.band_parts import sub_bands
     from clsas.signal.compression import compress
@@ -166,7 +166,7 @@ _MODULES = {
     "core.sound_speed": "SoundSpeed",
     "core.validate": "ClsasWarning",
     "exact.wavenumber": "wavenumber",
-    "plans.plan": "Plan",
+    "factorized.plan": "Plan",
     "files.airsas": "read_airsas",
     "files.cphd": "read_cphd",
     "files.cphd_writing": "write_cphd",

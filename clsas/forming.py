@@ -11,11 +11,10 @@ from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
 from clsas.exact.decide import ACCURACY_DB, Decision, decide
 from clsas.exact.run import ExactImager
+from clsas.factorized.plan import ExactImage, Plan
 from clsas.factorized.stages import FactorizedImager
 from clsas.factorized.track import MeanTrack
 from clsas.opencl.device import Device, open_device
-from clsas.plans.factorization import ExactImage
-from clsas.plans.plan import Plan
 from clsas.scene import Scene, check_numbers
 from clsas.sonar.beam import BeamWindow
 

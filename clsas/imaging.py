@@ -22,11 +22,10 @@ from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.exact.decide import ACCURACY_DB, BEST_ACCURACY_DB
 from clsas.factorized.costs import Costs
+from clsas.factorized.plan import ExactImage, Plan
 from clsas.factorized.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, Request, planned
 from clsas.forming import Progress, SceneImager, form, scene_of_plan
 from clsas.opencl.device import Device, open_device
-from clsas.plans.factorization import ExactImage
-from clsas.plans.plan import Plan
 from clsas.scene import Scene
 from clsas.signal.spectrum import (
     FEW_CHANNELS,

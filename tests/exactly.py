@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from clsas.exact.decide import ACCURACY_DB, Decision, decide
+from clsas.factorized.plan import ExactImage
 from clsas.factorized.sampled import SampledRoots, SampledScene
 from clsas.forming import SceneImager
 from clsas.opencl.device import Device, open_device
-from clsas.plans.factorization import ExactImage
 from clsas.scene import Scene
 from clsas.trials import reference
 

@@ -29,12 +29,12 @@ from clsas.cli.wording import command
 from clsas.core import validate
 from clsas.core.image import holds_any
 from clsas.exact.decide import ACCURACY_DB
+from clsas.factorized.plan import ExactImage
 from clsas.factorized.planner import WORST_TOLERANCE_DB
 from clsas.files.scene_tables import PLAN_KEYS
 from clsas.forming import SceneImager, scene_of_plan
 from clsas.measures.tradeoff import summary
 from clsas.opencl.device import Device, KernelTimes, open_device
-from clsas.plans.factorization import ExactImage
 from clsas.scene import Scene
 from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 

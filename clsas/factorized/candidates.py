@@ -40,6 +40,15 @@ from clsas.factorized.errors import (
     with_range_filters,
 )
 from clsas.factorized.filters import FilterRates, Filters, steering_spectrum
+from clsas.factorized.plan import (
+    ErrorBudget,
+    ExactImage,
+    Factorization,
+    Plan,
+    Prediction,
+    Stage,
+    Work,
+)
 from clsas.factorized.sampled import SampledRoots, Side
 from clsas.factorized.search import (
     Allowed,
@@ -57,9 +66,6 @@ from clsas.factorized.virtual_channels import InterpolatedAperture, NearestBeams
 from clsas.opencl import phases
 from clsas.opencl.buffers import padded_length
 from clsas.opencl.device import Device
-from clsas.plans.factorization import ExactImage, Factorization
-from clsas.plans.plan import Plan
-from clsas.plans.predictions import ErrorBudget, Prediction, Stage, Work
 from clsas.scene import Scene
 from clsas.signal.interpolation import Interpolator
 from clsas.signal.spectrum import OUTSIDE, occupied_band

@@ -21,6 +21,7 @@ from clsas.factorized.buffers import (
     stage_tables,
     tile_buffers,
 )
+from clsas.factorized.plan import Amount, CostSource, Work
 from clsas.factorized.sampled import SampledRoots, Side
 from clsas.opencl.buffers import (
     Buffer,
@@ -32,7 +33,6 @@ from clsas.opencl.buffers import (
 )
 from clsas.opencl.device import Device, DeviceInfo
 from clsas.opencl.upsampling import upsampling_buffers
-from clsas.plans.predictions import Amount, CostSource, Work
 from clsas.scene import Scene
 from clsas.signal.interpolation import COST
 

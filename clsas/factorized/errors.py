@@ -26,6 +26,7 @@ from clsas.exact.layout import BLOCKS, lookup_room
 from clsas.factorized.buffers import CHUNK
 from clsas.factorized.filters import LONGEST_UPSAMPLING_SHARE, UPSAMPLING_SHARE, Filters, Gain
 from clsas.factorized.phase_rates import drift, interpolated_directions, stretches
+from clsas.factorized.plan import ErrorBudget
 from clsas.factorized.sampled import (
     SAMPLED_PIXELS,
     SPREAD_POINTS,
@@ -47,7 +48,6 @@ from clsas.factorized.virtual_channels import (
 )
 from clsas.opencl import phases
 from clsas.opencl.device import Device
-from clsas.plans.predictions import ErrorBudget
 from clsas.signal import interpolation
 from clsas.signal.interpolation import PHASES, Interpolator, Resampling, Upsampler
 from clsas.sonar.beam import BeamWindow

@@ -38,13 +38,12 @@ from clsas.factorized.costs import (
     defaults,
     predict_exact,
 )
+from clsas.factorized.plan import Plan, Work
 from clsas.factorized.sampled import SampledRoots, SampledScene
 from clsas.factorized.search import Allowed
 from clsas.forming import form, form_exactly, scene_of_plan
 from clsas.opencl.buffers import padded_length, upsampled_lines
 from clsas.opencl.device import Device, DeviceInfo
-from clsas.plans.plan import Plan
-from clsas.plans.predictions import Work
 from clsas.scene import Scene
 from clsas.signal import interpolation
 from clsas.signal.interpolation import Resampling

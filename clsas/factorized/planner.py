@@ -39,14 +39,12 @@ from clsas.factorized.costs import (
 )
 from clsas.factorized.errors import MARGIN_DB, leaf_error, nearest_errors
 from clsas.factorized.filters import ALIGN_TAPS
+from clsas.factorized.plan import UNREACHED, ErrorBudget, Plan
 from clsas.factorized.sampled import SampledRoots, SampledScene, Side, points_at_m
 from clsas.factorized.search import MOST_STAGES, Allowed
 from clsas.factorized.track import MeanTrack, shapes_after
 from clsas.factorized.virtual_channels import NearestBeams
 from clsas.opencl.device import Device
-from clsas.plans.factorization import UNREACHED
-from clsas.plans.plan import Plan
-from clsas.plans.predictions import ErrorBudget
 from clsas.scene import Scene
 from clsas.signal import interpolation
 from clsas.sonar.beam import BeamWindow

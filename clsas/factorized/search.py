@@ -34,6 +34,7 @@ from clsas.factorized.filters import (
     FilterRates,
     choose,
 )
+from clsas.factorized.plan import Work
 from clsas.factorized.sampled import (
     INNER_POINTS,
     SampledRoots,
@@ -43,7 +44,6 @@ from clsas.factorized.sampled import (
 )
 from clsas.opencl.buffers import GUARD
 from clsas.opencl.device import Device
-from clsas.plans.predictions import Work
 from clsas.signal.interpolation import PHASES, upsampler
 from clsas.signal.spectrum import Spectrum
 

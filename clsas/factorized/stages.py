@@ -25,6 +25,7 @@ from clsas.factorized.buffers import (
     stage_tables,
 )
 from clsas.factorized.leaves import Finish, LeafGroups, PlaneLeaves, SurfaceLeaves, leaf_groups
+from clsas.factorized.plan import Factorization, Plan
 from clsas.factorized.track import MeanTrack
 from clsas.factorized.tree import Geometry, Sector, geometry_of, references, sector_of
 from clsas.factorized.virtual_channels import VirtualChannels, band_table
@@ -41,8 +42,6 @@ from clsas.opencl.buffers import (
 )
 from clsas.opencl.device import Device, aligned
 from clsas.opencl.upsampling import upsample
-from clsas.plans.factorization import Factorization
-from clsas.plans.plan import Plan
 from clsas.scene import Scene
 
 _AHEAD_S = 0.1  # of enqueued work: hides the preparation of roots; an interruption waits for it

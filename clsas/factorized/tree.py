@@ -34,6 +34,7 @@ from clsas.factorized.phase_rates import (
     sheet_rates,
     stretches,
 )
+from clsas.factorized.plan import Factorization
 from clsas.factorized.track import MeanTrack, mean_track_of
 from clsas.factorized.virtual_channels import (
     ChannelRanges,
@@ -42,7 +43,6 @@ from clsas.factorized.virtual_channels import (
     all_channels,
 )
 from clsas.opencl.buffers import MARGIN
-from clsas.plans.factorization import Factorization
 from clsas.scene import Scene
 from clsas.signal.ray_corrections import Corrections
 from clsas.sonar.beam import BeamWindow

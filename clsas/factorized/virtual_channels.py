@@ -12,25 +12,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from clsas.core import reprs
-from clsas.core.fields import CONFIG, Constraint, Whole
 from clsas.factorized.filters import edges_gain
 from clsas.factorized.phase_rates import SheetRates
 from clsas.factorized.track import APART, MeanTrack, Shape
-from clsas.signal.fields import RangeFilter
 from clsas.signal.interpolation import Gain, Interpolator
 
 _SMOOTHED_CHANNELS = 2.5  # rms width over which the spacing is smoothed, virtual channels
 _LEAST_RATE = 0.3  # lower bound of phase rates, relative to their mean over the track
 _LEAST_CHANNELS = 2.0  # lower bound of the virtual channels between the ends of the track
-
-_Cycles = Annotated[float, Constraint(ge=-0.5, le=0.5)]
 
 Stages = Sequence[tuple[int, int]]
 """(QR, QI) of each stage: the number of lines summed, and the divisor of both image sides."""
@@ -56,10 +52,10 @@ class InterpolatedAperture:
         Frequencies for which all filters were designed, cycles per sample.
     """
 
-    filter: RangeFilter
-    oversampling: tuple[Annotated[float, Constraint(ge=1.0, le=100.0)], ...]
-    beam_cycles: Annotated[float, Constraint(ge=0.0, le=1e3)]
-    band: tuple[_Cycles, _Cycles]
+    filter: Interpolator
+    oversampling: tuple[float, ...]
+    beam_cycles: float
+    band: tuple[float, float]
     shape: Shape = "track"
     method: Literal["interpolated"] = "interpolated"
 
@@ -69,7 +65,6 @@ class InterpolatedAperture:
     splits_leaves: ClassVar[bool] = False
     """Leaves are small enough for expansions of ranges about their centres."""
 
-    __pydantic_config__ = CONFIG
     __repr__ = reprs.of_fields
 
     @property
@@ -633,7 +628,7 @@ class NearestBeams:
         Number of neighbours that are summed into one virtual channel, QR, stage by stage.
     """
 
-    factors: Annotated[tuple[Whole, ...], Constraint(min_length=1)]
+    factors: tuple[int, ...]
     method: Literal["nearest"] = "nearest"
 
     filter: ClassVar[Interpolator] = Interpolator(1, 1.0, np.zeros((0, 2, 0)), -math.inf, -math.inf)
@@ -647,8 +642,6 @@ class NearestBeams:
     aligns_phases: ClassVar[bool] = False
     splits_leaves: ClassVar[bool] = True
     """Leaves have the size that the stages define, and are backprojected in smaller tiles."""
-
-    __pydantic_config__ = CONFIG
 
     @property
     def stages(self) -> int:

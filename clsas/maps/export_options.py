@@ -7,9 +7,9 @@ from typing import Any
 
 from clsas.core import validate
 from clsas.core.lines import RangeLines
+from clsas.factorized.plan import Plan
 from clsas.maps import geotiff, netcdf, sicd
 from clsas.maps.encoding import KINDS
-from clsas.plans.plan import Plan
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.sonar.beam import BeamWindow
 

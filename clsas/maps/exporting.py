@@ -14,6 +14,7 @@ from clsas.core.image import Image
 from clsas.core.lines import RangeLines
 from clsas.core.sidecars import remove_sidecars
 from clsas.core.version import __version__
+from clsas.factorized.plan import Plan
 from clsas.interferometry.result import Heights
 from clsas.maps import geotiff, netcdf, sicd, viewer, world_files
 from clsas.maps.collection import check_lines
@@ -23,7 +24,6 @@ from clsas.maps.interpolation import check_image
 from clsas.maps.orientation import Orientation
 from clsas.maps.sources import Source
 from clsas.mosaics.store import Store
-from clsas.plans.plan import Plan
 from clsas.plot import heights as heights_picture
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.plot.canvas import save as save_picture

@@ -20,6 +20,7 @@ from clsas.core.sound_speed import SoundSpeed
 from clsas.core.wavelengths import band_wavelength_m
 from clsas.factorized.costs import Costs
 from clsas.factorized.errors import half_precision_error
+from clsas.factorized.plan import Plan
 from clsas.factorized.planner import TOLERANCE_DB, checked_tolerance_db
 from clsas.forming import form
 from clsas.imaging import plan
@@ -34,7 +35,6 @@ from clsas.measures.effects import (
     errors_without,
 )
 from clsas.opencl.device import Device, open_device
-from clsas.plans.plan import Plan
 from clsas.scene import Scene
 from clsas.signal.compression import Window
 from clsas.signal.compression import check_options as check_compression

@@ -19,6 +19,7 @@ from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
 from clsas.exact.decide import ACCURACY_DB
 from clsas.factorized.filters import ALIGN_TAPS, APERTURE_TAPS
+from clsas.factorized.plan import Plan
 from clsas.factorized.planner import (
     BEST_TOLERANCE_DB,
     WORST_TOLERANCE_DB,
@@ -33,7 +34,6 @@ from clsas.measures.quality import measure_point
 from clsas.measures.shadows import DARKEST, dark_level_db
 from clsas.measures.tradeoff_result import Response, Row, Tradeoff
 from clsas.opencl.device import Device, open_device
-from clsas.plans.plan import Plan
 from clsas.signal.doubts import warn_before_imaging
 from clsas.sonar.beam import BeamWindow
 

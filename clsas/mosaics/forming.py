@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from clsas.core.grid import Grid
 from clsas.core.image import Image, holds_any
 from clsas.core.lines import RangeLines
+from clsas.factorized.plan import ExactImage, Plan
 from clsas.factorized.planner import Request, planned, tolerance_in_db
 from clsas.forming import SceneImager, form
 from clsas.mosaics.devices import process_device, thread_device
@@ -26,8 +27,6 @@ from clsas.mosaics.store import Store
 from clsas.mosaics.survey import Survey, largest_gap_m, open_files
 from clsas.mosaics.visibility import SurveyVisibility
 from clsas.opencl.device import Device
-from clsas.plans.factorization import ExactImage
-from clsas.plans.plan import Plan
 from clsas.scene import Scene
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.coverage import reaches

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from clsas.core import validate
 from clsas.core.decibels import in_db
-from clsas.plans.plan import Plan
+from clsas.factorized.plan import Plan
 from clsas.plot.canvas import drawable, new_figure
 
 if TYPE_CHECKING:

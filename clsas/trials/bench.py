@@ -15,6 +15,7 @@ from clsas.core.grid import Grid
 from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.core.lines import RangeLines
+from clsas.factorized.plan import ExactImage
 from clsas.forming import SceneImager, form_exactly
 from clsas.imaging import Imager, factorize, plan
 from clsas.interferometry.heights import heights
@@ -24,7 +25,6 @@ from clsas.measures.tradeoff import REFERENCE_DB
 from clsas.mosaics.mosaic import mosaic
 from clsas.mosaics.store import Record
 from clsas.opencl.device import Device, open_device
-from clsas.plans.factorization import ExactImage
 from clsas.scene import Scene
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines

@@ -15,10 +15,10 @@ from clsas.core import validate
 from clsas.core.image import Image
 from clsas.exact.wavenumber import wavenumber
 from clsas.factorized.costs import Costs
+from clsas.factorized.plan import Plan
 from clsas.imaging import backproject, factorize, plan
 from clsas.mosaics.mosaic import mosaic
 from clsas.opencl.device import Device, DeviceInfo, open_device
-from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import extremes
 from clsas.trials.extremes import Known, along_x

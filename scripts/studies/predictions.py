@@ -10,11 +10,11 @@ from functools import partial
 
 from clsas.factorized import measured_costs as costs
 from clsas.factorized.costs import KnownCosts, predict_exact
+from clsas.factorized.plan import costs_in_words
 from clsas.factorized.sampled import SampledRoots, SampledScene
 from clsas.forming import form_exactly
 from clsas.imaging import factorize, plan
 from clsas.opencl.device import Device
-from clsas.plans.report import costs_in_words
 from clsas.scene import Scene
 from clsas.trials import cases
 from studies.tables import TOLERANCES_DB

@@ -19,10 +19,10 @@ import clsas
 from clsas import plot
 from clsas.core.image_error import levels
 from clsas.exact.decide import ACCURACY_DB
+from clsas.factorized.plan import ExactImage
 from clsas.forming import form
 from clsas.measures.shadows import dark_level_db
 from clsas.opencl.device import open_device
-from clsas.plans.factorization import ExactImage
 from clsas.scene import Scene
 from clsas.simulation import seabeds
 from clsas.trials import bench, cases, wreck

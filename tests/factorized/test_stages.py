@@ -39,9 +39,9 @@ from clsas.core.lines import RangeLines, some_channels
 from clsas.core.validate import ClsasWarning
 from clsas.factorized.costs import Costs
 from clsas.factorized.errors import HALF_ROUNDING
+from clsas.factorized.plan import Plan
 from clsas.forming import form_exactly
 from clsas.imaging import backproject, factorize
-from clsas.plans.plan import Plan
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 from clsas.sonar.beam import BeamWindow

@@ -15,11 +15,11 @@ from clsas.core.image import Image
 from clsas.core.image_error import relative_error_db
 from clsas.factorized import planner
 from clsas.factorized.costs import Costs
+from clsas.factorized.plan import Plan
 from clsas.factorized.tree import geometry_of, sector_of
 from clsas.forming import scene_of_plan
 from clsas.imaging import backproject, factorize, plan
 from clsas.opencl.device import open_device
-from clsas.plans.plan import Plan
 from clsas.sonar.beam import BeamWindow
 from clsas.trials import reference
 from clsas.trials.selftest import driven

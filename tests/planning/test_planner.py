@@ -29,9 +29,9 @@ from clsas.core.grid import Grid
 from clsas.core.image_error import relative_error_db
 from clsas.factorized import candidates, measured_costs, planner
 from clsas.factorized.costs import Costs
+from clsas.factorized.plan import Plan
 from clsas.factorized.planner import trimmed
 from clsas.imaging import backproject, factorize, plan
-from clsas.plans.plan import Plan
 from clsas.signal.spectrum import OUTSIDE
 from clsas.sonar.beam import BeamWindow
 from clsas.sonar.visibility import sines

@@ -23,9 +23,9 @@ from clsas.core.digests import grid_digest, lines_digest, with_digest
 from clsas.core.grid import Grid
 from clsas.core.sound_speed import SoundSpeed
 from clsas.factorized import measured_costs as costs
+from clsas.factorized.plan import VERSION, Plan
 from clsas.imaging import factorize, plan
 from clsas.opencl.device import open_device
-from clsas.plans.plan import VERSION, Plan
 from clsas.sonar.beam import BeamWindow
 
 
@@ -198,17 +198,17 @@ def test_a_plan_with_a_wrong_value_is_refused(chosen, field, value):
         (
             "method.roots_at_once",
             0,
-            "method.roots_at_once must be greater than or equal to 1, got 0",
+            "method.roots_at_once must be at least 1, got 0",
         ),
-        ("method.half_precision", 1, "method.half_precision must be a valid boolean, got 1"),
+        ("method.half_precision", 1, "method.half_precision must be of type bool, got int"),
         ("method.colour", 1, "method.colour is unknown"),
-        ("method", {}, "method.kind must be given, got None"),
-        ("method", {"kind": "x"}, "method.kind must be 'factorized', 'exact', got 'x'"),
-        ("tolerance_db", float("nan"), "tolerance_db must be a number, got nan"),
+        ("method", {}, "method.kind must be one of 'factorized', 'exact', got None"),
+        ("method", {"kind": "x"}, "method.kind must be one of 'factorized', 'exact', got 'x'"),
+        ("tolerance_db", float("nan"), "tolerance_db must be finite dB, got nan"),
         (
             "method.half_lengths",
             [1],
-            r"method: half_lengths must be \d numbers, one for each stage, ",
+            r"method.half_lengths must be \d numbers, one for each stage, got \(1,\)",
         ),
     ],
 )
@@ -217,13 +217,73 @@ def test_the_message_names_the_mistake(chosen, field, value, message):
         Plan.from_json(replaced(chosen, field, value))
 
 
-@pytest.mark.parametrize("version", [1, VERSION - 1, VERSION + 1, "2"])
+@pytest.mark.parametrize("version", [VERSION - 1, VERSION + 1, "2", None])
 def test_a_plan_of_another_version_is_refused(chosen, version):
     values = changeable(chosen) | {"version": version}
-    if version == 1:  # it had no number, and its fields were not nested
-        values = values["method"] | {"tolerance_db": -50.0}
     with pytest.raises(ValueError, match=r"written by .*: make the plan again with clsas\.plan"):
         Plan.from_json(json.dumps(values))
+
+
+def places_of_numbers(value, path=()):
+    """The paths of all numbers in values of JSON, with one number of every list in a list."""
+    if isinstance(value, dict):
+        for name, part in value.items():
+            yield from places_of_numbers(part, (*path, name))
+    elif isinstance(value, list):
+        for number, part in enumerate(value[:1] if "coefficients" in path else value):
+            yield from places_of_numbers(part, (*path, number))
+    elif isinstance(value, (int, float)):
+        yield path
+
+
+@pytest.mark.slow
+def test_no_number_of_a_plan_can_be_replaced_unless_an_image_can_be_formed(any_plan):
+    """Numbers size buffers and indices: a kernel must not read or write beyond its buffers."""
+    lines, grid = made(swaying if any_plan.tolerance_db else straight)
+    text = any_plan.to_json()
+    for path in places_of_numbers(changeable(any_plan)):
+        for value in (1e30, -1, float("nan"), "x", [], None, True):
+            values = json.loads(text)
+            del values["digest"]
+            table = values
+            for part in path[:-1]:
+                table = table[part]
+            table[path[-1]] = value
+            read, refused = None, ""
+            try:
+                read = Plan.from_json(signed(values))
+            except ValueError as error:
+                refused = str(error)
+            if read is None:
+                *_, name = (part for part in path if isinstance(part, str))
+                assert name in re.findall(r"\w+", refused), (path, refused)
+            else:
+                assert read.describe()
+                if path[0] != "prediction":
+                    factorize(lines, grid, read)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("method.sides", [[64, 64]] * 65, "method.sides must be of 1 to 64 stages, got 65"),
+        ("method.half_lengths", [8] * 10**5, "method.half_lengths must be 3 numbers"),
+        ("method.aperture.oversampling", [1.0] * 10**5, "aperture.oversampling must be 3 numbers"),
+        ("method.tile", [16] * 10**5, "method.tile must be 2 numbers"),
+        ("left_out", ["refraction"] * 5, "left_out must be some of"),
+        ("prediction.stages", [], "prediction.stages must not be empty"),
+    ],
+)
+def test_a_list_of_another_length_is_refused(chosen, field, value, message):
+    with pytest.raises(ValueError, match=message):
+        Plan.from_json(replaced(chosen, field, value))
+
+
+def test_the_prediction_of_many_stages_is_refused(chosen):
+    values = changeable(chosen)
+    values["prediction"]["stages"] *= 1000
+    with pytest.raises(ValueError, match=r"prediction\.stages must be at most 65, got"):
+        Plan.from_json(signed(values))
 
 
 @pytest.mark.parametrize("coefficients", ["none", [[1.0]], [[[None]]], []])
@@ -235,11 +295,16 @@ def test_a_filter_that_is_none_is_refused(chosen, name, coefficients):
 
 def test_a_plan_with_a_field_too_many_or_too_few_is_refused(chosen):
     values = changeable(chosen)
-    with pytest.raises(ValueError, match="unknown"):
-        Plan.from_json(signed(values | {"unknown": 1}))
-    del values["method"]["sides"]
-    with pytest.raises(ValueError, match="method lacks 'sides'"):
-        Plan.from_json(signed(values))
+    with pytest.raises(ValueError, match=r"Plan\.to_json: colour is unknown"):
+        Plan.from_json(signed(values | {"colour": 1}))
+    for tables, name in (([], "left_out"), (["method"], "sides"), (["prediction", "work"], "leaf")):
+        less = changeable(chosen)
+        table = less
+        for each in tables:
+            table = table[each]
+        del table[name]
+        with pytest.raises(ValueError, match=f"{'.'.join(tables) or 'it'} lacks '{name}'"):
+            Plan.from_json(signed(less))
 
 
 # Properties and descriptions
@@ -420,13 +485,26 @@ def test_a_plan_knows_its_lines_and_grid(chosen):
         ("half_lengths", (-1, 2, 3)),
         ("stretch", np.nan),
         ("most_channels", (2**40,) * 3),
+        ("resampling", None),
+        ("kind", "guess"),
     ],
 )
-def test_an_image_by_an_invalid_plan_is_refused(chosen, field, value):
-    """`replace` checks only what fields have to do with each other."""
-    lines, grid = made(swaying)
-    with pytest.raises(ValueError, match=f"the plan is invalid: .*{field}"):
-        factorize(lines, grid, changed(chosen, **{field: value}))
+def test_a_plan_cannot_get_a_field_that_is_not_allowed(chosen, field, value):
+    with pytest.raises((TypeError, ValueError), match=f"^{field}"):
+        changed(chosen, **{field: value})
+
+
+def test_a_prediction_cannot_get_a_field_that_is_not_allowed(chosen):
+    for field, value, named in (
+        ("seconds", -1.0, "seconds"),
+        ("stages", [1], r"stages\[0\]"),
+        ("stages", chosen.stages * 100, "stages"),
+        ("work", dataclasses.replace(chosen.work, leaf=np.ones(3)), "work.leaf"),
+        ("errors", dataclasses.replace(chosen.errors, roots=np.inf), "errors.roots"),
+        ("cost_source", "guessed", "cost_source"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=f"^{named} must be"):
+            dataclasses.replace(chosen.prediction, **{field: value})
 
 
 def test_a_frequency_that_lines_cannot_hold_is_refused(chosen):

@@ -1,1 +1,0 @@
-"""Plans as frozen data: how an image will be formed, and the predictions for it."""
