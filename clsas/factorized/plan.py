@@ -26,10 +26,10 @@ from clsas.core.grid import Grid
 from clsas.core.lines import RangeLines
 from clsas.core.reading import parse_json
 from clsas.core.tables import Report, Table
-from clsas.exact.decide import BEST_ACCURACY_DB
 from clsas.factorized.track import Shape
 from clsas.factorized.virtual_channels import InterpolatedAperture, NearestBeams
 from clsas.opencl.phases import TERMS
+from clsas.signal.ambiguity import BEST_DB
 from clsas.signal.interpolation import (
     MOST_UPSAMPLING,
     PHASES,
@@ -54,7 +54,7 @@ CostSource: TypeAlias = Literal["given", "scaled", "default"]
 Amount: TypeAlias = float | NDArray[np.float64]
 """A number, or an array with one number for each of several sizes of subimages."""
 
-# Bounds of what a plan may contain, far beyond what plans need: indices stay within int32.
+# Bounds of what a plan may contain, far beyond what plans need. Indices stay within int32.
 _MOST_COUNT = 2**31 - 1
 _MOST_SAMPLES = 2**30 - 1  # of a line, before and after upsampling
 _MOST_OFFSET = 2**20 - 1  # of a line's first sample, in samples
@@ -469,7 +469,7 @@ class ExactImage:
         """Raise TypeError or ValueError if a field is not allowed."""
         _check(
             self,
-            accuracy_db=partial(validate.number, unit="dB", least=BEST_ACCURACY_DB, below=0.0),
+            accuracy_db=partial(validate.number, unit="dB", least=BEST_DB, below=0.0),
             reason=validate.text,
             kind=partial(validate.one_of, allowed=("exact",)),
         )

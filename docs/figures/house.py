@@ -14,18 +14,11 @@ FLOORS = (
         TEAL,
     ),
     (
-        (
-            ("exact", "the image, whatever it takes\ntiles, backprojection"),
-            ("aperture", "how many channels?\nnumbers of virtual channels"),
-            ("plans", "what has been decided?\nplan, predictions"),
-        ),
+        (("exact", "the image, whatever it takes\ntiles, backprojection"),),
         RED,
     ),
     (
-        (
-            ("factorized", "the image, fast\ntrack, virtual channels, tree, leaves"),
-            ("planning", "which way is the fastest?\nwork, errors, search, Imager"),
-        ),
+        (("factorized", "the image, fast\ntrack, plan, tree, stages, leaves"),),
         RED,
     ),
     (
@@ -58,7 +51,7 @@ FLOORS = (
 FLOWS = (
     "samples, positions, pixels",
     "directions, weights, spectra, buffers",
-    "exact images, virtual channels, plans",
+    "exact images",
     "plans, images",
     "corrected lines, findings, figures",
     "stored images, pictures",
