@@ -83,6 +83,7 @@ DENSE = ("ring", "arc", "helix", "raster", "planar", "headings", "star")
 EVERY_APERTURE = ("straight", "jittered", "curved", *DENSE)
 APART = ("beside", "fixed tx", "fixed rx", "array")
 BEAMS = ("hann", "hamming", "tukey", "rectangular")
+ROUNDED_SINE = 1e-5  # bound on what a device rounds of the sine of an aspect angle
 CLOSE = (0.2, 1.0)  # so that many channels see a pixel through a beam
 WIDE = (3.0, 30.0)  # so that ranges are tens to hundreds of metres
 PROFILES = ("gradient", "thermocline", "layers")
@@ -204,6 +205,11 @@ def draw(name: str, seed: int) -> Scene:
     )  # fmt: skip
     some = rng.choice(len(pixels_m), min(SAMPLED, len(pixels_m)), replace=False)
     some = np.unique(np.append(some, near))
+    if beam is not None and beam.jumps:
+        # Rounding decides whether a channel counts whose beam ends at a pixel.
+        sine = channels.sines(pixels_m[some])[..., None]
+        apart = np.abs(sine - beam.limits).min(axis=(0, 2))
+        some = some[apart > ROUNDED_SINE] if (apart > ROUNDED_SINE).any() else some
     values = echoes.received(channels.ranges_m(pixels_m[some]))
     if beam is not None:
         values *= weights(beam, channels.sines(pixels_m[some]))

@@ -105,7 +105,7 @@ def _exactly(
             image = execute(prepared)
         measured = _measured(scene, image, reference, asked_db)
         warned = _says_an_error(caught)
-        predicted_db = prepared.predicted_error_db
+        predicted_db = prepared.error_db
         return Formed("exact", asked_db, predicted_db, *measured, warned), image
     except Exception as error:  # which is a miss
         return Formed("exact", asked_db, failure=_described(error)), None

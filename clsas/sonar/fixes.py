@@ -76,7 +76,10 @@ def _stray(fixes_m: NDArray[np.float64], of_channels_m: NDArray[np.float64]) -> 
 
 
 def _held(lines: RangeLines) -> Iterator[Finding]:
-    pairs = np.ascontiguousarray(np.hstack([lines.tx_m, lines.rx_m]) + 0.0)  # without -0
+    columns = [lines.tx_m, lines.rx_m]
+    if lines.bank_numbers is not None:  # banks may share their antennas
+        columns.append(lines.bank_numbers[:, None])
+    pairs = np.ascontiguousarray(np.hstack(columns) + 0.0)  # without -0
     kinds = len(np.unique(pairs.view(f"V{pairs.itemsize * pairs.shape[1]}")))
     share = 1 - kinds / lines.channels
     if share > _HELD and kinds > 1:  # a single position is no track, and may be meant

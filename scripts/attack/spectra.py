@@ -90,7 +90,7 @@ def report(
                 image = clsas.backproject(lines, grid, accuracy_db=asked_db, device=device)
                 predicted_db = prepare(
                     lines, grid, accuracy_db=asked_db, device=device
-                ).predicted_error_db
+                ).error_db
             else:
                 plan = clsas.plan(
                     lines, grid, tolerance_db=asked_db, device=device, costs=SLOW_EXACT

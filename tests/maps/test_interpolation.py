@@ -105,6 +105,7 @@ def test_it_is_the_image_formed_on_the_axes_of_the_map(name, tmp_path):
 
 
 @pytest.mark.exhaustive
+@pytest.mark.filterwarnings("ignore:the image is")  # darker than its defocused echoes
 def test_the_carrier_is_that_of_moving_arrays_and_squinted_beams(tmp_path):
     place = local(217.0)
     lines, grid = lines_of(place, "points"), grid_of(place, 0.0125)

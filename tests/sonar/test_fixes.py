@@ -1,5 +1,7 @@
 """Fixes of the navigation that cannot be right, in lines and in tracks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -76,6 +78,13 @@ def with_fix(position_m, numbers, fix_m):
 )
 def test_only_fixes_that_cannot_be_right_are_found(position_m, names, levers_m):
     assert found(np.asarray(position_m, float), levers_m) == names
+
+
+def test_banks_may_share_their_antennas():
+    lines = lines_at(np.concatenate([ahead(), ahead()]), [[0, 0, 0]])
+    banks = np.repeat([0, 1], len(PINGS))
+    assert [each.name for each in doubts_of_fixes(lines, 0.015)] == ["held_fixes"]
+    assert list(doubts_of_fixes(replace(lines, bank_numbers=banks), 0.015)) == []
 
 
 def test_positions_may_be_coarse_for_long_waves():
