@@ -79,8 +79,11 @@ def check_place(path: Path) -> None:
         read_document(path)
     elif not path.parent.is_dir():
         raise FileNotFoundError(2, "there is no such folder", str(path.parent))
-    with tempfile.TemporaryFile(dir=path if path.is_dir() else path.parent):
-        pass  # raises where it cannot be written
+    try:
+        with tempfile.TemporaryFile(dir=path if path.is_dir() else path.parent):
+            pass
+    except OSError as error:  # it names the temporary file
+        raise type(error)(error.errno, error.strerror, str(path)) from error
 
 
 def check_own(store: Path, folder: Path) -> None:

@@ -1,6 +1,7 @@
 """Mosaics: as exact as asked for, seamless, resumable, distributed, growing."""
 
 import dataclasses
+import errno
 import json
 import os
 import re
@@ -663,6 +664,17 @@ def test_a_store_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises((OSError, ValueError), match="file"):
         clsas.mosaic(LINES, GRID, tmp_path / "file", **REQUEST)
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS, errno.ENOSPC])
+def test_an_error_names_the_store_that_cannot_be_written(tmp_path, monkeypatch, number):
+    def refused(dir):
+        raise OSError(number, os.strerror(number), str(dir / "tmp3yx_0ld"))
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refused)
+    with pytest.raises(OSError, match=os.strerror(number)) as caught:
+        clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **REQUEST)
+    assert caught.value.filename == str(tmp_path / "a.zarr")
 
 
 @pytest.mark.skipif(not os.geteuid(), reason="nothing is read-only to root")
