@@ -302,13 +302,15 @@ def test_a_failed_write_of_gdal_tells_a_full_disk_or_quota(tmp_path, monkeypatch
             rasterio.open(path, "w", width=99, height=99, **profile).close()
             geotiff_checks.check_whole(path)
 
-    def temporary(**_):
-        if full:
-            raise OSError(full, os.strerror(full))
-        return io.BytesIO()
+    class Disk(io.BytesIO):
+        """A file on a disk with 1 MiB of free space, or more."""
+
+        def write(self, contents):
+            if full and len(contents) > 1 << 20:
+                raise OSError(full, os.strerror(full))
 
     monkeypatch.setattr(geotiff._Export, "write", write)
-    monkeypatch.setattr("tempfile.TemporaryFile", temporary)
+    monkeypatch.setattr("tempfile.TemporaryFile", lambda **_: Disk())
     with pytest.raises(OSError, match="" if full else "GDAL cannot write the file") as caught:
         clsas.export(image, tmp_path / "a.tif")
     assert caught.value.errno == (full or errno.EIO)

@@ -2,6 +2,7 @@
 
 import errno
 import functools
+import io
 import os
 import shutil
 import stat
@@ -144,16 +145,26 @@ def test_a_cache_that_pocl_cannot_write_is_named(anew, no_folder):
         refusals.check_cache("NVIDIA CUDA")
 
 
+class Disk(io.BytesIO):
+    """A file on a disk with 1 MiB of free space, where PoCL begins a build and LLVM fails."""
+
+    def __init__(self, full):
+        super().__init__()
+        self.full = full
+
+    def write(self, contents):
+        if len(contents) > 1 << 20:
+            raise OSError(self.full, os.strerror(self.full))
+        return super().write(contents)
+
+
 @pytest.mark.parametrize("full", [errno.ENOSPC, errno.EDQUOT])
 def test_a_cache_that_is_full_is_named_before_anything_is_built(anew, tmp_path, monkeypatch, full):
     """LLVM ends the process if it cannot write a kernel."""
     device = open_device()
     assert anew(POCL_CACHE_DIR=tmp_path / "cache") == ""
 
-    def temporary(**_):
-        raise OSError(full, os.strerror(full))
-
-    monkeypatch.setattr("tempfile.TemporaryFile", temporary)
+    monkeypatch.setattr("tempfile.TemporaryFile", lambda **_: Disk(full))
     monkeypatch.setattr(pyopencl, "Program", lambda *_: pytest.fail("it was built"))
     monkeypatch.setattr(refusals, "POCL", device.info.platform)
     with pytest.raises(DeviceError, match=r"could not build peak.cl with -D.*: PoCL") as caught:
@@ -201,16 +212,9 @@ def test_pyopencl_uses_its_cache_only_if_it_is_private(anew, open_folder, tmp_pa
 @pytest.mark.parametrize("full", [errno.ENOSPC, errno.EDQUOT])
 def test_pyopencl_uses_no_cache_that_is_full(anew, tmp_path, monkeypatch, full):
     """Its data base would raise an error that names no file."""
-    folders = []
-
-    def temporary(dir):
-        folders.append(Path(dir))
-        raise OSError(full, os.strerror(full))
-
-    monkeypatch.setattr("tempfile.TemporaryFile", temporary)
+    monkeypatch.setattr("tempfile.TemporaryFile", lambda **_: Disk(full))
     anew(XDG_CACHE_HOME=tmp_path / "caches", CLSAS_CACHE=tmp_path / "cache")
     assert pyopencl._PYOPENCL_NO_CACHE
-    assert folders == [tmp_path / "caches" / "pytools"]
 
 
 ACCOUNT = 4242  # has no entry in the list of users
