@@ -494,7 +494,7 @@ def antennas_of(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None, float]:
     """Return the transmitters, receivers and velocities of some channels, and the sound speed.
 
-    These are the arguments that the functions of `clsas.core.geometry` take after the points.
+    Functions of ranges take them after the points.
     """
     velocity = lines.rx_velocity_m_s
     moving = None if velocity is None else velocity[channels]

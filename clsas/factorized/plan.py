@@ -667,8 +667,7 @@ class ErrorBudget:
 class Work:
     """Counted operations of a device and its host.
 
-    `clsas.factorized.costs.Costs` has the same fields in nanoseconds; `Costs.seconds` multiplies
-    the two. Amounts are numbers, or arrays over sizes of subimages.
+    `Costs` has the same fields in nanoseconds; `Costs.seconds` multiplies the two. Amounts are numbers, or arrays over sizes of subimages.
 
     Attributes
     ----------

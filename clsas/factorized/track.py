@@ -102,7 +102,7 @@ def shapes_after(shape: Shape) -> tuple[Shape, ...]:
 def mean_track_of(lines: RangeLines, shape: Shape, wavelength_m: float) -> MeanTrack | None:
     """Return the mean track of a given shape, or None if the channels have no such track.
 
-    Equal geometry and an equal wavelength (see `clsas.core.wavelengths.band_wavelength_m`) give
+    Equal geometry and an equal wavelength (see `band_wavelength_m`) give
     equal tracks. A plan therefore contains the shape only.
     """
     of_shape = {"track": mean_track, "strips": strips, "sheet": sheet}

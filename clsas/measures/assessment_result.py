@@ -28,7 +28,7 @@ class Effect:
         Rms and largest error of the ranges without the effect, in wavelengths; None for effects on
         amplitudes.
     needed : bool or None
-        True if the error power is more than `clsas.sonar.simplify.SHARE` of the power that the
+        True if the error power is more than `simplify.SHARE` of the power that the
         tolerance allows; None if the error is not known.
     left_out : bool
         True if `clsas.plan` and `clsas.backproject` leave the effect out of their own accord. They

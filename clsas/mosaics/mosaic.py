@@ -283,7 +283,7 @@ def mosaic(
         needs the device's buffers in addition, of up to 1024 upsampled lines.
     device : Device, str or int, or a sequence of them, optional
         Devices that work side by side. By default all GPUs if there are several, else the device
-        that `clsas.opencl.device.choose` returns. Must be left out with a `client`, each of whose
+        that `choose` returns. Must be left out with a `client`, each of whose
         workers takes a device of its machine.
     client : distributed.Client, optional
         Client of a Dask cluster whose workers form the patches. They must be able to open `source`

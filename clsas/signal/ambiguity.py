@@ -57,7 +57,7 @@ class Ambiguity:
     oversampling : float
         Sample rate over the width of the occupied band.
     brightness : float
-        Power of the image over the power that its beam passes; see `clsas.signal.brightness`.
+        Power of the image over the power that its beam passes; see `brightness`.
     scatter : float
         Factor by which chance may raise the relative error power of images with few resolution
         cells; see `clsas.signal.scatter`.

@@ -59,7 +59,7 @@ def brightness(
     if lines.channels < 2 * _LEAST_GROUP or lines.length < 2:
         return 1.0
     if beam is None and len(grid.spread(_FEW)) < _FEW**2:
-        return 1.0  # a few pixels are dark by chance, which `clsas.signal.scatter` allows for
+        return 1.0  # a few pixels are dark by chance, which `scatter` allows for
     group = min(_GROUP, lines.channels // 2)
     centres_m = lines.phase_centres_m  # in any order
     order = np.argsort(centres_m[:, np.ptp(centres_m, axis=0).argmax()], kind="stable")

@@ -12,7 +12,7 @@ range in homogeneous water. `homogeneous` makes use of this:
 - On a grid that is not level, pixels get *apparent positions*, a few millimetres to centimetres
   beside their own.
 - What is still missing is added to the ranges of groups of pixels, see
-  `clsas.signal.ray_corrections`. Relief of metres needs it, and so do arrays that are long or move.
+  `ray_corrections`. Relief of metres needs it, and so do arrays that are long or move.
 
 Where straight rays of the mean speed are accurate enough, they are used, and samples stay as they
 are. Every error is computed from exact rays, at sample pixels and channels.

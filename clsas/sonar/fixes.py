@@ -76,7 +76,7 @@ def _stray(fixes_m: NDArray[np.float64], of_channels_m: NDArray[np.float64]) -> 
 
 
 def _held(lines: RangeLines) -> Iterator[Finding]:
-    columns = [lines.tx_m, lines.rx_m]
+    columns: list[NDArray] = [lines.tx_m, lines.rx_m]
     if lines.bank_numbers is not None:  # banks may share their antennas
         columns.append(lines.bank_numbers[:, None])
     pairs = np.ascontiguousarray(np.hstack(columns) + 0.0)  # without -0

@@ -30,8 +30,12 @@ from clsas.sonar.beam import BeamWindow
 from clsas.trials import cases
 from studies.scaling import scaled
 
-ROOMS = ("factorized", "aperture", "exact")
-MODULES = ("clsas.signal.spectrum", "clsas.signal.ambiguity", "clsas.signal.interpolation")
+ROOMS = ("factorized", "exact")
+MODULES = (
+    "clsas.signal.spectrum",
+    "clsas.signal.ambiguity",
+    "clsas.signal.interpolation",
+)
 FIXED = {
     "clsas.factorized.measured_costs": "measures costs, which are given for the cases",
     "clsas.exact.wavenumber": "another imager, which has its own tool",
