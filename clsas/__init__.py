@@ -7,17 +7,30 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from clsas import plot
-    from clsas.core.contrast import contrast, entropy
-    from clsas.core.findings import Finding
-    from clsas.core.georeference import Georeference
-    from clsas.core.grid import Grid
-    from clsas.core.image import Image
-    from clsas.core.image_error import relative_error_db
-    from clsas.core.lines import RangeLines
-    from clsas.core.sound_speed import SoundSpeed
-    from clsas.core.validate import ClsasWarning
-    from clsas.exact.wavenumber import wavenumber
-    from clsas.factorized.plan import Plan
+    from clsas.engine.data.beam import BeamWindow
+    from clsas.engine.data.contrast import contrast, entropy
+    from clsas.engine.data.density import density_compensated, density_weights
+    from clsas.engine.data.findings import Finding
+    from clsas.engine.data.georeference import Georeference
+    from clsas.engine.data.grid import Grid
+    from clsas.engine.data.image import Image
+    from clsas.engine.data.image_error import relative_error_db
+    from clsas.engine.data.lines import RangeLines
+    from clsas.engine.data.sampling import check_sampling
+    from clsas.engine.data.sound_speed import SoundSpeed
+    from clsas.engine.data.system import Pulse, Sonar
+    from clsas.engine.data.track import Pointing, Track, channels
+    from clsas.engine.data.validate import ClsasWarning
+    from clsas.engine.device.device import DeviceError, list_devices
+    from clsas.engine.exact.wavenumber import wavenumber
+    from clsas.engine.factorized.plan import Plan
+    from clsas.engine.imaging import Imager, backproject, factorize, plan
+    from clsas.engine.signal.band_parts import sub_bands
+    from clsas.engine.signal.compression import compress
+    from clsas.engine.signal.echoes import Echoes
+    from clsas.engine.signal.full_matrix import from_full_matrix
+    from clsas.engine.signal.phase_history import from_phase_history
+    from clsas.engine.signal.replica import Replica
     from clsas.files.airsas import read_airsas
     from clsas.files.cphd import read_cphd
     from clsas.files.cphd_writing import write_cphd
@@ -27,7 +40,6 @@ if TYPE_CHECKING:
     from clsas.files.phase_histories import read_phase_history
     from clsas.files.sound_speed_files import read_sound_speed
     from clsas.files.xarrays import to_xarray
-    from clsas.imaging import Imager, backproject, factorize, plan
     from clsas.inspection.inspection import inspect
     from clsas.inspection.result import Inspection, PhaseSign
     from clsas.interferometry.heights import heights
@@ -50,23 +62,11 @@ if TYPE_CHECKING:
     from clsas.navigation.autofocus import Autofocus, autofocus
     from clsas.navigation.known_points import Calibration, calibrate_track
     from clsas.navigation.micronavigation import Micronavigation, micronavigate
-    from clsas.opencl.device import DeviceError, list_devices
     from clsas.processing.chain import Processed, process
-    from clsas.signal.band_parts import sub_bands
-    from clsas.signal.compression import compress
-    from clsas.signal.echoes import Echoes
-    from clsas.signal.full_matrix import from_full_matrix
-    from clsas.signal.phase_history import from_phase_history
-    from clsas.signal.replica import Replica
     from clsas.simulation.scenes import PointTargets, Seabed
     from clsas.simulation.simulator import simulate, simulate_lines
-    from clsas.sonar.beam import BeamWindow
-    from clsas.sonar.density import density_compensated, density_weights
-    from clsas.sonar.sampling import check_sampling
-    from clsas.sonar.system import Pulse, Sonar
-    from clsas.sonar.track import Pointing, Track, channels
 
-from clsas.core.version import __version__ as __version__
+from clsas.engine.data.version import __version__ as __version__
 
 __all__ = [
     "Assessment",
@@ -156,17 +156,17 @@ __all__ = [
 ]
 
 _MODULES = {
-    "core.contrast": "contrast entropy",
-    "core.findings": "Finding",
-    "core.georeference": "Georeference",
-    "core.grid": "Grid",
-    "core.image": "Image",
-    "core.image_error": "relative_error_db",
-    "core.lines": "RangeLines",
-    "core.sound_speed": "SoundSpeed",
-    "core.validate": "ClsasWarning",
-    "exact.wavenumber": "wavenumber",
-    "factorized.plan": "Plan",
+    "engine.data.contrast": "contrast entropy",
+    "engine.data.findings": "Finding",
+    "engine.data.georeference": "Georeference",
+    "engine.data.grid": "Grid",
+    "engine.data.image": "Image",
+    "engine.data.image_error": "relative_error_db",
+    "engine.data.lines": "RangeLines",
+    "engine.data.sound_speed": "SoundSpeed",
+    "engine.data.validate": "ClsasWarning",
+    "engine.exact.wavenumber": "wavenumber",
+    "engine.factorized.plan": "Plan",
     "files.airsas": "read_airsas",
     "files.cphd": "read_cphd",
     "files.cphd_writing": "write_cphd",
@@ -176,7 +176,7 @@ _MODULES = {
     "files.phase_histories": "read_phase_history",
     "files.sound_speed_files": "read_sound_speed",
     "files.xarrays": "to_xarray",
-    "imaging": "Imager backproject factorize plan",
+    "engine.imaging": "Imager backproject factorize plan",
     "inspection.inspection": "inspect",
     "inspection.result": "Inspection PhaseSign",
     "interferometry.heights": "heights",
@@ -199,21 +199,21 @@ _MODULES = {
     "navigation.autofocus": "Autofocus autofocus",
     "navigation.known_points": "Calibration calibrate_track",
     "navigation.micronavigation": "Micronavigation micronavigate",
-    "opencl.device": "DeviceError list_devices",
+    "engine.device.device": "DeviceError list_devices",
     "processing.chain": "Processed process",
-    "signal.band_parts": "sub_bands",
-    "signal.compression": "compress",
-    "signal.echoes": "Echoes",
-    "signal.full_matrix": "from_full_matrix",
-    "signal.phase_history": "from_phase_history",
-    "signal.replica": "Replica",
+    "engine.signal.band_parts": "sub_bands",
+    "engine.signal.compression": "compress",
+    "engine.signal.echoes": "Echoes",
+    "engine.signal.full_matrix": "from_full_matrix",
+    "engine.signal.phase_history": "from_phase_history",
+    "engine.signal.replica": "Replica",
     "simulation.scenes": "PointTargets Seabed",
     "simulation.simulator": "simulate simulate_lines",
-    "sonar.beam": "BeamWindow",
-    "sonar.density": "density_compensated density_weights",
-    "sonar.sampling": "check_sampling",
-    "sonar.system": "Pulse Sonar",
-    "sonar.track": "Pointing Track channels",
+    "engine.data.beam": "BeamWindow",
+    "engine.data.density": "density_compensated density_weights",
+    "engine.data.sampling": "check_sampling",
+    "engine.data.system": "Pulse Sonar",
+    "engine.data.track": "Pointing Track channels",
 }
 """Public names of each module. A module is imported when one of its names is first used."""
 
@@ -234,7 +234,7 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module("clsas.plot")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'clsas' has no attribute {name!r}")
-    from clsas.core.extras import needed
+    from clsas.engine.data.extras import needed
 
     module = _MODULE_OF[name]
     with needed(f"clsas.{name}", _EXTRAS.get(module)):

@@ -5,7 +5,7 @@ import sys
 
 def run() -> None:
     """Run the command; Ctrl-C ends it with code 130 also while its modules are imported."""
-    from clsas.core.extras import needed
+    from clsas.engine.data.extras import needed
 
     try:
         with needed("the command line", "cli"):

@@ -12,7 +12,7 @@ import time
 from datetime import UTC, datetime
 from pathlib import Path
 
-from clsas.opencl.device import DeviceError, open_device
+from clsas.engine.device.device import DeviceError, open_device
 
 ROOT = Path(__file__).parents[1]
 PYTHON = sys.executable
@@ -32,7 +32,7 @@ PARTS = {
 QUICK = {
     "Devices": PARTS["Devices"],
     "Self test": PARTS["Self test"],
-    "Tests": [*PARTS["Tests"], "tests/opencl"],
+    "Tests": [*PARTS["Tests"], "tests/engine/device"],
     "Factorized imaging": [*PARTS["Factorized imaging"], "--case", "ffbp-thesis"],
     "Scaling": [PYTHON, "scripts/bench", "scaling", "--largest", "512", "--device", "{device}"],
 }

@@ -21,7 +21,7 @@ from peers import scenes
 from studies import tables
 
 import clsas
-from clsas.opencl.device import open_device
+from clsas.engine.device.device import open_device
 from clsas.trials import cases
 
 PROCESSORS = ("haswell", "znver3", "icelake-server")

@@ -5,11 +5,11 @@ from functools import cache, partial
 import numpy as np
 from exactly import execute, prepare, same_interpolator
 
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.grid import Grid
-from clsas.core.image_error import relative_error_db
-from clsas.core.lines import RangeLines
-from clsas.signal.spectrum import Spectrum
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.signal.spectrum import Spectrum
 from clsas.trials.reference import ideal
 
 SPARE = 160  # samples of a line beyond what a grid needs, at each end

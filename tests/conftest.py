@@ -12,8 +12,8 @@ import pytest
 import tiers
 from variants import DEFAULT, EVERY_VARIANT, OTHERS, OWN, repeated_in, variant
 
-from clsas.factorized import measured_costs as costs
-from clsas.opencl.device import Device, list_devices
+from clsas.engine.device.device import Device, list_devices
+from clsas.engine.factorized import measured_costs as costs
 
 os.environ["MPLBACKEND"] = "agg"  # before Matplotlib is imported: figures open no windows
 _ALL = OWN | OTHERS

@@ -12,10 +12,10 @@ from factorizing import EXACT_IS_SLOW, bistatic_array, changed, swaying
 from scenes import kept
 
 from clsas import backproject, factorize, mosaic, plan, wavenumber
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
-from clsas.sonar.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
 from clsas.trials import extremes
 from clsas.trials.extremes import Known
 

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 from factorizing import around, over
 
-from clsas.core.grid import Grid
+from clsas.engine.data.grid import Grid
 from clsas.trials.dense_cases import helix as positions_on_helix
 
 CARRIER = 30e3

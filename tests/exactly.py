@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from clsas.exact.decide import ACCURACY_DB, Decision, decide
-from clsas.factorized.plan import ExactImage
-from clsas.factorized.sampled import SampledRoots, SampledScene
-from clsas.forming import SceneImager
-from clsas.opencl.device import Device, open_device
-from clsas.scene import Scene
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.exact.decide import ACCURACY_DB, Decision, decide
+from clsas.engine.factorized.plan import ExactImage
+from clsas.engine.factorized.sampled import SampledRoots, SampledScene
+from clsas.engine.forming import SceneImager
+from clsas.engine.scene import Scene
 from clsas.trials import reference
 
 

@@ -11,12 +11,12 @@ import pyopencl as cl
 from cases import along_x, lines_over
 
 from clsas import plan
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.factorized.costs import Costs
-from clsas.imaging import backproject
-from clsas.opencl.device import open_device
-from clsas.sonar.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.device.device import open_device
+from clsas.engine.factorized.costs import Costs
+from clsas.engine.imaging import backproject
 
 EXACT_IS_SLOW = Costs(pixel_ns=1e6, point_ns=1e6)
 """Plans for small images divide them only if nothing else is fast."""

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from rays import rays
 from sums import SPEED_M_S, BentChannels, Both, Channels, Echoes, Noise, Points, Sampling, weights
 
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
-from clsas.core.sound_speed import STEEPEST_PER_S, SoundSpeed
-from clsas.sonar.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.sound_speed import STEEPEST_PER_S, SoundSpeed
 from clsas.trials import oracle
 
 SAMPLED = 70  # random pixels at which the ideal image is known, besides those around the points

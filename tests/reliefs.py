@@ -7,9 +7,9 @@ import numpy as np
 from scenes import kept
 from scipy.spatial.transform import Rotation
 
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
-from clsas.imaging import backproject
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.imaging import backproject
 from clsas.simulation.scenes import Observer, PointTargets, Seabed
 from clsas.simulation.simulator import simulate_lines
 

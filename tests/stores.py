@@ -7,8 +7,8 @@ import numpy as np
 from cases import along_x, lines_over
 
 import clsas
-from clsas.core.digests import with_digest
-from clsas.core.grid import Grid
+from clsas.engine.data.digests import with_digest
+from clsas.engine.data.grid import Grid
 
 PLANE = Grid.plane((-4, 4, 40), (30, 40, 30))
 GRID = PLANE.with_height(np.linspace(0, 1, PLANE.size).reshape(PLANE.shape))

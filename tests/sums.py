@@ -14,7 +14,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from rays import rays
 
-from clsas.sonar.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow
 from clsas.trials import oracle
 
 Floats = NDArray[np.float64]

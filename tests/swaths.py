@@ -6,7 +6,7 @@ import numpy as np
 from reliefs import ALTITUDE_M, BAND_HZ, CARRIER_HZ, SOUND_M_S
 from scenes import kept
 
-from clsas.core.grid import Grid
+from clsas.engine.data.grid import Grid
 from clsas.simulation.scenes import Observer, PointTargets, Seabed
 from clsas.simulation.simulator import simulate_lines
 

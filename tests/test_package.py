@@ -13,7 +13,7 @@ import pytest
 
 import clsas
 from clsas import cli
-from clsas.core import extras
+from clsas.engine.data import extras
 
 ROOT = Path(__file__).parents[1]
 SLOW = ("matplotlib", "h5py", "pyopencl", "scipy", "pydantic", "rich", "numpy")
@@ -59,7 +59,7 @@ def test_every_public_name_is_there_and_known_to_type_checkers():
 def test_functions_keep_their_names_when_modules_of_these_are_imported():
     program = """
 import clsas
-import clsas.factorized.planner, clsas.mosaics.mosaic, clsas.measures.tradeoff
+import clsas.engine.factorized.planner, clsas.mosaics.mosaic, clsas.measures.tradeoff
 from clsas.simulation.simulator import simulate_lines
 assert all(callable(getattr(clsas, name)) for name in clsas.__all__ if name != "plot")
 from clsas import plan, simulate

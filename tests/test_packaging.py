@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import clsas
-from clsas.core import extras
+from clsas.engine.data import extras
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -17,7 +17,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 IMAGING = """
 import numpy as np
 import clsas
-from clsas.factorized.costs import Costs
+from clsas.engine.factorized.costs import Costs
 
 positions_m = np.zeros((64, 3))
 positions_m[:, 0] = np.linspace(-0.5, 0.5, 64)
@@ -91,7 +91,7 @@ def test_kernels_scenes_and_types_travel_in_the_wheel(wheel):
 def test_the_wheel_images_on_its_own(wheel, tmp_path):
     program = """
 import sys, clsas
-from clsas.opencl.device import kernel_source
+from clsas.engine.device.device import kernel_source
 print(clsas.__file__)
 origin = [[0.0, 0.0, 0.0]]
 lines = clsas.RangeLines([[0j, 0j, 1, 0j, 0j]], 1.0, 0.1, origin, origin, 0, 1500)

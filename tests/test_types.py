@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
 from clsas.simulation.scenes import PointTargets
 
 ROOT = Path(__file__).parents[1]

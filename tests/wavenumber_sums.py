@@ -6,7 +6,7 @@ import finufft
 import numpy as np
 import scipy.fft
 
-from clsas.exact.wavenumber import aspects_of, band_of, straighten
+from clsas.engine.exact.wavenumber import aspects_of, band_of, straighten
 
 _ACCURACY = {"eps": 1e-9, "nthreads": 1}
 _TAIL_ZONES, _TAIL_M = 8.0, 4.0  # padding against wrap-around along the track, and in range

@@ -16,7 +16,7 @@ from typing import Any
 import click
 
 import clsas
-from clsas.core.extras import needed
+from clsas.engine.data.extras import needed
 
 # Module and first sentence of the help of every command, under the headings of `clsas --help`.
 # Importing the module of a command takes up to a second: --help, --version and completion do not.
@@ -166,7 +166,7 @@ def main(traceback: bool) -> None:
 
 def _importing() -> AbstractContextManager[None]:
     """Delay Ctrl-C until imports are done, since it makes some extension modules abort."""
-    from clsas.core.threads import uninterrupted  # imports NumPy, which is slow
+    from clsas.engine.data.threads import uninterrupted  # imports NumPy, which is slow
 
     return uninterrupted()
 
@@ -190,7 +190,7 @@ def _showing(others: Callable[..., None]) -> Callable[..., None]:
 
 def _printable(text: str) -> str:
     """Return a message with control characters escaped, since parts may come from a file."""
-    from clsas.core import validate  # imports NumPy, which is slow
+    from clsas.engine.data import validate  # imports NumPy, which is slow
 
     return validate.printable(text)
 

@@ -13,7 +13,7 @@ from clsas.cli.inputs import load_lines, read_beam, read_grid, read_request
 from clsas.cli.outputs import json_able, report
 from clsas.cli.parameters import INPUT
 from clsas.cli.wording import command
-from clsas.factorized.planner import (
+from clsas.engine.factorized.planner import (
     BEST_TOLERANCE_DB,
     TOLERANCE_DB,
     WORST_TOLERANCE_DB,

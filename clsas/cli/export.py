@@ -16,7 +16,7 @@ from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, ORIGIN, File, Output, keep_out
 from clsas.cli.view import Folder, size_of
 from clsas.cli.wording import command
-from clsas.core import reading, validate
+from clsas.engine.data import reading, validate
 from clsas.files.hdf5 import read_geometry
 from clsas.maps import sicd
 from clsas.maps.encoding import KINDS

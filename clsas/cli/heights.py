@@ -16,7 +16,7 @@ from clsas.cli.mosaics import described_flags
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, File, Output, Parsed, Store, keep_out
 from clsas.cli.wording import command
-from clsas.core import validate
+from clsas.engine.data import validate
 from clsas.files.hdf5 import SUFFIXES
 from clsas.files.height_files import read_heights
 from clsas.files.scene_files import SceneFile

@@ -26,17 +26,17 @@ from clsas.cli.inputs import (
 from clsas.cli.outputs import printable, progress_bar, report, say, warn
 from clsas.cli.parameters import HDF5
 from clsas.cli.wording import command
-from clsas.core import validate
-from clsas.core.image import holds_any
-from clsas.exact.decide import ACCURACY_DB
-from clsas.factorized.plan import ExactImage
-from clsas.factorized.planner import WORST_TOLERANCE_DB
+from clsas.engine.data import validate
+from clsas.engine.data.image import holds_any
+from clsas.engine.device.device import Device, KernelTimes, open_device
+from clsas.engine.exact.decide import ACCURACY_DB
+from clsas.engine.factorized.plan import ExactImage
+from clsas.engine.factorized.planner import WORST_TOLERANCE_DB
+from clsas.engine.forming import SceneImager, scene_of_plan
+from clsas.engine.scene import Scene
+from clsas.engine.signal.interpolation import MOST_UPSAMPLING, TAPS
 from clsas.files.scene_tables import PLAN_KEYS
-from clsas.forming import SceneImager, scene_of_plan
 from clsas.measures.tradeoff import summary
-from clsas.opencl.device import Device, KernelTimes, open_device
-from clsas.scene import Scene
-from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 
 _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is reported
 

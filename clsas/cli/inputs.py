@@ -11,8 +11,8 @@ import click
 import clsas
 from clsas.cli.outputs import warn
 from clsas.cli.parameters import keep_apart, need_matplotlib, written_to
-from clsas.core import banks, validate
-from clsas.factorized.planner import TOLERANCE_DB
+from clsas.engine.data import banks, validate
+from clsas.engine.factorized.planner import TOLERANCE_DB
 from clsas.files import scene_files as config
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS

@@ -12,7 +12,7 @@ from clsas.cli.inputs import read_scene
 from clsas.cli.outputs import report
 from clsas.cli.parameters import INPUT
 from clsas.cli.wording import command
-from clsas.core.json_types import json_able
+from clsas.files.json_types import json_able
 
 _FROM_SCENE = ("range_m", "pointing", "element_pattern", "motion_in_flight")
 

@@ -16,13 +16,13 @@ from clsas.cli.inputs import load, load_lines, read_levels, read_scene, warn_of_
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import HDF5, INPUT, Output
 from clsas.cli.wording import command
-from clsas.core import validate
-from clsas.core.conditioning import STATISTICS, high_passed, tapered_ends
+from clsas.engine.data import validate
+from clsas.engine.data.conditioning import STATISTICS, high_passed, tapered_ends
+from clsas.engine.data.density import noise_penalty_db
+from clsas.engine.signal.compression import check_options
 from clsas.files.cphd_writing import SUFFIXES as CPHD
 from clsas.files.formats import SUFFIXES
-from clsas.signal.compression import check_options
 from clsas.simulation.simulator import check_size
-from clsas.sonar.density import noise_penalty_db
 
 
 @command()

@@ -13,11 +13,11 @@ from clsas.cli import options
 from clsas.cli.outputs import print_json, printable, progress_bar, say
 from clsas.cli.parameters import File, need_matplotlib
 from clsas.cli.wording import command
-from clsas.opencl.device import choose, open_device
+from clsas.engine.device.device import choose, open_device
 from clsas.trials import demo as demonstration
 
 if TYPE_CHECKING:
-    from clsas.factorized.costs import KnownCosts
+    from clsas.engine.factorized.costs import KnownCosts
 
 
 @command()
@@ -34,7 +34,7 @@ def devices(measure: bool, as_json: bool) -> None:
     \b
     Example:  CLSAS_DEVICE=0 clsas devices
     """
-    from clsas.factorized import measured_costs
+    from clsas.engine.factorized import measured_costs
 
     used, reason = choose()
     if measure:

@@ -15,7 +15,7 @@ from clsas.cli.inputs import load, load_lines, read_beam, read_grid
 from clsas.cli.outputs import json_able, print_json, printable, progress_bar, report, say
 from clsas.cli.parameters import HDF5, INPUT, POSITION, STAGES, Output
 from clsas.cli.wording import command
-from clsas.core import validate
+from clsas.engine.data import validate
 from clsas.files.scene_files import SceneFile
 from clsas.measures.cuts import Cut
 from clsas.measures.quality import PointResponse

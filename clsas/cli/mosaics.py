@@ -25,15 +25,15 @@ from clsas.cli.inputs import (
 from clsas.cli.outputs import printable, progress_bar, report, say
 from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart, keep_out
 from clsas.cli.wording import command
-from clsas.core.extras import needed
-from clsas.core.threads import uninterrupted
-from clsas.exact.decide import ACCURACY_DB
+from clsas.engine.data.extras import needed
+from clsas.engine.data.threads import uninterrupted
+from clsas.engine.device.device import open_device
+from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.files.scene_files import SceneFile, simulation_digest
 from clsas.files.scene_tables import PLAN_KEYS
 from clsas.mosaics.documents import check_place
 from clsas.mosaics.patches import patch_shape_of
 from clsas.mosaics.record import Record
-from clsas.opencl.device import open_device
 
 _SCHEDULER_S = 10  # how long a scheduler may take to answer; arbitrary
 _IDLE_S = 60.0  # default of --idle-s

@@ -15,7 +15,7 @@ from clsas.cli.inputs import load, read_beam, read_grid
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, POSITION, RANGE
 from clsas.cli.wording import command
-from clsas.core import validate
+from clsas.engine.data import validate
 from clsas.navigation.autofocus import UNKNOWNS as FOCUSED
 from clsas.navigation.known_points import DEFAULT_UNKNOWNS
 from clsas.navigation.known_points import UNKNOWNS as CALIBRATED

@@ -11,9 +11,11 @@ from typing import Any
 import click
 
 from clsas.cli.parameters import AXIS, INPUT, PERCENTILES, RATIO, STAGES, Output
-from clsas.core import validate
-from clsas.exact.decide import BEST_ACCURACY_DB
-from clsas.factorized.planner import (
+from clsas.engine.data import validate
+from clsas.engine.data.beam import SHAPES
+from clsas.engine.data.coverage import UnreachedWarning
+from clsas.engine.exact.decide import BEST_ACCURACY_DB
+from clsas.engine.factorized.planner import (
     BEST_TOLERANCE_DB,
     WORST_TOLERANCE_DB,
     checked_tolerance_db,
@@ -21,8 +23,6 @@ from clsas.factorized.planner import (
 )
 from clsas.files.hdf5 import SUFFIXES
 from clsas.plot.canvas import SUFFIXES as PICTURES
-from clsas.sonar.beam import SHAPES
-from clsas.sonar.coverage import UnreachedWarning
 
 
 def checked(check: Callable[[Any], object]) -> Callable:

@@ -21,8 +21,8 @@ from rich.progress import (
 )
 
 from clsas.cli.wording import in_options
-from clsas.core import validate
-from clsas.core.json_types import json_able
+from clsas.engine.data import validate
+from clsas.files.json_types import json_able
 
 
 @contextmanager

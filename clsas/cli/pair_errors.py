@@ -14,7 +14,7 @@ from clsas.cli.inputs import load_banks, load_heights, read_beam
 from clsas.cli.outputs import printable, report
 from clsas.cli.parameters import HDF5_OR_STORE, INPUT, POSITION, keep_out
 from clsas.cli.wording import command
-from clsas.core import banks, validate
+from clsas.engine.data import banks, validate
 from clsas.files.scene_files import SceneFile
 from clsas.interferometry.pair_errors_result import UNKNOWNS
 from clsas.mosaics.stored_heights import check_heights

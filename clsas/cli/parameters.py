@@ -13,9 +13,9 @@ from typing import Any
 import click
 
 from clsas.cli.wording import option_name
-from clsas.core import validate
-from clsas.core.extras import check_installed
-from clsas.core.reading import check_ordinary
+from clsas.engine.data import validate
+from clsas.engine.data.extras import check_installed
+from clsas.engine.data.reading import check_ordinary
 
 
 class Parsed(click.ParamType):

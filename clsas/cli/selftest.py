@@ -10,7 +10,7 @@ import click
 from clsas.cli import options
 from clsas.cli.outputs import print_json, printable, progress_bar, say
 from clsas.cli.wording import command
-from clsas.opencl.device import open_device
+from clsas.engine.device.device import open_device
 
 if TYPE_CHECKING:
     from clsas.trials.selftest import Result

@@ -13,7 +13,7 @@ from clsas.cli.inputs import read_levels
 from clsas.cli.outputs import printable, report
 from clsas.cli.parameters import POSITION, File, Output, keep_out, need_matplotlib
 from clsas.cli.wording import command
-from clsas.core import reading, validate
+from clsas.engine.data import reading, validate
 from clsas.files.formats import SUFFIXES
 from clsas.plot.canvas import SUFFIXES as PICTURES
 

@@ -18,15 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from clsas.core import reading, validate
-from clsas.core.fourier import fourier_series
-from clsas.core.lines import RangeLines
+from clsas.engine.data import reading, validate
+from clsas.engine.data.fourier import fourier_series
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.system import Pulse
+from clsas.engine.signal.compression import Window, check_options, compress
+from clsas.engine.signal.echoes import Echoes
 from clsas.files import hdf5
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked_positions
-from clsas.signal.compression import Window, check_options, compress
-from clsas.signal.echoes import Echoes
-from clsas.sonar.system import Pulse
 
 SHARED = "characterization data"
 ACQUISITION, SENSORS = "acquistionParams.csv", "sensorCoordinates.csv"  # the data set's spelling

@@ -20,15 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
-from clsas.core import reading, validate
-from clsas.core.extras import needed
-from clsas.core.georeference import Georeference
-from clsas.core.lines import RangeLines
-from clsas.core.reading import parse_json
+from clsas.engine.data import reading, validate
+from clsas.engine.data.extras import needed
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.reading import parse_json
+from clsas.engine.signal.compression import Window, check_options
+from clsas.engine.signal.phase_history import from_phase_history
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked_positions
-from clsas.signal.compression import Window, check_options
-from clsas.signal.phase_history import from_phase_history
 
 SPEED, ORIGIN = "clsas.sound_speed_m_s", "clsas.origin_m"
 """Names of the collection parameters with which a CPHD file describes sonar data."""

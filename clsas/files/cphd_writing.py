@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
-from clsas.core import validate
-from clsas.core.atomic import replacing
-from clsas.core.lines import RangeLines
+from clsas.engine.data import validate
+from clsas.engine.data.atomic import replacing
+from clsas.engine.data.lines import RangeLines
 from clsas.files.cphd import LOOK, ORIGIN, PLACE, SPEED, sarkit_cphd
 
 SUFFIXES = (".cphd",)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import reading, validate
+from clsas.engine.data import reading, validate
 
 
 def read_columns(

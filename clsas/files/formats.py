@@ -6,8 +6,8 @@ import os
 
 import h5py
 
-from clsas.core import reading, validate
-from clsas.core.lines import RangeLines
+from clsas.engine.data import reading, validate
+from clsas.engine.data.lines import RangeLines
 from clsas.files import cphd, cphd_writing, hdf5, matlab
 from clsas.files.airsas import is_airsas, read_airsas
 from clsas.files.full_matrix import FIELDS as FULL_MATRIX

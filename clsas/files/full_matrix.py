@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from clsas.core.lines import RangeLines
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.signal.compression import Window
+from clsas.engine.signal.full_matrix import from_full_matrix
 from clsas.files import matlab
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked
-from clsas.signal.compression import Window
-from clsas.signal.full_matrix import from_full_matrix
 
 FIELDS = ("time_data", "time", "tx", "rx", "array")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from clsas.core.georeference import Georeference
+from clsas.engine.data.georeference import Georeference
 from clsas.files.tables import Table, located
 
 

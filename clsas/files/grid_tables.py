@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from clsas.core.grid import Grid
+from clsas.engine.data.grid import Grid
 from clsas.files.height_files import read_heights
 from clsas.files.tables import Table, Vector, located
 

@@ -18,17 +18,17 @@ from typing import Any
 import h5py
 import numpy as np
 
-from clsas.core import reading, validate
-from clsas.core.atomic import replacing
-from clsas.core.georeference import Georeference
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
-from clsas.core.sound_speed import SoundSpeed
+from clsas.engine.data import reading, validate
+from clsas.engine.data.atomic import replacing
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.data.system import Pulse
+from clsas.engine.signal.echoes import Echoes
 from clsas.interferometry.interferogram import Interferogram
 from clsas.interferometry.result import Heights
-from clsas.signal.echoes import Echoes
-from clsas.sonar.system import Pulse
 
 FORMAT = "clsas"
 VERSION = 1

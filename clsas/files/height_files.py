@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import reading, validate
+from clsas.engine.data import reading, validate
 
 SUFFIXES = (".csv", ".npy")
 """Suffixes of files of heights."""

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from clsas.core import reading, validate
+from clsas.engine.data import reading, validate
 from clsas.files.hdf5 import FileFormatError, too_large
 
 _HEADER = 128  # bytes: a text, followed by the version and the byte order

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from clsas.core import validate
+from clsas.engine.data import validate
 
 _BARE_KEY = re.compile(r"[\w-]{1,100}", re.ASCII)
 # Required kind of value for pydantic's types of errors. Other errors keep pydantic's message.

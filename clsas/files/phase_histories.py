@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 
-from clsas.core import validate
-from clsas.core.lines import RangeLines
+from clsas.engine.data import validate
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.signal.compression import Window
+from clsas.engine.signal.phase_history import from_phase_history
 from clsas.files import matlab
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked_positions
-from clsas.signal.compression import Window
-from clsas.signal.phase_history import from_phase_history
 
 FIELDS = ("fp", "freq", "x", "y", "z", "r0")
 _LOWEST_HZ = 1e6  # waves of 300 m: radars that look through ice or ground begin at 1 to 10 MHz

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 
-from clsas.core import validate
-from clsas.core.findings import warn_of
-from clsas.core.lines import RangeLines
-from clsas.core.pings import Transmissions
-from clsas.signal.doubts import doubts
+from clsas.engine.data import validate
+from clsas.engine.data.findings import warn_of
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.pings import Transmissions
+from clsas.engine.signal.doubts import doubts
 
 
 def checked(path: str | os.PathLike, lines: RangeLines) -> RangeLines:

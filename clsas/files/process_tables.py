@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from clsas.core import validate
-from clsas.factorized.planner import tolerance_in_db
+from clsas.engine.data import validate
+from clsas.engine.factorized.planner import tolerance_in_db
 from clsas.files.tables import Table, Vector, located
 from clsas.interferometry.checks import (
     checked_coherence,

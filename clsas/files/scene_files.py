@@ -14,17 +14,17 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from clsas.core import reading, validate
-from clsas.core.digests import digest
-from clsas.core.georeference import Georeference
-from clsas.core.grid import Grid
-from clsas.core.sound_speed import SoundSpeed
-from clsas.core.version import __version__
+from clsas.engine.data import reading, validate
+from clsas.engine.data.digests import digest
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.data.system import Sonar
+from clsas.engine.data.track import Track
+from clsas.engine.data.version import __version__
 from clsas.files.mistakes import explain
 from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS, SceneTables
 from clsas.simulation.scenes import Scene
-from clsas.sonar.system import Sonar
-from clsas.sonar.track import Track
 
 _MOST_MISTAKES = 20  # listed in one message: a plain choice, which fits on a screen
 _IMAGING = ("grid", "image", "mosaic", "process")  # tables that do not affect range lines

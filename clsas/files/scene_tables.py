@@ -15,22 +15,22 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from clsas.core import validate
-from clsas.exact.decide import BEST_ACCURACY_DB
-from clsas.factorized.planner import checked_pairs, tolerance_in_db
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.track import Pointing
+from clsas.engine.exact.decide import BEST_ACCURACY_DB
+from clsas.engine.factorized.planner import checked_pairs, tolerance_in_db
+from clsas.engine.signal.compression import check_options as check_compression
+from clsas.engine.signal.interpolation import MOST_UPSAMPLING, TAPS
 from clsas.files.georeference_table import GeoreferenceTable
 from clsas.files.grid_tables import GridTable
 from clsas.files.process_tables import ProcessTable
 from clsas.files.sound_speed_table import SoundSpeedTable
 from clsas.files.survey_tables import SonarTable, TrackTable
 from clsas.files.tables import Table, Vector, located
-from clsas.signal.compression import check_options as check_compression
-from clsas.signal.interpolation import MOST_UPSAMPLING, TAPS
 from clsas.simulation.scenes import PointTargets, Seabed
 from clsas.simulation.seabeds import pipeline, rocks, wreck
 from clsas.simulation.simulator import check_options as check_simulation
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.track import Pointing
 
 SEABEDS: dict[str, Callable[..., Seabed]] = {"wreck": wreck, "pipeline": pipeline, "rocks": rocks}
 PLAN_KEYS = ("tolerance_db", "tolerance_wavelengths", "stages")

@@ -6,8 +6,8 @@ import os
 from functools import partial
 from pathlib import Path
 
-from clsas.core import validate
-from clsas.core.sound_speed import SoundSpeed
+from clsas.engine.data import validate
+from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.files.csv_columns import read_columns
 from clsas.files.mistakes import suggestion
 from clsas.files.tables import located

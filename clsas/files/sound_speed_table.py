@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clsas.core.sound_speed import SoundSpeed
+from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.files.sound_speed_files import read_sound_speed
 from clsas.files.tables import Table, located
 

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from clsas.core import validate
-from clsas.core.georeference import Georeference
+from clsas.engine.data import validate
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.system import Pulse, Sonar, line_array, stacked
+from clsas.engine.data.track import Motion, Track
 from clsas.files.tables import Table, Vector, located
 from clsas.files.track_files import read_track
-from clsas.sonar.system import Pulse, Sonar, line_array, stacked
-from clsas.sonar.track import Motion, Track
 
 PRESETS = ("thesis_wide_beam", "edgetech", "sensotek", "hisas_1030")
 

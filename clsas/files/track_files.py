@@ -8,14 +8,14 @@ from functools import partial
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.findings import warn_of
-from clsas.core.georeference import Georeference
+from clsas.engine.data import validate
+from clsas.engine.data.findings import warn_of
+from clsas.engine.data.fixes import doubts_of_track
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.track import Track
 from clsas.files.csv_columns import read_columns
 from clsas.files.mistakes import suggestion
 from clsas.files.tables import located
-from clsas.sonar.fixes import doubts_of_track
-from clsas.sonar.track import Track
 
 _POSITION = ("x_m", "y_m", "z_m")
 _VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.decibels import largest_amplitude
-from clsas.core.extras import needed
-from clsas.core.georeference import Georeference
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
-from clsas.signal.echoes import Echoes
+from clsas.engine.data import validate
+from clsas.engine.data.decibels import largest_amplitude
+from clsas.engine.data.extras import needed
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.signal.echoes import Echoes
 
 if TYPE_CHECKING:
     import xarray

@@ -13,12 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from clsas.core import decibels
-from clsas.core.conditioning import DEAD_DB, are_dead
-from clsas.core.findings import Finding
-from clsas.core.lines import RangeLines, some_channels
-from clsas.core.pings import STILL
-from clsas.core.reprs import measured
+from clsas.engine.data import decibels
+from clsas.engine.data.conditioning import DEAD_DB, are_dead
+from clsas.engine.data.findings import Finding
+from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.looking import behind
+from clsas.engine.data.pings import STILL
+from clsas.engine.data.reprs import measured
+from clsas.engine.data.sampling import check_sampling
+from clsas.engine.signal.ambiguity import end_powers
+from clsas.engine.signal.doubts import MOST_WAVELENGTHS, doubts
+from clsas.engine.signal.spectrum import NEEDED_OVERSAMPLING
 from clsas.inspection.phase_sign import CLEAR
 from clsas.inspection.recording import (
     CONSTANT_DB,
@@ -29,11 +34,6 @@ from clsas.inspection.recording import (
 )
 from clsas.inspection.result import runs
 from clsas.inspection.slips import POINTS, covered, likely_slip, ranges_m
-from clsas.signal.ambiguity import end_powers
-from clsas.signal.doubts import MOST_WAVELENGTHS, doubts
-from clsas.signal.spectrum import NEEDED_OVERSAMPLING
-from clsas.sonar.looking import behind
-from clsas.sonar.sampling import check_sampling
 
 _GAP = 1.75
 """Advance relative to that of the pings around, above which pings are missing. One missing ping

@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.findings import Finding
-from clsas.core.georeference import placed
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.findings import Finding
+from clsas.engine.data.georeference import placed
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.looking import side_of
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.signal.compression import compress
+from clsas.engine.signal.echoes import Echoes
 from clsas.inspection.checks import CHECKS
 from clsas.inspection.recording import Recording
 from clsas.inspection.result import Inspection
-from clsas.opencl.device import Device, open_device
-from clsas.signal.compression import compress
-from clsas.signal.echoes import Echoes
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.looking import side_of
 
 _FARTHEST_M = 1e3 * validate.FARTHEST_M  # coordinates in mm are reported, not refused
 _SLOWEST_M_S = 1.0  # accepts a sound speed in km/s, so that the checks can report the slip
@@ -42,7 +42,7 @@ def inspect(
         spacing of pings with what the grid requires.
     device : Device, str or int, optional
         Device that forms small images to find the sign of the phase. See
-        `clsas.opencl.device.choose`.
+        `clsas.engine.device.device.choose`.
     beam : BeamWindow, optional
         Beam of the image to come, for the limit of the spacing.
     element_length_m : float, optional

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines, some_channels
-from clsas.core.validate import ClsasWarning
-from clsas.imaging import backproject
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.validate import ClsasWarning
+from clsas.engine.device.device import Device
+from clsas.engine.imaging import backproject
+from clsas.engine.scene import check_numbers
 from clsas.inspection.result import PhaseSign
-from clsas.opencl.device import Device
-from clsas.scene import check_numbers
 
 CLEAR = 1.5
 """Least ratio of the two sharpnesses that determines the sign. In speckle it reaches 1.1."""

@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal.windows import hann
 
-from clsas.core import banks, decibels
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, some_channels
-from clsas.core.pings import Transmissions
-from clsas.core.wavelengths import wavelength_between_m
+from clsas.engine.data import banks, decibels
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.pings import Transmissions
+from clsas.engine.data.wavelengths import wavelength_between_m
+from clsas.engine.device.device import Device
+from clsas.engine.signal.echoes import Echoes
+from clsas.engine.signal.spectrum import Spectrum, measure_spectrum
 from clsas.inspection.phase_sign import phase_sign
 from clsas.inspection.result import PhaseSign
-from clsas.opencl.device import Device
-from clsas.signal.echoes import Echoes
-from clsas.signal.spectrum import Spectrum, measure_spectrum
-from clsas.sonar.beam import BeamWindow
 
 LEAST_CLIPPED = 8
 """Fewest samples at its largest level that make a channel count as clipped. Echoes have one or

@@ -9,10 +9,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from clsas.core import reprs
-from clsas.core.findings import Finding
-from clsas.core.lines import RangeLines
-from clsas.core.tables import Report, Table
+from clsas.engine.data import reprs
+from clsas.engine.data.findings import Finding
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.tables import Report, Table
 
 _MOST_RUNS = 12  # runs of indices that are written out
 

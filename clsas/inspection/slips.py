@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, some_channels
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines, some_channels
 
 POINTS = 16
 """Grid points sampled along either side."""

@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, antennas_of
+from clsas.engine.data import validate
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines, antennas_of
 from clsas.interferometry.baseline import Baseline
 from clsas.interferometry.errors import UnmeasurableError
 

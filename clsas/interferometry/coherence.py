@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
-from clsas.core.grid import Grid
+from clsas.engine.data.grid import Grid
 from clsas.interferometry.errors import UnmeasurableError
 
 UNIFORM_SD_RAD = math.pi / math.sqrt(3)

@@ -12,7 +12,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
+from clsas.engine.data import validate
 from clsas.interferometry.checks import checked_level, checked_points
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.displaced import Displaced

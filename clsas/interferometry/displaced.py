@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from clsas.core.grid import Grid, without_heights
+from clsas.engine.data.grid import Grid, without_heights
+from clsas.engine.signal.spectrum import middle_cycles_per_m
 from clsas.interferometry.baseline import Baseline, Lattice, in_pixels
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.result import Heights
-from clsas.signal.spectrum import middle_cycles_per_m
 
 _UP = np.array([0.0, 0.0, 1.0])
 _SMOOTHED = 3.0  # windows along either side, over which slopes are averaged

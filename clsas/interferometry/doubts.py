@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.grid import Grid
+from clsas.engine.data import validate
+from clsas.engine.data.grid import Grid
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.sweep import Sweep
 

@@ -18,11 +18,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
-from clsas.core import validate
-from clsas.core.georeference import placed
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
-from clsas.core.wavelengths import cycles_per_m_at
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.georeference import placed
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.wavelengths import cycles_per_m_at
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.interferometry.baseline import Baseline, Lattice, sight_lattice
 from clsas.interferometry.checks import (
     check_echoes,
@@ -45,9 +48,6 @@ from clsas.interferometry.shadows import in_shadow
 from clsas.interferometry.side_lobes import from_elsewhere, point_response
 from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, sweep
 from clsas.interferometry.task import Task
-from clsas.opencl.device import Device, open_device
-from clsas.signal.spectrum import measure_spectrum
-from clsas.sonar.beam import BeamWindow
 
 LEAST_COHERENCE = 0.5
 """Default of the smallest coherence with a valid height."""
@@ -107,7 +107,7 @@ def heights(
     beam : BeamWindow, optional
         Weights of the channels by aspect angle.
     device : Device, str or int, optional
-        See `clsas.opencl.device.choose`.
+        See `clsas.engine.device.device.choose`.
     progress : callable, optional
         Called as progress(steps done, steps at most).
 

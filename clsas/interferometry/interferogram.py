@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import reprs, validate
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.image_error import check_one_grid
+from clsas.engine.data import reprs, validate
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.image_error import check_one_grid
 from clsas.interferometry.coherence import (
     Moments,
     Window,

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from clsas.core.lines import RangeLines, some_channels
-from clsas.core.wavelengths import cycles_per_m_at
+from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.wavelengths import cycles_per_m_at
+from clsas.engine.signal.band_parts import sub_bands
+from clsas.engine.signal.spectrum import measure_spectrum, middle_cycles_per_m
 from clsas.interferometry.coherence import UNIFORM_SD_RAD, Window
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.result import Heights
-from clsas.signal.band_parts import sub_bands
-from clsas.signal.spectrum import measure_spectrum, middle_cycles_per_m
 
 _LEAST_TILES = 3  # independent windows from which a deviation is estimated
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
-from clsas.imaging import Imager
-from clsas.opencl.device import Device
-from clsas.signal.refraction import homogeneous
-from clsas.sonar.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.device.device import Device
+from clsas.engine.imaging import Imager
+from clsas.engine.water.refraction import homogeneous
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from clsas.core import validate
-from clsas.core.lines import RangeLines
-from clsas.factorized.planner import checked_tolerance_db
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.factorized.planner import checked_tolerance_db
+from clsas.engine.signal.spectrum import middle_cycles_per_m
 from clsas.interferometry.checks import check_pair, checked_known_sd
 from clsas.interferometry.comparisons import Comparison, at_pixels, at_points, in_overlap
 from clsas.interferometry.displaced import Displaced
@@ -19,9 +22,6 @@ from clsas.interferometry.misregistration import ConstantPhase, constant_phase
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.pair_errors_result import UNKNOWNS, PairErrors
 from clsas.interferometry.result import Heights
-from clsas.opencl.device import Device, open_device
-from clsas.signal.spectrum import middle_cycles_per_m
-from clsas.sonar.beam import BeamWindow
 
 _MRAD = 1e-3
 # Deviations by which heights may differ from expected ones without a warning; dunes reach 2.
@@ -73,7 +73,7 @@ def pair_errors(
     beam : BeamWindow, optional
         Weights of the channels by aspect angle: those of `heights`.
     device : Device, str or int, optional
-        See `clsas.opencl.device.choose`.
+        See `clsas.engine.device.device.choose`.
 
     Returns
     -------

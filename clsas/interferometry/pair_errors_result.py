@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import reprs
-from clsas.core.lines import RangeLines
+from clsas.engine.data import reprs
+from clsas.engine.data.directions import track_directions
+from clsas.engine.data.lines import RangeLines
 from clsas.interferometry.checks import check_pair
-from clsas.sonar.directions import track_directions
 
 UNKNOWNS = ("phase", "delay", "roll")
 """Errors that `pair_errors` can estimate."""

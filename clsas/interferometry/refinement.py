@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
-from clsas.core.grid import Grid
-from clsas.core.image import Image
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
 from clsas.interferometry.baseline import Lattice
 from clsas.interferometry.coherence import (
     Window,

@@ -7,12 +7,12 @@ from typing import Self
 
 from numpy.typing import ArrayLike
 
-from clsas.core import validate
-from clsas.core.grid import Grid
-from clsas.factorized.planner import checked_tolerance_db
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.factorized.planner import checked_tolerance_db
 from clsas.interferometry.checks import checked_coherence, checked_search
 from clsas.interferometry.interferogram import window_within
-from clsas.sonar.beam import BeamWindow
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import reprs, validate
-from clsas.core.georeference import Georeference
-from clsas.core.image import Image
+from clsas.engine.data import reprs, validate
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.image import Image
 
 
 @dataclass(frozen=True, eq=False)

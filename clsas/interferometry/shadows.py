@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from clsas.core.grid import Grid
+from clsas.engine.data.grid import Grid
 from clsas.interferometry.baseline import Lattice
 from clsas.interferometry.coherence import Window
 

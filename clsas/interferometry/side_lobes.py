@@ -23,17 +23,17 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.signal import fftconvolve
 
-from clsas.core.geometry import bistatic_range_m
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, antennas_of
-from clsas.core.pings import channels_per_ping
-from clsas.core.wavelengths import wavelength_m
+from clsas.engine.data.density import usual_spacing_m
+from clsas.engine.data.directions import track_directions
+from clsas.engine.data.geometry import bistatic_range_m
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines, antennas_of
+from clsas.engine.data.pings import channels_per_ping
+from clsas.engine.data.system import element_pattern
+from clsas.engine.data.wavelengths import wavelength_m
+from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.pair import Pair
-from clsas.signal.spectrum import measure_spectrum
-from clsas.sonar.density import usual_spacing_m
-from clsas.sonar.directions import track_directions
-from clsas.sonar.system import element_pattern
 
 # Share of the power of a window from elsewhere above which a height is not valid. On the simulated
 # wreck 0.25 masks 2 % of the lit pixels that are right, 0.5 a quarter of a percent, and 1 leaves

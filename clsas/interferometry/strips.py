@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.threads import in_threads
+from clsas.engine.data.threads import in_threads
 from clsas.interferometry.coherence import Window
 
 # Rows of a strip, and windows of rows. Half and twice as many take the same time.

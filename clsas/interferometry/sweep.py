@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, maximum_filter1d
 
-from clsas.core.grid import Grid, without_heights
+from clsas.engine.data.grid import Grid, without_heights
 from clsas.interferometry.baseline import (
     Baseline,
     Lattice,

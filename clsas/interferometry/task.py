@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid, without_heights
+from clsas.engine.data.grid import Grid, without_heights
 from clsas.interferometry.baseline import Baseline
 from clsas.interferometry.pair import Pair
 

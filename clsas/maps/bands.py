@@ -10,8 +10,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid
-from clsas.core.means import block_sums
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.means import block_sums
 from clsas.maps.sources import Source
 
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.geometry import bistatic_range_m
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
-from clsas.core.wavelengths import cycles_per_m_at, wavelength_m
-from clsas.signal.spectrum import measure_spectrum, power_spectrum
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.visibility import sines
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.geometry import bistatic_range_m
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.visibility import sines
+from clsas.engine.data.wavelengths import cycles_per_m_at, wavelength_m
+from clsas.engine.signal.spectrum import measure_spectrum, power_spectrum
 
 
 def check_lines(lines: RangeLines, grid: Grid) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from clsas.core import validate
-from clsas.core.lines import RangeLines
-from clsas.factorized.plan import Plan
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.factorized.plan import Plan
 from clsas.maps import geotiff, netcdf, sicd
 from clsas.maps.encoding import KINDS
 from clsas.plot.canvas import SUFFIXES as PICTURES
-from clsas.sonar.beam import BeamWindow
 
 SUFFIXES = (*geotiff.SUFFIXES, *netcdf.SUFFIXES, *sicd.SUFFIXES, *PICTURES)
 """Suffixes of the files that `clsas.export` writes."""

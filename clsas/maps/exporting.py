@@ -7,14 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from clsas.core import map_grids, validate
-from clsas.core.georeference import Georeference
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
-from clsas.core.sidecars import remove_sidecars
-from clsas.core.version import __version__
-from clsas.factorized.plan import Plan
+from clsas.engine.data import map_grids, validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.version import __version__
+from clsas.engine.factorized.plan import Plan
+from clsas.files.sidecars import remove_sidecars
 from clsas.interferometry.result import Heights
 from clsas.maps import geotiff, netcdf, sicd, viewer, world_files
 from clsas.maps.collection import check_lines
@@ -29,7 +30,6 @@ from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.plot.canvas import save as save_picture
 from clsas.plot.colours import COLOUR_MAP
 from clsas.plot.levels import DYNAMIC_RANGE_DB
-from clsas.sonar.beam import BeamWindow
 
 
 def export(

@@ -20,11 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.atomic import assembling
-from clsas.core.extras import needed
-from clsas.core.lines import RangeLines
-from clsas.core.map_grids import Affine
+from clsas.engine.data import validate
+from clsas.engine.data.atomic import assembling
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.extras import needed
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.map_grids import Affine
 from clsas.maps.agreement import LEAST_AGREEMENT, agreement
 from clsas.maps.bands import Band, bands_of
 from clsas.maps.carrier import Carrier
@@ -35,7 +36,6 @@ from clsas.maps.interpolation import InexactError, Interpolation
 from clsas.maps.orientation import Orientation
 from clsas.maps.resampling import Resampling, north_up, steps_m
 from clsas.maps.sources import Source, windows_of
-from clsas.sonar.beam import BeamWindow
 
 SUFFIXES = (".tif", ".tiff")
 """Suffixes of GeoTIFF files."""

@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import NoReturn
 
-from clsas.core import reprs
+from clsas.engine.data import reprs
 
 _FULL_BYTES = 1 << 24  # free space below which a disk may be too full for what GDAL writes at once
 

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from scipy import signal as filters
 from scipy.sparse import csr_array
 
-from clsas.core.fourier import gridding, gridding_gain, taps_for
-from clsas.core.grid import Grid
-from clsas.core.map_grids import Affine
+from clsas.engine.data.fourier import gridding, gridding_gain, taps_for
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.map_grids import Affine
 from clsas.maps.carrier import Carrier
 from clsas.maps.resampling import averaged, lattice, steps_m
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.atomic import replacing
-from clsas.core.extras import needed
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.version import __version__
+from clsas.engine.data import validate
+from clsas.engine.data.atomic import replacing
+from clsas.engine.data.extras import needed
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.version import __version__
 from clsas.files.xarrays import GRID_MAPPING, grid_dims, to_xarray
 from clsas.maps.bands import bands_of
 from clsas.maps.encoding import Encoding

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid
-from clsas.core.map_grids import Affine
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.map_grids import Affine
 
 _SAME = 1e-9  # smallest gain for which a raster is turned, far above rounding
 

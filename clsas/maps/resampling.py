@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from clsas.core.map_grids import Affine, cover
+from clsas.engine.data.map_grids import Affine, cover
 from clsas.maps.bands import Band
 
 _CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from scipy.constants import speed_of_light
 
-from clsas.core import validate
-from clsas.core.atomic import replacing
-from clsas.core.extras import needed
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
-from clsas.core.version import __version__
+from clsas.engine.data import validate
+from clsas.engine.data.atomic import replacing
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.extras import needed
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.version import __version__
 from clsas.maps.collection import Collection, check_lines
 from clsas.maps.sicd_collection import Axis, time_and_axes, times_s, track_polynomials
 from clsas.maps.sicd_raster import Raster, ecf_m
 from clsas.maps.sources import Source
-from clsas.sonar.beam import BeamWindow
 
 if TYPE_CHECKING:
     from clsas.maps.geotiff import Progress

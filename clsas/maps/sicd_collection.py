@@ -8,8 +8,8 @@ import numpy as np
 from numpy.polynomial import Polynomial, polynomial
 from numpy.typing import NDArray
 
-from clsas.core.georeference import Georeference
-from clsas.core.lines import RangeLines
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.lines import RangeLines
 from clsas.maps.collection import Collection
 from clsas.maps.sicd_raster import Raster, ecf_m
 from clsas.measures.resolution import half_power_width

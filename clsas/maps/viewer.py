@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.atomic import replacing_folder
-from clsas.core.decibels import largest_amplitude
-from clsas.core.georeference import Georeference
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.version import __version__
+from clsas.engine.data import validate
+from clsas.engine.data.atomic import replacing_folder
+from clsas.engine.data.decibels import largest_amplitude
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.version import __version__
 from clsas.maps.frames import Frame, fitted_degrees, geographic_of, steps_of
 from clsas.maps.sources import Source
 from clsas.maps.tiles import BRIGHTEST, SIDE, STEP_DB, Pyramid, Quantization, factors_of

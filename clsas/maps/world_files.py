@@ -8,9 +8,9 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from clsas.core.atomic import replacing
-from clsas.core.image import Image
-from clsas.core.map_grids import Affine, is_vertical, warn_of_place
+from clsas.engine.data.atomic import replacing
+from clsas.engine.data.image import Image
+from clsas.engine.data.map_grids import Affine, is_vertical, warn_of_place
 from clsas.plot import image_db
 from clsas.plot.canvas import PADDING_IN, PNG_DPI, length_unit, save
 

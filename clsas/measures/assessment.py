@@ -11,19 +11,29 @@ from functools import partial
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.decibels import in_db, power
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
-from clsas.core.sound_speed import SoundSpeed
-from clsas.core.wavelengths import band_wavelength_m
-from clsas.factorized.costs import Costs
-from clsas.factorized.errors import half_precision_error
-from clsas.factorized.plan import Plan
-from clsas.factorized.planner import TOLERANCE_DB, checked_tolerance_db
-from clsas.forming import form
-from clsas.imaging import plan
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.decibels import in_db, power
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.simplify import REFRACTION, RELIEF, SHARE, leave_out
+from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.data.system import Sonar
+from clsas.engine.data.track import Pointing, Track, channels
+from clsas.engine.data.wavelengths import band_wavelength_m
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.factorized.costs import Costs
+from clsas.engine.factorized.errors import half_precision_error
+from clsas.engine.factorized.plan import Plan
+from clsas.engine.factorized.planner import TOLERANCE_DB, checked_tolerance_db
+from clsas.engine.forming import form
+from clsas.engine.imaging import plan
+from clsas.engine.scene import Scene
+from clsas.engine.signal.compression import Window
+from clsas.engine.signal.compression import check_options as check_compression
+from clsas.engine.signal.spectrum import measure_spectrum
+from clsas.engine.water.refraction import homogeneous
 from clsas.measures.assessment_result import Assessment, Effect
 from clsas.measures.effects import (
     BEAM,
@@ -34,18 +44,8 @@ from clsas.measures.effects import (
     Survey,
     errors_without,
 )
-from clsas.opencl.device import Device, open_device
-from clsas.scene import Scene
-from clsas.signal.compression import Window
-from clsas.signal.compression import check_options as check_compression
-from clsas.signal.refraction import homogeneous
-from clsas.signal.spectrum import measure_spectrum
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.simplify import REFRACTION, RELIEF, SHARE, leave_out
-from clsas.sonar.system import Sonar
-from clsas.sonar.track import Pointing, Track, channels
 
 _FULL, _FORMED = "full", "formed"  # images beside those without one effect
 _POINTS = 16  # grid points along either side whose ranges determine the extent of lines
@@ -87,7 +87,7 @@ def assess(
     element_pattern : bool
         True if the lines contain the sonar's element patterns.
     device : Device, str or int, optional
-        Device that forms the image; see `clsas.opencl.device.choose`.
+        Device that forms the image; see `clsas.engine.device.device.choose`.
     costs : Costs, optional
         Costs to use instead of those stored for the device.
     repeats : int

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from clsas.core import reprs
-from clsas.core.tables import Report, Table
+from clsas.engine.data import reprs
+from clsas.engine.data.tables import Report, Table
 from clsas.measures.effects import ENDS, KEYS
 
 NONE_DB = -250.0

@@ -17,14 +17,14 @@ import scipy.fft
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from clsas.core import reprs, validate
-from clsas.core.georeference import placed
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines, some_channels
-from clsas.core.rays import rays
-from clsas.core.sound_speed import SoundSpeed, check_reaches
-from clsas.core.threads import in_threads
-from clsas.sonar.beam import LEAST_WEIGHT_SUM, BeamWindow
+from clsas.engine.data import reprs, validate
+from clsas.engine.data.beam import LEAST_WEIGHT_SUM, BeamWindow
+from clsas.engine.data.georeference import placed
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.sound_speed import SoundSpeed, check_reaches
+from clsas.engine.data.threads import in_threads
+from clsas.engine.water.rays import rays
 
 WORST = 5
 """Number of pixels with the largest errors that a certificate lists."""

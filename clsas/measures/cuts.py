@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import reprs
-from clsas.core.grid import Axis
+from clsas.engine.data import reprs
+from clsas.engine.data.grid import Axis
 
 _LOBES = 10  # side lobes on each side that count in the ISLR
 _UPSAMPLING = 32  # points of a cut per pixel

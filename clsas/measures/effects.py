@@ -8,22 +8,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.decibels import in_db
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.georeference import placed
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines, some_channels
-from clsas.core.surface import surface_of
-from clsas.core.wavelengths import band_wavelength_m, cycles_per_m_at, wavelength_m
-from clsas.signal.ambiguity import ends_error
-from clsas.signal.refraction import Homogeneous
-from clsas.signal.spectrum import measure_spectrum
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.simplify import APART, MOTION, REFRACTION, RELIEF
-from clsas.sonar.system import Sonar, element_pattern
-from clsas.sonar.track import Pointing, Track
-from clsas.sonar.visibility import sines
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.decibels import in_db
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.georeference import placed
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.simplify import APART, MOTION, REFRACTION, RELIEF
+from clsas.engine.data.surface import surface_of
+from clsas.engine.data.system import Sonar, element_pattern
+from clsas.engine.data.track import Pointing, Track
+from clsas.engine.data.visibility import sines
+from clsas.engine.data.wavelengths import band_wavelength_m, cycles_per_m_at, wavelength_m
+from clsas.engine.signal.ambiguity import ends_error
+from clsas.engine.signal.spectrum import measure_spectrum
+from clsas.engine.water.refraction import Homogeneous
 
 SWAY = "sway and yaw beyond a straight track"
 PATTERN = "element pattern"

@@ -13,10 +13,17 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.grid import Grid
-from clsas.core.lines import some_channels
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import some_channels
+from clsas.engine.data.sampling import corners_of, course, grating_lobe_m
+from clsas.engine.data.system import Sonar
+from clsas.engine.data.track import Pointing, Track, channels
+from clsas.engine.data.visibility import sines
+from clsas.engine.signal.compression import Window
+from clsas.engine.signal.compression import check_options as check_compression
 from clsas.measures.resolution import (
     View,
     azimuth_width_m,
@@ -24,13 +31,6 @@ from clsas.measures.resolution import (
     grating_lobe_db,
     view,
 )
-from clsas.signal.compression import Window
-from clsas.signal.compression import check_options as check_compression
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.sampling import corners_of, course, grating_lobe_m
-from clsas.sonar.system import Sonar
-from clsas.sonar.track import Pointing, Track, channels
-from clsas.sonar.visibility import sines
 
 _CHANNELS = 1024  # channels whose ranges to the grid are computed, beside the first and last ping
 _POINTS = 16  # grid points along either side for these ranges; the corners are among them

@@ -8,13 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid
+from clsas.engine.data.elevation import sight_along
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.system import Sonar
+from clsas.engine.data.track import Track, channels
 from clsas.measures.limits_common import NO_GRID, Result, result
 from clsas.measures.limits_geometry import Survey
 from clsas.measures.limits_result import shown
-from clsas.sonar.elevation import sight_along
-from clsas.sonar.system import Sonar
-from clsas.sonar.track import Track, channels
 
 _POINTS = 16  # grid points along either side that represent the grid
 

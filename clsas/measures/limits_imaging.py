@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from clsas.engine.data.sampling import SLACK
 from clsas.measures.limits_common import (
     CURVED,
     NO_ELEMENT,
@@ -24,7 +25,6 @@ from clsas.measures.limits_common import (
 from clsas.measures.limits_geometry import Survey
 from clsas.measures.limits_result import shown
 from clsas.measures.resolution import range_width_m
-from clsas.sonar.sampling import SLACK
 
 _SHARE = 8  # an eighth of a wavelength: the error of a path that [34] allows
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import groupby
 
-from clsas.core import reprs
-from clsas.core.tables import Report, Table
+from clsas.engine.data import reprs
+from clsas.engine.data.tables import Report, Table
 
 _INDENT = "    "
 

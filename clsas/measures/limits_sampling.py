@@ -11,6 +11,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from clsas.engine.data.sampling import (
+    SLACK,
+    corners_of,
+    measure_spacing,
+    receive_interval_s,
+)
 from clsas.measures.limits_common import (
     CURVED,
     NO_ARRAY,
@@ -28,12 +34,6 @@ from clsas.measures.limits_common import (
 )
 from clsas.measures.limits_geometry import Survey
 from clsas.measures.limits_result import Limit, shown
-from clsas.sonar.sampling import (
-    SLACK,
-    corners_of,
-    measure_spacing,
-    receive_interval_s,
-)
 
 
 def ping_interval(survey: Survey) -> Iterator[Result]:

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from clsas.core import validate
-from clsas.core.digests import digest
-from clsas.core.grid import Grid
-from clsas.core.image import Image
+from clsas.engine.data import validate
+from clsas.engine.data.digests import digest
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
 
 
 def multilook(images: Image | Sequence[Image], *, window_m: float | None = None) -> Image:

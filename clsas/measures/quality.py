@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import reprs, validate
-from clsas.core.georeference import Georeference
-from clsas.core.grid import Axis, Grid
-from clsas.core.image import Image
+from clsas.engine.data import reprs, validate
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.grid import Axis, Grid
+from clsas.engine.data.image import Image
 from clsas.measures.cuts import Cut, measure_cut
 
 _SEARCH = 10  # pixels around the given position in which the peak is searched

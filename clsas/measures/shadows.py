@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from clsas.core import validate
-from clsas.core.image import Image
-from clsas.core.image_error import darkest_pixels
+from clsas.engine.data import validate
+from clsas.engine.data.image import Image
+from clsas.engine.data.image_error import darkest_pixels
 
 DARKEST = 0.1
 """Default share of the pixels that count as dark."""
@@ -22,7 +22,7 @@ def dark_level_db(image: Image | ArrayLike, *, darkest: float = DARKEST) -> floa
         Complex pixels, not all of them zero. Pixels that are zero do not count.
     darkest : float
         Share of the pixels that count as dark, above 0 and up to 1; see
-        `clsas.core.image_error.darkest_pixels`.
+        `clsas.engine.data.image_error.darkest_pixels`.
 
     Returns
     -------

@@ -6,18 +6,18 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
-from clsas.core import validate
-from clsas.core.grid import Grid
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.system import Sonar
+from clsas.engine.data.track import Pointing, Track
+from clsas.engine.signal.compression import Window
 from clsas.measures.limits_common import Result
 from clsas.measures.limits_geometry import Survey
 from clsas.measures.limits_heights import heights
 from clsas.measures.limits_imaging import approximations, resolution
 from clsas.measures.limits_result import Limit, Limits
 from clsas.measures.limits_sampling import along_track, grating_lobes, ping_interval
-from clsas.signal.compression import Window
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.system import Sonar
-from clsas.sonar.track import Pointing, Track
 
 _SUBJECTS = {
     "Range and ping interval": ping_interval,

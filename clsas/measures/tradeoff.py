@@ -12,30 +12,30 @@ from itertools import count, product
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.image_error import relative_error_db
-from clsas.core.lines import RangeLines
-from clsas.exact.decide import ACCURACY_DB
-from clsas.factorized.filters import ALIGN_TAPS, APERTURE_TAPS
-from clsas.factorized.plan import Plan
-from clsas.factorized.planner import (
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.exact.decide import ACCURACY_DB
+from clsas.engine.factorized.filters import ALIGN_TAPS, APERTURE_TAPS
+from clsas.engine.factorized.plan import Plan
+from clsas.engine.factorized.planner import (
     BEST_TOLERANCE_DB,
     WORST_TOLERANCE_DB,
     Request,
     checked_pairs,
     planned,
 )
-from clsas.forming import form_exactly
-from clsas.imaging import factorize
+from clsas.engine.forming import form_exactly
+from clsas.engine.imaging import factorize
+from clsas.engine.signal.doubts import warn_before_imaging
 from clsas.measures.cuts import Cut
 from clsas.measures.quality import measure_point
 from clsas.measures.shadows import DARKEST, dark_level_db
 from clsas.measures.tradeoff_result import Response, Row, Tradeoff
-from clsas.opencl.device import Device, open_device
-from clsas.signal.doubts import warn_before_imaging
-from clsas.sonar.beam import BeamWindow
 
 TOLERANCES_DB = (-20.0, -30.0, -40.0, -50.0, -60.0, -70.0)
 STAGES = (*(((2, 2),) * count for count in range(1, 6)), ((2, 4),) * 2)
@@ -80,7 +80,7 @@ def tradeoff(
     beam : BeamWindow, optional
         Weights of the channels, also for the exact image.
     device : Device, str or int, optional
-        See `clsas.opencl.device.choose`.
+        See `clsas.engine.device.device.choose`.
     repeats : int
         Number of timed runs.
     study : bool

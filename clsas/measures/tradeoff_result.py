@@ -8,9 +8,9 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from clsas.core import reprs, validate
-from clsas.core.atomic import replacing
-from clsas.core.tables import Report, Table
+from clsas.engine.data import reprs, validate
+from clsas.engine.data.atomic import replacing
+from clsas.engine.data.tables import Report, Table
 
 _FIGURES = ("resolution_m", "pslr_db", "islr_db")
 _HEADER = (

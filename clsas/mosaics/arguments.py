@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.lines import RangeLines
-from clsas.exact.decide import BEST_ACCURACY_DB
-from clsas.factorized.planner import TOLERANCE_DB, checked_pairs, tolerance_in_db
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.directions import MOST_TRACK_PINGS
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.simplify import shift_error
+from clsas.engine.exact.decide import BEST_ACCURACY_DB
+from clsas.engine.factorized.planner import TOLERANCE_DB, checked_pairs, tolerance_in_db
 from clsas.mosaics.documents import is_there, read_document
 from clsas.mosaics.provenance import REQUESTS, beam_json
 from clsas.mosaics.scheduling import Growth
 from clsas.mosaics.survey import END, has_ended
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.directions import MOST_TRACK_PINGS
-from clsas.sonar.simplify import shift_error
 
 
 def checked_request(

@@ -13,10 +13,10 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec
 
-from clsas.core import validate
-from clsas.core.atomic import creating, make_folders, staging, sync_folder
-from clsas.core.digests import grid_digest, with_digest
-from clsas.core.grid import Grid
+from clsas.engine.data import validate
+from clsas.engine.data.atomic import creating, make_folders, staging, sync_folder
+from clsas.engine.data.digests import grid_digest, with_digest
+from clsas.engine.data.grid import Grid
 from clsas.mosaics.documents import (
     DIGESTS,
     FORMAT,

@@ -8,11 +8,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import banks
-from clsas.core.lines import RangeLines
+from clsas.engine.data import banks
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.lines import RangeLines
 from clsas.mosaics.survey import Survey
 from clsas.mosaics.visibility import SurveyVisibility
-from clsas.sonar.beam import BeamWindow
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from clsas.core.reading import check_ordinary
+from clsas.engine.data.reading import check_ordinary
 from clsas.mosaics.levels import PixelArray
 from clsas.mosaics.metadata import CHECKSUM_BYTES, ITEM_BYTES
 from clsas.mosaics.record import PatchIndex

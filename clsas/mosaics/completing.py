@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.atomic import sync_folder
-from clsas.core.digests import digest, is_intact, with_digest
+from clsas.engine.data.atomic import sync_folder
+from clsas.engine.data.digests import digest, is_intact, with_digest
 from clsas.mosaics.arrays import open_array, write_values
 from clsas.mosaics.chunks import chunk_checksums
 from clsas.mosaics.documents import (

@@ -13,7 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from clsas.opencl.device import (
+from clsas.engine.device.device import (
     ENVIRONMENT_VARIABLE,
     Device,
     DeviceInfo,

@@ -13,12 +13,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from clsas.core import validate
-from clsas.core.atomic import make_folders, replacing
-from clsas.core.digests import is_intact
-from clsas.core.georeference import Georeference
-from clsas.core.grid import Grid
-from clsas.core.reading import parse_json, read_bytes
+from clsas.engine.data import validate
+from clsas.engine.data.atomic import make_folders, replacing
+from clsas.engine.data.digests import is_intact
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.reading import parse_json, read_bytes
 from clsas.mosaics.levels import WINDOW, are_levels
 
 FORMAT = "clsas mosaic"

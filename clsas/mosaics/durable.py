@@ -15,14 +15,14 @@ from zarr.abc.store import Store
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import LocalStore
 
-from clsas.core.atomic import make_folders, replacing
-from clsas.core.reading import check_ordinary
+from clsas.engine.data.atomic import make_folders, replacing
+from clsas.engine.data.reading import check_ordinary
 from clsas.mosaics.documents import check_own
 from clsas.mosaics.metadata import Checked
 
 
 class DurableStore(LocalStore):
-    """Zarr store in a folder, written with `clsas.core.atomic`.
+    """Zarr store in a folder, written with `clsas.engine.data.atomic`.
 
     Attributes
     ----------

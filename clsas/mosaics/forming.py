@@ -13,12 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid
-from clsas.core.image import Image, holds_any
-from clsas.core.lines import RangeLines
-from clsas.factorized.plan import ExactImage, Plan
-from clsas.factorized.planner import Request, planned, tolerance_in_db
-from clsas.forming import SceneImager, form
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.coverage import reaches
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image, holds_any
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.device.device import Device
+from clsas.engine.factorized.plan import ExactImage, Plan
+from clsas.engine.factorized.planner import Request, planned, tolerance_in_db
+from clsas.engine.forming import SceneImager, form
+from clsas.engine.scene import Scene
 from clsas.mosaics.devices import process_device, thread_device
 from clsas.mosaics.patches import PatchWindow, host_bytes
 from clsas.mosaics.provenance import REQUESTS, beam_json
@@ -26,10 +30,6 @@ from clsas.mosaics.record import Record
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import Survey, largest_gap_m, open_files
 from clsas.mosaics.visibility import SurveyVisibility
-from clsas.opencl.device import Device
-from clsas.scene import Scene
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.coverage import reaches
 
 # Pixels times channels. Backprojecting a smaller patch takes less time than planning it.
 _WORTH_A_PLAN = 5e7

@@ -19,11 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from clsas.core import banks as numbers
-from clsas.core import validate
-from clsas.core.georeference import placed
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
+from clsas.engine.data import banks as numbers
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.georeference import placed
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.device.device import Device
 from clsas.interferometry import heights
 from clsas.interferometry.checks import check_grid, check_pair
 from clsas.interferometry.coherence import Window
@@ -42,8 +44,6 @@ from clsas.mosaics.record import PatchIndex, Record
 from clsas.mosaics.scheduling import Run, form_patches
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import open_survey
-from clsas.opencl.device import Device
-from clsas.sonar.beam import BeamWindow
 
 _SIDE = 1024  # pixels along a patch by default, which then takes about 0.6 GiB
 _TRIAL = 512  # largest side of the part of the grid that decides on the windows; arbitrary

@@ -16,8 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid
-from clsas.core.image import Image, holds_any
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image, holds_any
+from clsas.engine.device.device import Device
 from clsas.interferometry import heights
 from clsas.interferometry.baseline import Baseline
 from clsas.interferometry.errors import UnmeasurableError
@@ -33,8 +35,6 @@ from clsas.mosaics.relief_shadows import mask_shadows, of_shadows
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import largest_gap_m
 from clsas.mosaics.visibility import SurveyVisibility
-from clsas.opencl.device import Device
-from clsas.sonar.beam import BeamWindow
 
 _PLACES = 5  # along either side of a patch, for which curves are found; arbitrary
 

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.digests import digest
-from clsas.core.grid import Grid
-from clsas.core.reading import parse_json, read_bytes
+from clsas.engine.data.digests import digest
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.reading import parse_json, read_bytes
 from clsas.mosaics.documents import DIGESTS, DamageError, plane_of, read_attributes
 from clsas.mosaics.levels import axis_of, mosaic_arrays, patch_arrays, stored_levels
 

@@ -18,11 +18,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import reprs, validate
-from clsas.core.georeference import placed
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
+from clsas.engine.data import reprs, validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.coverage import warn_unreached
+from clsas.engine.data.georeference import placed
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.device.device import Device
+from clsas.engine.signal.doubts import warn_before_imaging
 from clsas.mosaics.arguments import (
     beam_of_mosaic,
     check_client,
@@ -39,10 +43,6 @@ from clsas.mosaics.scheduling import Run, form_patches, wait_for_first_file
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import open_survey, warn_of_order
 from clsas.mosaics.visibility import SurveyVisibility
-from clsas.opencl.device import Device
-from clsas.signal.doubts import warn_before_imaging
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.coverage import warn_unreached
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.means import block_means
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.means import block_means
 
 _FINEST = 5  # pixels of a level along each side of an overview pixel, before a larger step is tried
 _LARGER = 4 / 3  # largest step over the smallest, so that a coarser level can be read

@@ -9,8 +9,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.atomic import sync_folder
+from clsas.engine.data import validate
+from clsas.engine.data.atomic import sync_folder
 from clsas.mosaics.documents import check_own, read_document, write_attributes
 from clsas.mosaics.levels import WINDOW, layers_of, shadowed_of, stored_levels
 from clsas.mosaics.pyramid import Level, layer_levels, levels

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
-from clsas.core import validate
-from clsas.core.grid import Grid
+from clsas.engine.data import validate
+from clsas.engine.data.grid import Grid
 from clsas.mosaics.levels import aligned_side, factors_of
 from clsas.mosaics.record import PatchIndex
 from clsas.mosaics.visibility import SurveyVisibility

@@ -7,11 +7,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from clsas.core.digests import digest, grid_digest
-from clsas.core.grid import Grid
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.digests import digest, grid_digest
+from clsas.engine.data.grid import Grid
 from clsas.mosaics.documents import PARTS_OF_B, read_document
 from clsas.mosaics.survey import Survey
-from clsas.sonar.beam import BeamWindow
 
 REQUESTS = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
 """Requests for accuracy or a method, of which a mosaic takes at most one."""

@@ -22,7 +22,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.means import block_means
+from clsas.engine.data.means import block_means
 from clsas.mosaics.levels import IN_DB, PixelArray
 
 Real = TypeVar("Real", np.float32, np.float64)

@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from clsas.core import reprs
-from clsas.core.digests import is_intact, with_digest
+from clsas.engine.data import reprs
+from clsas.engine.data.digests import is_intact, with_digest
 from clsas.mosaics.documents import DamageError, read_attributes
 
 PIXELS_CHECKSUM = "pixels_crc32c"

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid, without_heights
+from clsas.engine.data.grid import Grid, without_heights
 from clsas.interferometry.baseline import Lattice
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.shadows import ReliefPart, Skyline

@@ -9,17 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
-from clsas.core.threads import uninterrupted, wait
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.threads import uninterrupted, wait
+from clsas.engine.device.device import Device
 from clsas.mosaics.devices import device_threads
 from clsas.mosaics.patches import Layout, PatchWindow
 from clsas.mosaics.record import PatchIndex, Record
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import files_of, has_ended, open_files
 from clsas.mosaics.visibility import SurveyVisibility
-from clsas.opencl.device import Device
-from clsas.sonar.beam import BeamWindow
 
 if TYPE_CHECKING:
     from distributed import Client

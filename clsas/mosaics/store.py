@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import reprs, validate
-from clsas.core.digests import grid_digest, with_digest
-from clsas.core.extras import needed
-from clsas.core.grid import Grid
-from clsas.core.image import Image
+from clsas.engine.data import reprs, validate
+from clsas.engine.data.digests import grid_digest, with_digest
+from clsas.engine.data.extras import needed
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
 from clsas.interferometry.result import Heights
 from clsas.mosaics import stored_heights
 from clsas.mosaics.documents import (

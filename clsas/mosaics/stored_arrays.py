@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.extras import needed
+from clsas.engine.data import validate
+from clsas.engine.data.extras import needed
 from clsas.mosaics.documents import DamageError, read_document
 from clsas.mosaics.levels import PixelArray, mosaic_arrays, patch_arrays
 from clsas.mosaics.patch_files import PatchFiles

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.grid import Grid, without_heights
-from clsas.core.image import Image
-from clsas.core.means import block_means
+from clsas.engine.data import validate
+from clsas.engine.data.grid import Grid, without_heights
+from clsas.engine.data.image import Image
+from clsas.engine.data.means import block_means
 from clsas.interferometry.refinement import filled
 from clsas.interferometry.result import Heights
 from clsas.mosaics.documents import read_document

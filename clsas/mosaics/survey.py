@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from clsas.core import validate
-from clsas.core.digests import Without, digest
-from clsas.core.lines import RangeLines
+from clsas.engine.data import validate
+from clsas.engine.data.digests import Without, digest
+from clsas.engine.data.lines import RangeLines
 from clsas.files.hdf5 import FileFormatError, read_geometry, read_samples
 
 END = "end"

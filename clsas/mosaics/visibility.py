@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.geometry import bistatic_range_m
-from clsas.core.grid import Grid
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.directions import MOST_TRACK_PINGS
+from clsas.engine.data.geometry import bistatic_range_m
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.visibility import BeamTrack, Boxes
 from clsas.mosaics.survey import Survey
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.directions import MOST_TRACK_PINGS
-from clsas.sonar.visibility import BeamTrack, Boxes
 
 # Bytes per channel that finding the visibility takes, without and with a beam: measured with 1e6
 # pings.

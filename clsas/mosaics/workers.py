@@ -23,9 +23,9 @@ from distributed import Client, Nanny, Scheduler, Security, SpecCluster, Worker
 from distributed.comm.core import CommClosedError
 from distributed.system import MEMORY_LIMIT
 
-from clsas.core.cache import private_folder
-from clsas.core.extras import needed
-from clsas.core.threads import uninterrupted
+from clsas.engine.data.cache import private_folder
+from clsas.engine.data.extras import needed
+from clsas.engine.data.threads import uninterrupted
 
 _SAFE_PATH = "PYTHONSAFEPATH"
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
+from clsas.engine.data import validate
 
 _LEAST_DEVIATION = 1e-9  # smallest standard deviation accepted, metres or radians
 _MOST_DEVIATION_M = 1e3

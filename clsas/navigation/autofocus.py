@@ -18,14 +18,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.contrast import contrast
-from clsas.core.georeference import placed
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
-from clsas.forming import form, scene_of_plan
-from clsas.imaging import plan
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.contrast import contrast
+from clsas.engine.data.georeference import placed
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.forming import form, scene_of_plan
+from clsas.engine.imaging import plan
+from clsas.engine.signal.readout import Readout
+from clsas.engine.water.refraction import homogeneous
 from clsas.navigation.autofocus_result import Autofocus
 from clsas.navigation.checks import (
     check_navigation,
@@ -46,10 +50,6 @@ from clsas.navigation.responses import (
     received_share,
 )
 from clsas.navigation.speed_check import check_speed
-from clsas.opencl.device import Device, open_device
-from clsas.signal.readout import Readout
-from clsas.signal.refraction import homogeneous
-from clsas.sonar.beam import BeamWindow
 
 UNKNOWNS = ("sway", "heave", "surge")
 
@@ -107,7 +107,7 @@ def autofocus(
         Displacements to solve for: across the track, up, and along it. To solve for several, the
         responses must see the sonar from different directions.
     device : Device, str or int, optional
-        See `clsas.opencl.device.choose`.
+        See `clsas.engine.device.device.choose`.
     progress : callable, optional
         Called as progress(steps done, steps).
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import reprs
-from clsas.core.lines import RangeLines
+from clsas.engine.data import reprs
+from clsas.engine.data.lines import RangeLines
 
 
 @dataclass(frozen=True, eq=False)

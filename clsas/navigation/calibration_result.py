@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import reprs
-from clsas.core.lines import RangeLines
+from clsas.engine.data import reprs
+from clsas.engine.data.lines import RangeLines
 from clsas.navigation.range_model import UNKNOWNS
 
 UNITS = {"time_offset": "s", "sound_speed": "m/s", "forward": "m", "port": "m", "up": "m"}

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from clsas.core import banks, validate
-from clsas.core.lines import RangeLines
-from clsas.core.pings import Transmissions
-from clsas.core.wavelengths import band_wavelength_m, is_about_zero
-from clsas.signal.readout import Readout
+from clsas.engine.data import banks, validate
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.pings import Transmissions
+from clsas.engine.data.wavelengths import band_wavelength_m, is_about_zero
+from clsas.engine.signal.readout import Readout
 
 _MOST_OVERSAMPLING = 64.0  # limits the range resolution of lines that are almost constant
 _REMEDY = "lines.without_still_pings() drops them"

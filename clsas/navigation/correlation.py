@@ -17,15 +17,15 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from clsas.core.conditioning import are_dead
-from clsas.core.lines import RangeLines
-from clsas.core.wavelengths import cycles_per_m_at
+from clsas.engine.data.conditioning import are_dead
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.wavelengths import cycles_per_m_at
+from clsas.engine.signal.readout import Readout
 from clsas.navigation.directions import Alignment, alignment
 from clsas.navigation.echoes import Window, independent_echoes, strongest, without_highlights
 from clsas.navigation.overlap import Overlap
 from clsas.navigation.pair_geometry import PairGeometry
 from clsas.navigation.swath import Swath
-from clsas.signal.readout import Readout
 
 _FREQUENCIES = 9  # in either half of the band, each representing an equal share of the power
 _SPECKLE_LAGS = 64  # samples over which speckle may be correlated in range

@@ -22,8 +22,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from clsas.engine.data.system import element_pattern
 from clsas.navigation.pair_geometry import PairGeometry
-from clsas.sonar.system import element_pattern
 
 ALL, MIDDLE = 1.0, 0.25
 """Half widths of the passband of the filters, in periods of ambiguous directions: the whole beam,

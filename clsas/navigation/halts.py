@@ -13,8 +13,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.engine.signal.readout import Readout
 from clsas.navigation.responses import Contributions, Passage
-from clsas.signal.readout import Readout
 
 _STRETCH = 4.0
 """Length of a stretch in Fresnel lengths. Over it, an echo from broadside has 1/16 of its power in

@@ -13,16 +13,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import reprs, validate
-from clsas.core.lines import RangeLines
+from clsas.engine.data import reprs, validate
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.track import Track
+from clsas.engine.signal.readout import Readout
 from clsas.navigation.calibration_result import UNITS, Calibration
 from clsas.navigation.checks import checked_unknowns
 from clsas.navigation.range_fit import MOST_CONDITION, Ambiguity, Fit, fitted
 from clsas.navigation.range_model import UNKNOWNS, Model
 from clsas.navigation.reflectors import LEAST_SNR, Reader
 from clsas.navigation.responses import displacement_axes
-from clsas.signal.readout import Readout
-from clsas.sonar.track import Track
 
 DEFAULT_UNKNOWNS = UNKNOWNS[:2]
 

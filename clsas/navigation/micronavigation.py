@@ -10,9 +10,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import reprs, validate
-from clsas.core.conditioning import DEAD_DB
-from clsas.core.lines import RangeLines
+from clsas.engine.data import reprs, validate
+from clsas.engine.data.conditioning import DEAD_DB
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.track import Track
+from clsas.engine.signal.compression import compress
+from clsas.engine.signal.echoes import Echoes
+from clsas.engine.water.ray_delays import at_speed
 from clsas.navigation.accuracy import Accuracy, check_plausible
 from clsas.navigation.checks import check_navigation, first_bank, mean_wavelength_m
 from clsas.navigation.correlation import Correlator
@@ -20,10 +24,6 @@ from clsas.navigation.overlap import Array, moved
 from clsas.navigation.passes import LEAST_ECHOES, Displacements, measured
 from clsas.navigation.smoother import Step, persistence, shape_deviation_m, smooth
 from clsas.navigation.swath import Swath, check_sizes, checked_swath
-from clsas.signal.compression import compress
-from clsas.signal.echoes import Echoes
-from clsas.signal.ray_delays import at_speed
-from clsas.sonar.track import Track
 
 UNKNOWNS = ("sway", "yaw", "surge")
 YAW_SD_RAD = math.radians(1.0)

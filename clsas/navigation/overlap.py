@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from clsas.core.lines import RangeLines
+from clsas.engine.data.lines import RangeLines
 
 _MOST_APART = 0.5
 """Largest distance along the array, in spacings of the array, at which two phase centres are

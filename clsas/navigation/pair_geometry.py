@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.geometry import bistatic_range_m
-from clsas.core.lines import RangeLines
+from clsas.engine.data.geometry import bistatic_range_m
+from clsas.engine.data.lines import RangeLines
 from clsas.navigation.overlap import Array, Overlap
 from clsas.navigation.swath import Swath
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.lines import RangeLines
+from clsas.engine.data.lines import RangeLines
 from clsas.navigation.advance import surge
 from clsas.navigation.correlation import Correlator
 from clsas.navigation.directions import ALL, MIDDLE

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.lines import RangeLines
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.lines import RangeLines
 
 UNKNOWNS = ("time_offset", "sound_speed", "forward", "port", "up")
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from clsas.core.lines import some_channels
+from clsas.engine.data.lines import some_channels
 from clsas.navigation.range_model import Model
 from clsas.navigation.reflectors import LEAST_SNR, Reader
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from clsas.core.wavelengths import cycles_per_m_at
+from clsas.engine.data.wavelengths import cycles_per_m_at
+from clsas.engine.signal.readout import Readout
 from clsas.navigation.checks import range_cell_m
-from clsas.signal.readout import Readout
 
 LEAST_SNR = 10.0
 """Power of a response over that of the noise around it, from which it is used (10 dB). Noise alone

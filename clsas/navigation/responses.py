@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.spatial.distance import cdist
 
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
-from clsas.core.phasors import phasors
-from clsas.core.threads import in_threads
-from clsas.core.wavelengths import wavelength_m
-from clsas.signal.readout import Readout
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.directions import track_directions
-from clsas.sonar.visibility import sines
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.directions import track_directions
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.threads import in_threads
+from clsas.engine.data.visibility import sines
+from clsas.engine.data.wavelengths import wavelength_m
+from clsas.engine.signal.phasors import phasors
+from clsas.engine.signal.readout import Readout
 
 READ_DB = -40.0
 """Accuracy with which the lines are read."""

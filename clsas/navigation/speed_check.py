@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
+from clsas.engine.data import validate
 from clsas.navigation.responses import Contributions, Passage
 
 _LEAST_SHARE = 0.95

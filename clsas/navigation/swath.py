@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.lines import RangeLines
+from clsas.engine.data import validate
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.navigation.overlap import Array
-from clsas.signal.spectrum import measure_spectrum
 
 _LEAST_WINDOW = 16  # samples
 _WINDOW_CELLS = 150.0  # default length of a window, range resolution cells

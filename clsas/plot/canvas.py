@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from clsas.core import validate
-from clsas.core.atomic import replacing
-from clsas.core.extras import needed
-from clsas.core.sidecars import remove_sidecars
+from clsas.engine.data import validate
+from clsas.engine.data.atomic import replacing
+from clsas.engine.data.extras import needed
+from clsas.files.sidecars import remove_sidecars
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from clsas.core.georeference import Georeference
+    from clsas.engine.data.georeference import Georeference
 
 SUFFIXES = (".png", ".pdf", ".svg")
 """Suffixes of the files that `save` writes."""
@@ -147,7 +147,7 @@ def axis_label(name: str, unit: str, of: str = "", place: Georeference | None = 
     Parameters
     ----------
     name : str
-        Name of a `clsas.core.grid.Axis`: "x", "y" or "z", "along columns" or "along rows".
+        Name of a `clsas.engine.data.grid.Axis`: "x", "y" or "z", "along columns" or "along rows".
     unit : str
     of : str
         Words for the origin, as in "Along-track from the peak (mm)".

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from clsas.core import validate
-from clsas.core.extras import needed
+from clsas.engine.data import validate
+from clsas.engine.data.extras import needed
 
 if TYPE_CHECKING:
     from matplotlib.colors import Colormap

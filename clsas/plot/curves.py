@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clsas.core import validate
+from clsas.engine.data import validate
 from clsas.measures.cuts import Cut
 from clsas.measures.quality import PointResponse
 from clsas.measures.tradeoff_result import Row, Tradeoff

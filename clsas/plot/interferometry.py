@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from clsas.core import validate
-from clsas.core.grid import Grid
+from clsas.engine.data import validate
+from clsas.engine.data.grid import Grid
 from clsas.interferometry.interferogram import Interferogram
 from clsas.interferometry.result import Heights
 from clsas.plot import colours

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.decibels import level_db
-from clsas.core.extras import is_installed
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
+from clsas.engine.data import validate
+from clsas.engine.data.decibels import level_db
+from clsas.engine.data.extras import is_installed
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
 from clsas.plot.canvas import (
     axis_label,
     drawable,

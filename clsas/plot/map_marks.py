@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clsas.core.grid import Grid
-from clsas.core.reprs import quantity
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.reprs import quantity
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.grid import Grid
+from clsas.engine.data import validate
+from clsas.engine.data.grid import Grid
 from clsas.plot.canvas import length_unit
 from clsas.plot.levels import image_db
 

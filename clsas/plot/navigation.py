@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.image import Image
+from clsas.engine.data import validate
+from clsas.engine.data.image import Image
 from clsas.navigation.autofocus import Autofocus
 from clsas.navigation.micronavigation import Micronavigation
 from clsas.plot.canvas import new_figure

@@ -6,9 +6,9 @@ import textwrap
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from clsas.core import validate
-from clsas.core.decibels import in_db
-from clsas.factorized.plan import Plan
+from clsas.engine.data import validate
+from clsas.engine.data.decibels import in_db
+from clsas.engine.factorized.plan import Plan
 from clsas.plot.canvas import drawable, new_figure
 
 if TYPE_CHECKING:

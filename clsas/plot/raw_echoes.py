@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.decibels import level_db
+from clsas.engine.data import validate
+from clsas.engine.data.decibels import level_db
+from clsas.engine.signal.echoes import Echoes
 from clsas.plot.canvas import drawable, new_figure
 from clsas.plot.colours import COLOUR_MAP
 from clsas.plot.levels import Scale, aligned, draw_levels
-from clsas.signal.echoes import Echoes
 
 if TYPE_CHECKING:
     from matplotlib.colors import Colormap

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.decibels import level_db
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
-from clsas.core.pings import Transmissions
+from clsas.engine.data import validate
+from clsas.engine.data.decibels import level_db
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.pings import Transmissions
+from clsas.engine.signal.spectrum import power_spectrum
 from clsas.inspection.result import Inspection
 from clsas.plot.canvas import axis_label, length_unit, new_figure, plain_ticks
 from clsas.plot.levels import Scale, draw_levels
 from clsas.plot.survey import outline as outline_of
-from clsas.signal.spectrum import power_spectrum
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.image import Image
+from clsas.engine.data import validate
+from clsas.engine.data.image import Image
 from clsas.plot.canvas import axis_label, drawable, length_unit, new_figure, plain_ticks
 from clsas.plot.colours import COLOUR_MAP
 from clsas.plot.colours import colour_map as checked_colour_map

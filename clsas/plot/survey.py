@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
+from clsas.engine.data import validate
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.signal.echoes import Echoes
 from clsas.plot.canvas import axis_label, length_unit, new_figure, plain_ticks
-from clsas.signal.echoes import Echoes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

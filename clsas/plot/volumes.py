@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.grid import Grid
-from clsas.core.image import Image
+from clsas.engine.data import validate
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
 from clsas.plot.canvas import axis_label, drawable, figure_class, length_unit
 from clsas.plot.levels import Scale, add_colour_bar, draw_levels, edges
 

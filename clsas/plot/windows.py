@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.grid import Grid
+from clsas.engine.data import validate
+from clsas.engine.data.grid import Grid
 from clsas.measures.quality import on_axes
 
 _AROUND = 32  # pixels on either side by default, along the coarser axis

@@ -12,19 +12,20 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from clsas.core import reprs, validate
-from clsas.core.atomic import staging, sync_folder
-from clsas.core.image import Image
-from clsas.core.json_types import json_able
-from clsas.core.lines import RangeLines
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data import reprs, validate
+from clsas.engine.data.atomic import staging, sync_folder
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ClsasWarning
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.signal.echoes import Echoes
 from clsas.files.hdf5 import save
+from clsas.files.json_types import json_able
 from clsas.files.process_tables import CORRECTIONS, STEPS, checked_steps
 from clsas.files.scene_files import SceneFile, read_scene
 from clsas.interferometry.checks import check_grid
 from clsas.interferometry.result import Heights
 from clsas.mosaics.store import Store
-from clsas.opencl.device import Device, open_device
 from clsas.processing.folders import check_folder, checked_records, folder_of, made
 from clsas.processing.record import StepRecord, file_digest, step_digest, write_records
 from clsas.processing.recording import Recording, loaded
@@ -39,7 +40,6 @@ from clsas.processing.steps import (
     options_of,
     store_of,
 )
-from clsas.signal.echoes import Echoes
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +155,7 @@ def process(
         above. The preceding steps of the scene that correct the lines are brought up to date first,
         so that a step always starts from the same lines. Other steps are left alone.
     device : Device, str or int, optional
-        See `clsas.opencl.device.choose`.
+        See `clsas.engine.device.device.choose`.
     progress : callable, optional
         Called as progress(step, done, total), with the name of a step and its progress.
 

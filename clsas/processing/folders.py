@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from clsas.core import validate
-from clsas.core.atomic import locked
+from clsas.engine.data import validate
+from clsas.engine.data.atomic import locked
 from clsas.files.scene_files import SceneFile
 from clsas.processing.record import NAME, StepRecord, read_records
 from clsas.processing.recording import Recording

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from clsas.core.contrast import contrast, entropy
-from clsas.core.image import Image
+from clsas.engine.data.contrast import contrast, entropy
+from clsas.engine.data.image import Image
 from clsas.interferometry.result import Heights
 from clsas.navigation.autofocus import Autofocus
 from clsas.navigation.micronavigation import Micronavigation

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 import scipy
 
-from clsas.core import reading, reprs, validate
-from clsas.core.atomic import replacing
-from clsas.core.digests import DIGEST, digest, is_intact, with_digest
-from clsas.core.json_types import json_able
-from clsas.core.version import __version__
+from clsas.engine.data import reading, reprs, validate
+from clsas.engine.data.atomic import replacing
+from clsas.engine.data.digests import DIGEST, digest, is_intact, with_digest
+from clsas.engine.data.version import __version__
+from clsas.files.json_types import json_able
 from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
 

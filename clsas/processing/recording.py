@@ -8,14 +8,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from clsas.core import validate
-from clsas.core.digests import digest
-from clsas.core.lines import RangeLines
+from clsas.engine.data import validate
+from clsas.engine.data.digests import digest
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.signal.compression import compress
+from clsas.engine.signal.echoes import Echoes
 from clsas.files.formats import load
 from clsas.files.scene_files import SceneFile
 from clsas.processing.record import file_digest, step_digest
-from clsas.signal.compression import compress
-from clsas.signal.echoes import Echoes
 
 
 @dataclass(frozen=True, eq=False)

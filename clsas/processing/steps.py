@@ -9,20 +9,21 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from clsas import plot
-from clsas.core import banks
-from clsas.core.atomic import replacing, staging
-from clsas.core.digests import digest
-from clsas.core.extras import install_command, is_installed
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
-from clsas.core.validate import warn
-from clsas.factorized.planner import TOLERANCE_DB
+from clsas.engine.data import banks
+from clsas.engine.data.atomic import replacing, staging
+from clsas.engine.data.digests import digest
+from clsas.engine.data.extras import install_command, is_installed
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import warn
+from clsas.engine.device.device import Device
+from clsas.engine.factorized.planner import TOLERANCE_DB
+from clsas.engine.imaging import backproject, factorize, plan
 from clsas.files.hdf5 import save
 from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS
-from clsas.imaging import backproject, factorize, plan
 from clsas.inspection.inspection import inspect
 from clsas.interferometry.heights import heights
 from clsas.interferometry.pair_errors import pair_errors
@@ -34,7 +35,6 @@ from clsas.mosaics.store import Store
 from clsas.navigation.autofocus import autofocus
 from clsas.navigation.known_points import calibrate_track
 from clsas.navigation.micronavigation import micronavigate
-from clsas.opencl.device import Device
 from clsas.processing import numbers
 from clsas.processing.record import StepRecord
 from clsas.processing.tracks import csv_of_track

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
-from clsas.core import validate
+from clsas.engine.data import validate
 
 Elevations = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 

@@ -19,7 +19,7 @@ class Bend(NamedTuple):
     lift : ndarray
         Added to this component, times the component of the axis that points up.
     spreading_m : ndarray
-        Length whose inverse is the amplitude; see `clsas.core.rays.Rays`.
+        Length whose inverse is the amplitude; see `clsas.engine.water.rays.Rays`.
     speed_m_s : float
         Sound speed at the antenna.
     focused : bool

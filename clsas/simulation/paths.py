@@ -13,16 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core import validate
-from clsas.core.geometry import legs_m
-from clsas.core.ray_tables import TIMES, Q, Quantity
-from clsas.core.sound_speed import SoundSpeed
-from clsas.core.threads import in_threads
+from clsas.engine.data import validate
+from clsas.engine.data.geometry import legs_m
+from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.data.threads import in_threads
+from clsas.engine.data.track import Channels
+from clsas.engine.water.ray_tables import TIMES, Q, Quantity
 from clsas.simulation.legs import Legs
 from clsas.simulation.patterns import ElementPatterns
 from clsas.simulation.refraction import BlockRays, Sightlines
 from clsas.simulation.scenes import Observer, PointTargets, Scene, Seabed
-from clsas.sonar.track import Channels
 
 # Points of a block without and with element patterns. Blocks fit into the caches of a processor,
 # but are large enough that summing them takes longer than the FFT.

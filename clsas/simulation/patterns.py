@@ -16,10 +16,10 @@ from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import NDArray
 from scipy import fft
 
-from clsas.core import validate
+from clsas.engine.data import validate
+from clsas.engine.data.system import Sonar, element_pattern
+from clsas.engine.data.track import Channels
 from clsas.simulation.legs import Legs
-from clsas.sonar.system import Sonar, element_pattern
-from clsas.sonar.track import Channels
 
 
 @dataclass(frozen=True)

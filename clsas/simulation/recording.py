@@ -24,14 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from clsas.core import validate
-from clsas.core.fourier import EDGE_PRODUCT, gridding_gain, smooth_edge, spread, taps_for
-from clsas.core.threads import in_threads
+from clsas.engine.data import validate
+from clsas.engine.data.fourier import EDGE_PRODUCT, gridding_gain, smooth_edge, spread, taps_for
+from clsas.engine.data.system import PASSBAND
+from clsas.engine.data.threads import in_threads
+from clsas.engine.data.track import Channels
 from clsas.simulation.paths import Paths, PointBlock
 from clsas.simulation.patterns import interpolation_matrix
 from clsas.simulation.refraction import MOST_FOCUS
-from clsas.sonar.system import PASSBAND
-from clsas.sonar.track import Channels
 
 Progress = Callable[[int, int], None] | None
 

@@ -8,11 +8,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.ray_tables import TIMES, USUAL, Accuracy, Q, Quantity, quantity_of, table_around
-from clsas.core.rays import rays, shadow
-from clsas.core.sound_speed import SoundSpeed
+from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.data.track import Channels
+from clsas.engine.water.ray_tables import (
+    TIMES,
+    USUAL,
+    Accuracy,
+    Q,
+    Quantity,
+    quantity_of,
+    table_around,
+)
+from clsas.engine.water.rays import rays, shadow
 from clsas.simulation.legs import Bend, Legs
-from clsas.sonar.track import Channels
 
 # Points of a block from which on a table is faster. It takes as long as some thousand rays.
 _WORTH_A_TABLE = 4096

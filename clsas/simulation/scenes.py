@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import reprs, validate
+from clsas.engine.data import reprs, validate
 from clsas.simulation.height_field import BentRays, HeightField
 from clsas.simulation.refraction import Sightlines
 from clsas.simulation.scatterers import Scatterers, draw_scatterers

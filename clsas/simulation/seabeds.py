@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from clsas.core import validate
+from clsas.engine.data import validate
 from clsas.simulation.scenes import Seabed, checked_extent
 
 _MOST_BOULDERS = 100_000  # boulders of about 1 m2 each, many times the default patch of 2560 m2

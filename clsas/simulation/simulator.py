@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
-from clsas.core.lines import RangeLines
-from clsas.core.sound_speed import SoundSpeed, check_reaches
-from clsas.signal.compression import Window, compress
-from clsas.signal.compression import check_options as check_compression
-from clsas.signal.echoes import Echoes
+from clsas.engine.data import validate
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.sound_speed import SoundSpeed, check_reaches
+from clsas.engine.data.system import PASSBAND, Sonar
+from clsas.engine.data.track import Channels, Pointing, Track, channels
+from clsas.engine.signal.compression import Window, compress
+from clsas.engine.signal.compression import check_options as check_compression
+from clsas.engine.signal.echoes import Echoes
 from clsas.simulation.paths import Paths, scene_parts
 from clsas.simulation.patterns import ElementPatterns
 from clsas.simulation.recording import NO_ECHO, RINGING, Progress, ReceiveWindows, record
 from clsas.simulation.scenes import PointTargets, Scene, Seabed
-from clsas.sonar.system import PASSBAND, Sonar
-from clsas.sonar.track import Channels, Pointing, Track, channels
 
 _LEAST_BAND_HZ = 1e-6  # arbitrary (a pulse of twelve days), but its inverse must be finite
 

@@ -10,24 +10,24 @@ from typing import Any
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.image_error import relative_error_db
-from clsas.core.lines import RangeLines
-from clsas.factorized.plan import ExactImage
-from clsas.forming import SceneImager, form_exactly
-from clsas.imaging import Imager, factorize, plan
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.visibility import sines
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.factorized.plan import ExactImage
+from clsas.engine.forming import SceneImager, form_exactly
+from clsas.engine.imaging import Imager, factorize, plan
+from clsas.engine.scene import Scene
 from clsas.interferometry.heights import heights
 from clsas.interferometry.refinement import PASSES
 from clsas.interferometry.result import Heights
 from clsas.measures.tradeoff import REFERENCE_DB
 from clsas.mosaics.mosaic import mosaic
 from clsas.mosaics.store import Record
-from clsas.opencl.device import Device, open_device
-from clsas.scene import Scene
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.visibility import sines
 from clsas.trials import cases, dunes, reference, wreck
 from clsas.trials.cases import Case
 from clsas.trials.dense_cases import DenseCase
@@ -52,7 +52,7 @@ def run(
     case : str
         One of `clsas.trials.cases.EXACT_CASES`.
     device : Device, str or int, optional
-        See `clsas.opencl.device.choose`.
+        See `clsas.engine.device.device.choose`.
     accuracy_db : float
         Requested accuracy, see `clsas.backproject`.
     repeats : int
@@ -137,7 +137,7 @@ def run_factorized(
     case : str, Case or DenseCase
         One of `clsas.trials.cases.FACTORIZED_CASES`, or another case.
     device : Device, str or int, optional
-        See `clsas.opencl.device.choose`.
+        See `clsas.engine.device.device.choose`.
     tolerance_db : float
         Requested tolerance, see `clsas.plan`.
     repeats : int
@@ -228,7 +228,7 @@ def run_mosaic(
     case : str
         One of `clsas.trials.cases.MOSAIC_CASES`.
     device : Device, str or int, optional
-        See `clsas.opencl.device.choose`.
+        See `clsas.engine.device.device.choose`.
     tolerance_db : float
         Requested tolerance, see `clsas.mosaic`.
     repeats : int
@@ -316,7 +316,7 @@ def run_heights(
     case : str
         One of `clsas.trials.cases.HEIGHTS_CASES`.
     device : Device, str or int, optional
-        See `clsas.opencl.device.choose`.
+        See `clsas.engine.device.device.choose`.
     tolerance_db : float
         Requested tolerance of the images, see `clsas.heights`.
     repeats : int

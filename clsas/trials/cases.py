@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
-from clsas.sonar.beam import BeamWindow
 from clsas.trials.dense_cases import DENSE_CASES, DenseCase
 
 _POINTS = 1000  # a plain choice; simulation time is proportional to it

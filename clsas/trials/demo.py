@@ -13,21 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas import plot
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.sampling import check_sampling
+from clsas.engine.data.system import Sonar
+from clsas.engine.data.track import Track
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.forming import form_exactly
+from clsas.engine.signal.compression import compress
 from clsas.files.hdf5 import save
 from clsas.files.scene_files import SceneFile, built_in_scene, read_scene
-from clsas.forming import form_exactly
 from clsas.measures.quality import PointResponse, measure_point
 from clsas.measures.resolution import expected_resolution_m
-from clsas.opencl.device import Device, open_device
-from clsas.signal.compression import compress
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate
-from clsas.sonar.sampling import check_sampling
-from clsas.sonar.system import Sonar
-from clsas.sonar.track import Track
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,7 +61,7 @@ def run(
     out : Path
         Folder for the files, created if it does not exist.
     device : str or int, optional
-        See `clsas.opencl.device.choose`.
+        See `clsas.engine.device.device.choose`.
     say : callable
         Called with each line of the report.
     progress : callable

@@ -10,11 +10,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
-from clsas.sonar.beam import BeamWindow
 
 _AIR_M_S, _WATER_M_S = 343.0, 1500.0
 

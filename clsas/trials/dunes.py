@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
 from clsas.simulation.scenes import Observer, PointTargets, Seabed
 from clsas.simulation.simulator import simulate_lines
 

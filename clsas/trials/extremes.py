@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
-from clsas.sonar.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
 from clsas.trials import oracle
 from clsas.trials.oracle import Band, Echo
 

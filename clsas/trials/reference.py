@@ -8,19 +8,19 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.core import validate
-from clsas.core.fourier import fourier_series
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.image import Image
-from clsas.core.image_error import relative_error_db
-from clsas.core.lines import RangeLines
-from clsas.core.wavelengths import wavelength_m
-from clsas.exact.decide import Decision
-from clsas.signal.ray_delays import delays_s
-from clsas.signal.readout import interpolated
-from clsas.signal.spectrum import measure_spectrum
-from clsas.sonar.beam import BeamWindow, normalising
-from clsas.sonar.visibility import sines
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow, normalising
+from clsas.engine.data.fourier import fourier_series
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.image import Image
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.visibility import sines
+from clsas.engine.data.wavelengths import wavelength_m
+from clsas.engine.exact.decide import Decision
+from clsas.engine.signal.readout import interpolated
+from clsas.engine.signal.spectrum import measure_spectrum
+from clsas.engine.water.ray_delays import delays_s
 
 Progress = Callable[[int, int], None] | None
 Evaluate = Callable[[NDArray[np.complex128], NDArray[np.float64]], NDArray[np.complex128]]
@@ -40,7 +40,7 @@ def same_interpolator(
     """Return the image of a decision at some points, as the device forms it but in float64.
 
     The image of the device differs by rounding, by the expansion of the geometry, and by short
-    polynomials for sine and cosine (`clsas.opencl.phases`).
+    polynomials for sine and cosine (`clsas.engine.device.phases`).
 
     Parameters
     ----------

@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from clsas.core import validate
-from clsas.core.image import Image
-from clsas.exact.wavenumber import wavenumber
-from clsas.factorized.costs import Costs
-from clsas.factorized.plan import Plan
-from clsas.imaging import backproject, factorize, plan
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.image import Image
+from clsas.engine.device.device import Device, DeviceInfo, open_device
+from clsas.engine.exact.wavenumber import wavenumber
+from clsas.engine.factorized.costs import Costs
+from clsas.engine.factorized.plan import Plan
+from clsas.engine.imaging import backproject, factorize, plan
 from clsas.mosaics.mosaic import mosaic
-from clsas.opencl.device import Device, DeviceInfo, open_device
-from clsas.sonar.beam import BeamWindow
 from clsas.trials import extremes
 from clsas.trials.extremes import Known, along_x
 
@@ -79,7 +79,7 @@ def run(
     Parameters
     ----------
     device : Device, str or int, optional
-        See `clsas.opencl.device.choose`.
+        See `clsas.engine.device.device.choose`.
     progress : callable, optional
         Called as progress(done, total).
 

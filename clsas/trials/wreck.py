@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.core.cache import private_folder
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
+from clsas.engine.data.cache import private_folder
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.signal.compression import compress
 from clsas.files.hdf5 import FileFormatError, load, save
 from clsas.files.scene_files import SceneFile, built_in_scene, parse_scene, simulation_digest
-from clsas.signal.compression import compress
 from clsas.simulation.simulator import simulate
 
 X_M, Y_M = (-32.0, 32.0), (36.0, 92.0)
@@ -46,7 +46,7 @@ def scene(name: str = "wreck") -> SceneFile:
 def lines(progress: Callable[[int, int], None] | None = None, *, name: str = "wreck") -> RangeLines:
     """Return the range lines of a scene. The first call simulates them, which takes minutes.
 
-    Later calls read them from the cache (`clsas.core.cache.private_folder`).
+    Later calls read them from the cache (`clsas.engine.data.cache.private_folder`).
     """
     digest = simulation_digest(built_in_scene(name), Path())
     path = private_folder() / f"{name.replace('_', '-')}-{digest}.h5"

@@ -3,24 +3,18 @@
 from drawing import BLUE, INK, ORANGE, RED, TEAL, arrow, box, canvas, save
 
 FLOORS = (
-    ((("core", "what are the data?\nRangeLines, Grid, Image"),), INK),
+    ((("data", "what are the data?\nRangeLines, Grid, Image, Track, BeamWindow"),), INK),
     (
         (
-            ("sonar", "who looks, from where?\ntrack, beam, visibility"),
             ("signal", "how are lines sampled?\nechoes, spectrum, filters"),
-            ("simulation", "what would be received?\nscenes, simulator"),
-            ("opencl", "how does a device see it?\ndevices, buffers, kernels"),
+            ("water", "how does sound travel?\nrays, homogeneous water"),
+            ("device", "how does a device see it?\ndevices, buffers, kernels"),
         ),
         TEAL,
     ),
-    (
-        (("exact", "the image, whatever it takes\ntiles, backprojection"),),
-        RED,
-    ),
-    (
-        (("factorized", "the image, fast\ntrack, plan, tree, stages, leaves"),),
-        RED,
-    ),
+    ((("exact", "the image, whatever it takes\ntiles, backprojection"),), RED),
+    ((("factorized", "the image, fast\ntrack, plan, tree, stages, leaves"),), RED),
+    ((("simulation", "what would be received?\nscenes, simulator"),), TEAL),
     (
         (
             ("navigation", "where was the sonar?\nmicronavigation, autofocus"),
@@ -50,9 +44,10 @@ FLOORS = (
 )
 FLOWS = (
     "samples, positions, pixels",
-    "directions, weights, spectra, buffers",
+    "spectra, rays, buffers",
     "exact images",
     "plans, images",
+    "lines of known scenes",
     "corrected lines, findings, figures",
     "stored images, pictures",
 )

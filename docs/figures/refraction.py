@@ -4,7 +4,7 @@ import numpy as np
 from drawing import BLUE, INK, ORANGE, RED, TEAL, plt, save
 
 import clsas
-from clsas.core.rays import rays
+from clsas.engine.water.rays import rays
 
 PROFILE = clsas.SoundSpeed([0, 11, 14, 26], [1510, 1510, 1495, 1494])
 SONAR, SEABED = 6.0, 22.0

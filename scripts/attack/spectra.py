@@ -20,7 +20,7 @@ import numpy as np
 from exactly import prepare
 
 import clsas
-from clsas.factorized.costs import Costs
+from clsas.engine.factorized.costs import Costs
 from clsas.trials.extremes import raw
 
 POINTS = [(0.0, 42.5, 0), (0.08, 42.505, 0), (-0.07, 42.49, 0), (0.03, 42.512, 0)]
@@ -88,9 +88,7 @@ def report(
             warnings.simplefilter("always")
             if asked_db == -80:
                 image = clsas.backproject(lines, grid, accuracy_db=asked_db, device=device)
-                predicted_db = prepare(
-                    lines, grid, accuracy_db=asked_db, device=device
-                ).error_db
+                predicted_db = prepare(lines, grid, accuracy_db=asked_db, device=device).error_db
             else:
                 plan = clsas.plan(
                     lines, grid, tolerance_db=asked_db, device=device, costs=SLOW_EXACT

@@ -16,7 +16,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 import clsas
-from clsas.signal.spectrum import measure_spectrum
+from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.trials import cases
 from clsas.trials.cases import Case
 from clsas.trials.dense_cases import DenseCase, helix

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from clsas.core.cache import private_folder
+from clsas.engine.data.cache import private_folder
 
 Ask = Callable[..., dict]
 

@@ -15,20 +15,20 @@ from pathlib import Path
 
 import numpy as np
 
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.system import Sonar
+from clsas.engine.data.track import Track, channels
+from clsas.engine.data.validate import ClsasWarning
+from clsas.engine.imaging import factorize
+from clsas.engine.signal.compression import compress
 from clsas.files.formats import load
 from clsas.files.scene_files import parse_scene
-from clsas.imaging import factorize
 from clsas.measures.quality import measure_point
 from clsas.processing.chain import process
-from clsas.signal.compression import compress
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.seabeds import wreck as seabed
 from clsas.simulation.simulator import simulate
-from clsas.sonar.system import Sonar
-from clsas.sonar.track import Track, channels
 from clsas.trials import wreck
 
 POINT_M = (-6.0, 54.0, 0.0)

@@ -13,20 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
-from clsas.core.wavelengths import wavelength_m
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.system import Pulse, Sonar
+from clsas.engine.data.track import Track
+from clsas.engine.data.wavelengths import wavelength_m
+from clsas.engine.device.device import Device
+from clsas.engine.forming import form_exactly
+from clsas.engine.imaging import factorize
+from clsas.engine.signal.compression import compress
 from clsas.files.phase_histories import read_phase_history
-from clsas.forming import form_exactly
-from clsas.imaging import factorize
 from clsas.navigation.autofocus import IMAGE_TOLERANCE_DB, Autofocus, autofocus
 from clsas.navigation.responses import Passage
-from clsas.opencl.device import Device
-from clsas.signal.compression import compress
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate
-from clsas.sonar.system import Pulse, Sonar
-from clsas.sonar.track import Track
 from studies.navigating import detrended, said_to_be_on
 
 WAVELENGTH_M = 0.015

@@ -12,8 +12,8 @@ from unittest import mock
 import numpy as np
 
 import clsas
-from clsas.core.digests import grid_digest
-from clsas.core.grid import Grid
+from clsas.engine.data.digests import grid_digest
+from clsas.engine.data.grid import Grid
 from clsas.mosaics import pyramid
 from clsas.mosaics.levels import Levels, levels_of
 from clsas.mosaics.patches import Layout, PatchWindow, patch_shape_of

@@ -17,17 +17,17 @@ import scipy.io
 import scipy.signal
 from numpy.typing import NDArray
 
-from clsas.core.grid import Grid
-from clsas.core.lines import RangeLines
-from clsas.forming import form_exactly
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.system import Pulse, Sonar
+from clsas.engine.data.track import Track, channels
+from clsas.engine.device.device import Device
+from clsas.engine.forming import form_exactly
+from clsas.engine.signal.compression import compress
 from clsas.measures.quality import measure_point
 from clsas.navigation.micronavigation import Micronavigation, micronavigate
-from clsas.opencl.device import Device
-from clsas.signal.compression import compress
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate
-from clsas.sonar.system import Pulse, Sonar
-from clsas.sonar.track import Track, channels
 
 WAVELENGTH_M = 0.015
 SPACING_M = WAVELENGTH_M / 2

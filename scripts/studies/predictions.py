@@ -8,14 +8,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
-from clsas.factorized import measured_costs as costs
-from clsas.factorized.costs import KnownCosts, predict_exact
-from clsas.factorized.plan import costs_in_words
-from clsas.factorized.sampled import SampledRoots, SampledScene
-from clsas.forming import form_exactly
-from clsas.imaging import factorize, plan
-from clsas.opencl.device import Device
-from clsas.scene import Scene
+from clsas.engine.device.device import Device
+from clsas.engine.factorized import measured_costs as costs
+from clsas.engine.factorized.costs import KnownCosts, predict_exact
+from clsas.engine.factorized.plan import costs_in_words
+from clsas.engine.factorized.sampled import SampledRoots, SampledScene
+from clsas.engine.forming import form_exactly
+from clsas.engine.imaging import factorize, plan
+from clsas.engine.scene import Scene
 from clsas.trials import cases
 from studies.tables import TOLERANCES_DB
 

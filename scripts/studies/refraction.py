@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 import clsas
-from clsas.core.decibels import in_db
-from clsas.signal.refraction import homogeneous
+from clsas.engine.data.decibels import in_db
+from clsas.engine.water.refraction import homogeneous
 
 COLUMNS = (
     "band, range",

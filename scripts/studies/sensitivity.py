@@ -19,26 +19,26 @@ from typing import Any
 
 import numpy as np
 
-from clsas.core.grid import Grid
-from clsas.core.image_error import relative_error_db
-from clsas.core.lines import RangeLines
-from clsas.core.validate import ClsasWarning
-from clsas.factorized.costs import Costs
-from clsas.imaging import backproject, factorize, plan
-from clsas.opencl.device import Device
-from clsas.sonar.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ClsasWarning
+from clsas.engine.device.device import Device
+from clsas.engine.factorized.costs import Costs
+from clsas.engine.imaging import backproject, factorize, plan
 from clsas.trials import cases
 from studies.scaling import scaled
 
-ROOMS = ("factorized", "exact")
+ROOMS = ("engine.factorized", "engine.exact")
 MODULES = (
-    "clsas.signal.spectrum",
-    "clsas.signal.ambiguity",
-    "clsas.signal.interpolation",
+    "clsas.engine.signal.spectrum",
+    "clsas.engine.signal.ambiguity",
+    "clsas.engine.signal.interpolation",
 )
 FIXED = {
-    "clsas.factorized.measured_costs": "measures costs, which are given for the cases",
-    "clsas.exact.wavenumber": "another imager, which has its own tool",
+    "clsas.engine.factorized.measured_costs": "measures costs, which are given for the cases",
+    "clsas.engine.exact.wavenumber": "another imager, which has its own tool",
     "STACK HELD CHUNK GUARD PHASES _GROUP _FINE VECTOR_ROOM": "layouts that kernels share",
     "_FAR _LARGEST_HALF _LEAST_HALF _MOST_EXPONENT _SINGULAR": "limits of number formats",
     "BEST_TOLERANCE_DB WORST_TOLERANCE_DB BEST_ACCURACY_DB": "limits of input",

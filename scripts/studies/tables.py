@@ -17,13 +17,13 @@ from scipy import stats
 
 import clsas
 from clsas import plot
-from clsas.core.image_error import levels
-from clsas.exact.decide import ACCURACY_DB
-from clsas.factorized.plan import ExactImage
-from clsas.forming import form
+from clsas.engine.data.image_error import levels
+from clsas.engine.device.device import open_device
+from clsas.engine.exact.decide import ACCURACY_DB
+from clsas.engine.factorized.plan import ExactImage
+from clsas.engine.forming import form
+from clsas.engine.scene import Scene
 from clsas.measures.shadows import dark_level_db
-from clsas.opencl.device import open_device
-from clsas.scene import Scene
 from clsas.simulation import seabeds
 from clsas.trials import bench, cases, wreck
 from studies.scaling import scaled
@@ -133,7 +133,7 @@ def presets(devices: list[str]) -> None:
 
 
 def taps(devices: list[str]) -> None:
-    """Print the kernel time by taps, the source of `clsas.signal.interpolation.COST`."""
+    """Print the kernel time by taps, the source of `clsas.engine.signal.interpolation.COST`."""
     case = dataclasses.replace(cases.EXACT_CASES["bp-thesis"], channels=512)
     lines, grid = case.lines(), case.grid
     best: dict[tuple[str, int], float] = {}

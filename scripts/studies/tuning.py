@@ -7,9 +7,9 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 
-from clsas.core.image import Image
-from clsas.imaging import backproject, factorize, plan
-from clsas.opencl.device import Device
+from clsas.engine.data.image import Image
+from clsas.engine.device.device import Device
+from clsas.engine.imaging import backproject, factorize, plan
 from clsas.trials.cases import FFBP_2K, Case
 from studies.sensitivity import Constant
 

@@ -24,9 +24,9 @@ from range_errors import range_errors_m
 
 import clsas
 from clsas import plot
-from clsas.factorized.virtual_channels import stage_errors_m
-from clsas.opencl.device import Device, open_device
-from clsas.sonar.system import Sonar, line_array
+from clsas.engine.data.system import Sonar, line_array
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.factorized.virtual_channels import stage_errors_m
 
 sys.path.append(str(Path(__file__).parents[1]))
 import stored_tables

@@ -20,10 +20,10 @@ from range_errors import range_errors_m
 from scipy.spatial.distance import cdist
 
 import clsas
-from clsas.factorized.virtual_channels import stage_errors_m
-from clsas.opencl.device import Device, open_device
+from clsas.engine.data.visibility import BeamTrack, Boxes, sines
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.factorized.virtual_channels import stage_errors_m
 from clsas.simulation import seabeds
-from clsas.sonar.visibility import BeamTrack, Boxes, sines
 from clsas.trials import wreck
 
 PIXELS = 1024

@@ -6,7 +6,7 @@ from functools import partial
 import chapter5
 from chapter5 import equal_stages
 
-from clsas.factorized import virtual_channels
+from clsas.engine.factorized import virtual_channels
 
 TOLERANCES_DB = (-20, -30, -40, -50)
 

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import clsas
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.surface import surface_of
-from clsas.core.wavelengths import band_wavelength_m
-from clsas.factorized.track import mean_track
-from clsas.factorized.tree import Tree
-from clsas.factorized.virtual_channels import NearestBeams
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.surface import surface_of
+from clsas.engine.data.wavelengths import band_wavelength_m
+from clsas.engine.factorized.track import mean_track
+from clsas.engine.factorized.tree import Tree
+from clsas.engine.factorized.virtual_channels import NearestBeams
 
 
 def range_errors_m(

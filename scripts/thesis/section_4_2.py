@@ -8,7 +8,7 @@ import chapter5
 from chapter5 import equal_stages
 
 import clsas
-from clsas.factorized.virtual_channels import operations
+from clsas.engine.factorized.virtual_channels import operations
 
 STAGES = [(2, 2), (2, 2)]
 SAMPLES = (3757, 1990)  # samples that the subimages of the thesis need in its two stages

@@ -17,8 +17,8 @@ from chapter5 import ACCURACY_DB, WAVELENGTH_M, decibels
 from range_errors import range_errors_m
 
 import clsas
-from clsas.factorized.virtual_channels import stage_errors_m
-from clsas.opencl.device import Device
+from clsas.engine.device.device import Device
+from clsas.engine.factorized.virtual_channels import stage_errors_m
 
 CHANNELS, SPACING_M = 1024, WAVELENGTH_M / 4
 NEAREST_M, SIDE_M, PIXELS = 0.1, 12.8e-3, 1024

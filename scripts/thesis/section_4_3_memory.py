@@ -22,7 +22,7 @@ import pyopencl as cl
 from section_7_1 import EXACT_IS_SLOW, SYSTEMS
 
 import clsas
-from clsas.opencl.device import Device, open_device
+from clsas.engine.device.device import Device, open_device
 
 TOLERANCE_DB = -40.0
 STAGES = ((8, 8), (2, 2))

@@ -16,9 +16,9 @@ from unittest import mock
 import chapter5
 
 import clsas
-from clsas.factorized import candidates
-from clsas.factorized.planner import Request, planned
-from clsas.factorized.search import Allowed, Tree
+from clsas.engine.factorized import candidates
+from clsas.engine.factorized.planner import Request, planned
+from clsas.engine.factorized.search import Allowed, Tree
 
 FACTORS = ((8, 2), (4, 4), (4, 2, 2), (16, 2), (8, 4), (8, 2, 2), (4, 4, 2))  # QR
 RATIOS = (1, 2)  # QI over QR, the same in each stage

@@ -18,7 +18,7 @@ from unittest import mock
 import chapter5
 
 import clsas
-from clsas.exact import wavenumber as imager
+from clsas.engine.exact import wavenumber as imager
 from clsas.measures.tradeoff import REFERENCE_DB
 
 ACCURACIES_DB = (imager.ACCURACY_DB, -40.0)  # of interpolation: that of clsas, and a coarse one

@@ -21,9 +21,9 @@ import numpy as np
 import stored_tables
 
 import clsas
-from clsas.factorized.costs import Costs
-from clsas.opencl.device import Device, open_device
-from clsas.sonar.system import line_array
+from clsas.engine.data.system import line_array
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.factorized.costs import Costs
 
 TOLERANCE_DB = -40.0
 POINTS = 50

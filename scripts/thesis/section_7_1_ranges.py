@@ -20,8 +20,8 @@ import numpy as np
 from section_7_1 import SYSTEMS, System
 
 import clsas
+from clsas.engine.device.device import Device, open_device
 from clsas.measures.tradeoff import REFERENCE_DB
-from clsas.opencl.device import Device, open_device
 
 TOLERANCE_DB = -40.0
 RATIOS = (1.5, 2.0, 4.0, 8.0, 16.0)  # of far to near range

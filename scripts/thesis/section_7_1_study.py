@@ -12,7 +12,7 @@ from itertools import product
 import chapter5
 
 import clsas
-from clsas.factorized.planner import Request, planned
+from clsas.engine.factorized.planner import Request, planned
 from clsas.measures.tradeoff import STUDIED_DEPTHS, STUDIED_TAPS
 from clsas.measures.tradeoff_result import Row, Tradeoff
 

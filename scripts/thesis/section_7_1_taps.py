@@ -21,10 +21,10 @@ import numpy as np
 from section_7_1 import SYSTEMS, System
 
 import clsas
-from clsas.factorized.planner import Request, planned
-from clsas.factorized.search import Allowed
+from clsas.engine.device.device import Device, open_device
+from clsas.engine.factorized.planner import Request, planned
+from clsas.engine.factorized.search import Allowed
 from clsas.measures.tradeoff import REFERENCE_DB
-from clsas.opencl.device import Device, open_device
 
 TAPS = (2, 4, 6, 8)
 TOLERANCES_DB = (-10.0, -18.0, -28.0, -38.0, -48.0, -58.0)

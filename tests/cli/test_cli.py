@@ -22,12 +22,12 @@ from interrupt import interrupted
 import clsas
 from clsas import cli
 from clsas.cli import images
-from clsas.core import validate
-from clsas.factorized import measured_costs as costs
-from clsas.factorized.measured_costs import Scale
+from clsas.engine.data import validate
+from clsas.engine.device.device import choose
+from clsas.engine.factorized import measured_costs as costs
+from clsas.engine.factorized.measured_costs import Scale
 from clsas.files.scene_files import built_in_scene, read_scene
 from clsas.measures.resolution import expected_resolution_m
-from clsas.opencl.device import choose
 from clsas.trials import cases, demo
 
 pytest.importorskip("matplotlib")
@@ -391,7 +391,7 @@ def test_costs_are_measured_again(monkeypatch, tmp_path):
         measured.append(device.info.index)
         return Scale(*(2.0 for _ in dataclasses.fields(Scale)))
 
-    monkeypatch.setattr("clsas.factorized.measured_costs.measure", measure)
+    monkeypatch.setattr("clsas.engine.factorized.measured_costs.measure", measure)
     assert {each["source"] for each in run_json("devices")["costs"].values()} == {"default"}
     assert not measured
     result = run_json("devices", "--measure")
@@ -443,7 +443,7 @@ def test_devices(monkeypatch):
 
 
 def test_without_a_device_the_message_says_how_to_get_one(made, tmp_path, monkeypatch):
-    monkeypatch.setattr("clsas.opencl.device.list_devices", list)
+    monkeypatch.setattr("clsas.engine.device.device.list_devices", list)
     _, stderr = run("devices", code=1)
     assert stderr.startswith("Error: No OpenCL device was found.")
     assert "pip install" in stderr

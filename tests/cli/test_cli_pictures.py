@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 import clsas
 from clsas.cli import main
-from clsas.core.grid import Grid
+from clsas.engine.data.grid import Grid
 
 pytest.importorskip("matplotlib")
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from cases import APERTURE, CARRIER, STEP, along_x, noise, patch, thesis_lines
 
-from clsas.core.grid import Grid
-from clsas.core.image_error import relative_error_db
-from clsas.core.lines import RangeLines
-from clsas.imaging import backproject
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.imaging import backproject
 from clsas.trials.reference import ideal
 
 

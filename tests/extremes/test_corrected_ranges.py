@@ -10,9 +10,9 @@ from factorizing import EXACT_IS_SLOW
 
 import clsas
 from clsas import Grid, SoundSpeed
-from clsas.signal.ray_delays import delays_s
-from clsas.signal.readout import Readout
-from clsas.signal.refraction import homogeneous
+from clsas.engine.signal.readout import Readout
+from clsas.engine.water.ray_delays import delays_s
+from clsas.engine.water.refraction import homogeneous
 from clsas.trials import oracle
 
 THERMOCLINE = SoundSpeed([0, 14, 17, 60], [1505, 1505, 1495, 1495.5])

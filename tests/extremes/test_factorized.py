@@ -7,8 +7,8 @@ import pytest
 from cases import along_x
 from factorizing import EXACT_IS_SLOW, around, exact, made, over, planned, swaying
 
-from clsas.core.image_error import relative_error_db
-from clsas.imaging import backproject, factorize, plan
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.imaging import backproject, factorize, plan
 
 FAR = np.array([1e7, -1e7, 1e7])
 

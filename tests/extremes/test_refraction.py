@@ -14,9 +14,9 @@ from tiers import also, few
 
 import clsas
 from clsas import Grid, RangeLines, SoundSpeed
-from clsas.core.decibels import in_db
-from clsas.signal.refraction import homogeneous
-from clsas.sonar.simplify import REFRACTION
+from clsas.engine.data.decibels import in_db
+from clsas.engine.data.simplify import REFRACTION
+from clsas.engine.water.refraction import homogeneous
 from clsas.trials import oracle
 
 NOMINAL = 1500.0  # m/s, by which times become ranges

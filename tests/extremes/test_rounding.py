@@ -24,11 +24,11 @@ from exactly import execute, prepare, same_interpolator
 from sums import SPEED_M_S, Channels, Points, Sampling
 from tiers import few
 
-from clsas.core.grid import Grid
-from clsas.core.image_error import relative_error_db
-from clsas.core.lines import RangeLines
-from clsas.core.validate import ClsasWarning
-from clsas.imaging import backproject
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ClsasWarning
+from clsas.engine.imaging import backproject
 from clsas.trials import oracle
 from clsas.trials.reference import sampled_error_db
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import clsas
-from clsas.core import validate
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data import validate
+from clsas.engine.data.validate import ClsasWarning
 from clsas.files import airsas
 from clsas.files.airsas import read_airsas
 from clsas.files.hdf5 import FileFormatError

@@ -12,9 +12,9 @@ from scipy.constants import speed_of_light
 
 import clsas
 from clsas import cli
-from clsas.core import validate
-from clsas.core.georeference import Georeference
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data import validate
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.validate import ClsasWarning
 from clsas.files import cphd, cphd_writing
 from clsas.files.cphd import read_cphd
 from clsas.files.cphd_writing import write_cphd

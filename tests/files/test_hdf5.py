@@ -9,17 +9,17 @@ import h5py
 import numpy as np
 import pytest
 
-from clsas.core import validate
-from clsas.core.georeference import Georeference
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
+from clsas.engine.data import validate
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.system import Pulse
+from clsas.engine.signal.echoes import Echoes
 from clsas.files import hdf5 as io
 from clsas.files.hdf5 import FileFormatError, load, read_geometry, read_samples, save
 from clsas.interferometry.interferogram import Interferogram
 from clsas.interferometry.result import Heights
-from clsas.signal.echoes import Echoes
-from clsas.sonar.system import Pulse
 
 UTM = Georeference(crs="EPSG:32632", vertical_datum="NN2000")
 LOCAL = Georeference.local(60.39, 5.32, 1 / 3, heading_deg=217)

@@ -10,7 +10,7 @@ from scipy.constants import speed_of_light
 from scipy.io import savemat
 
 import clsas
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.validate import ClsasWarning
 from clsas.files import matlab
 from clsas.files.full_matrix import read_full_matrix
 from clsas.files.hdf5 import FileFormatError

@@ -8,6 +8,9 @@ import pytest
 from pydantic_core import PydanticUndefined
 
 import clsas
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.sampling import check_sampling
+from clsas.engine.data.system import BARKER_13
 from clsas.files import scene_files as config
 from clsas.files.mistakes import models_in
 from clsas.files.scene_tables import SceneTables
@@ -15,9 +18,6 @@ from clsas.files.survey_tables import PRESETS
 from clsas.files.track_files import read_track
 from clsas.simulation.scenes import PointTargets, Seabed
 from clsas.simulation.seabeds import rocks
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.sampling import check_sampling
-from clsas.sonar.system import BARKER_13
 
 DOCS = Path(__file__).parents[2] / "docs" / "scene-files.md"
 EXAMPLE, *_ = re.findall(r"```toml\n(.*?)```", DOCS.read_text(), re.DOTALL)

@@ -4,13 +4,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsas.core.georeference import Georeference
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.system import Pulse
+from clsas.engine.signal.echoes import Echoes
 from clsas.files.xarrays import to_xarray
-from clsas.signal.echoes import Echoes
-from clsas.sonar.system import Pulse
 
 xarray = pytest.importorskip("xarray")
 

@@ -6,10 +6,10 @@ from scenes import kept
 from tiers import thinned
 
 from clsas import wavenumber as form_wavenumber
-from clsas.factorized.costs import Costs
-from clsas.imaging import factorize, plan
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.factorized.costs import Costs
+from clsas.engine.imaging import factorize, plan
 from clsas.mosaics.mosaic import mosaic
-from clsas.sonar.beam import BeamWindow
 from clsas.trials import extremes
 from clsas.trials.extremes import (
     along_x,
@@ -147,7 +147,7 @@ def promised(asked_db, predicted_db, records):
 @pytest.mark.parametrize(
     ("name", "asked_db"), thinned(CASES, [-80, -50, -30], whole=AT_EVERY_TOLERANCE)
 )
-@pytest.mark.filterwarnings("always::clsas.core.validate.ClsasWarning")
+@pytest.mark.filterwarnings("always::clsas.engine.data.validate.ClsasWarning")
 def test_exact(name, asked_db, platform, recwarn):
     known = made(name)
     prepared = prepare(
@@ -161,7 +161,7 @@ def test_exact(name, asked_db, platform, recwarn):
 @pytest.mark.parametrize(
     ("name", "asked_db"), thinned(CASES, [-65, -50, -35], whole=AT_EVERY_TOLERANCE)
 )
-@pytest.mark.filterwarnings("always::clsas.core.validate.ClsasWarning")
+@pytest.mark.filterwarnings("always::clsas.engine.data.validate.ClsasWarning")
 def test_factorized(name, asked_db, platform, recwarn):
     known = made(name)
     chosen = plan(

@@ -14,10 +14,10 @@ from variants import DEFAULT, OWN, variant
 
 import clsas
 from clsas import BeamWindow, Grid, PointTargets, simulate_lines
-from clsas.core.image import Image
-from clsas.core.image_error import relative_error_db
-from clsas.opencl.device import Device
-from clsas.sonar.coverage import UnreachedWarning
+from clsas.engine.data.coverage import UnreachedWarning
+from clsas.engine.data.image import Image
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.device.device import Device
 
 BY_NAME = {imager.name: imager for imager in IMAGERS}
 FAR_M = np.array([1e7, -1e7, 1e7])

@@ -10,17 +10,17 @@ from dense import TRACKS, headings, scene, to_and_fro, turning
 from factorizing import EXACT_IS_SLOW, changed, peak_device_bytes
 from tiers import also, thinned
 
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.image_error import relative_error_db
-from clsas.factorized import planner
-from clsas.factorized.costs import Costs
-from clsas.factorized.plan import Plan
-from clsas.factorized.tree import geometry_of, sector_of
-from clsas.forming import scene_of_plan
-from clsas.imaging import backproject, factorize, plan
-from clsas.opencl.device import open_device
-from clsas.sonar.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.device.device import open_device
+from clsas.engine.factorized import planner
+from clsas.engine.factorized.costs import Costs
+from clsas.engine.factorized.plan import Plan
+from clsas.engine.factorized.tree import geometry_of, sector_of
+from clsas.engine.forming import scene_of_plan
+from clsas.engine.imaging import backproject, factorize, plan
 from clsas.trials import reference
 from clsas.trials.selftest import driven
 

@@ -7,12 +7,12 @@ from factorizing import EXACT_IS_SLOW, around, over
 from tiers import also, few, thinned
 
 from clsas import plan
-from clsas.core.grid import Grid
-from clsas.core.image_error import relative_error_db
-from clsas.core.lines import RangeLines
-from clsas.core.validate import ClsasWarning
-from clsas.imaging import backproject, factorize
-from clsas.sonar.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ClsasWarning
+from clsas.engine.imaging import backproject, factorize
 
 pytestmark = pytest.mark.slow
 

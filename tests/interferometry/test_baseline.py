@@ -7,11 +7,11 @@ import pytest
 from reliefs import GRID, flat_banks
 from scipy.optimize import least_squares
 
-from clsas.core.geometry import bistatic_range_m
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.geometry import bistatic_range_m
 from clsas.interferometry.baseline import Baseline, sight_lattice
 from clsas.interferometry.refinement import sensitivity
 from clsas.interferometry.sweep import Curves
-from clsas.sonar.beam import BeamWindow
 
 CYCLES_PER_M = 2 * 100e3 / 1500.0
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from clsas.core.grid import Grid
+from clsas.engine.data.grid import Grid
 from clsas.interferometry.coherence import (
     Moments,
     Window,

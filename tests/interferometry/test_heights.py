@@ -11,11 +11,11 @@ from reliefs import BAND_HZ, CARRIER_HZ, GRID, banks, flat_banks, truth
 from tiers import also, few
 
 import clsas
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.validate import ClsasWarning
+from clsas.engine.device.device import open_device
 from clsas.interferometry.heights import heights, measure
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.request import Request
-from clsas.opencl.device import open_device
 
 AMBIGUITY_M = 2.06  # 2 pi R/(k B): a wavelength of 15 mm, 34.2 m of range, 0.25 m between the banks
 WINDOW_M = 0.22

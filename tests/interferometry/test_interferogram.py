@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.validate import ClsasWarning
 from clsas.interferometry.interferogram import Interferogram, interferogram
 
 GRID = Grid.plane((0, 1.99, 200), (30, 31.99, 200))

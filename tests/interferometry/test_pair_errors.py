@@ -11,12 +11,12 @@ from reliefs import flat_banks
 from tiers import few
 
 import clsas
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.validate import ClsasWarning
+from clsas.engine.device.device import open_device
 from clsas.interferometry import pair_errors
 from clsas.interferometry.misregistration import ConstantPhase, constant_phase
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.pair_errors_result import PairErrors, turned
-from clsas.opencl.device import open_device
 
 CYCLE_S = 1 / reliefs.CARRIER_HZ
 UNITS = {"phase": "phase_rad", "delay": "delay_s", "roll": "roll_rad"}

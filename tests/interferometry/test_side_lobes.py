@@ -8,12 +8,12 @@ from scipy.ndimage import center_of_mass, maximum_filter, minimum_filter
 from tiers import also
 
 import clsas
-from clsas.core.decibels import in_db
+from clsas.engine.data.decibels import in_db
+from clsas.engine.data.system import line_array
+from clsas.engine.device.device import open_device
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.side_lobes import from_elsewhere, middle, point_response
-from clsas.opencl.device import open_device
-from clsas.sonar.system import line_array
 
 SHAPE = (60, 81)
 WINDOW = Window(5, 7)

@@ -17,7 +17,7 @@ from stores import GRID, LINES, PLANE, REQUEST
 from tiers import also
 
 import clsas
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.validate import ClsasWarning
 from clsas.maps import geotiff, geotiff_checks
 
 pyproj = pytest.importorskip("pyproj")

@@ -8,7 +8,7 @@ from placed import UTM_NORTH, local
 from tiers import also, few
 
 import clsas
-from clsas.core.image_error import relative_error_db
+from clsas.engine.data.image_error import relative_error_db
 from clsas.maps.agreement import agreement
 from clsas.maps.carrier import Carrier
 from clsas.maps.collection import Collection

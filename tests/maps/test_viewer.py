@@ -15,7 +15,7 @@ from stores import GRID, LINES, REQUEST
 
 import clsas
 from clsas.cli import main
-from clsas.core import atomic
+from clsas.engine.data import atomic
 from clsas.maps import tiles, viewer
 from clsas.maps.frames import Frame, fitted_degrees
 from clsas.maps.tiles import Pyramid, Quantization, factors_of, shape_of

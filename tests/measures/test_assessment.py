@@ -11,15 +11,15 @@ from click.testing import CliRunner
 import clsas
 from clsas import SoundSpeed
 from clsas.cli import main
-from clsas.core.grid import Grid
-from clsas.core.image_error import relative_error_db
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.simplify import APART, MOTION, REFRACTION, RELIEF
+from clsas.engine.data.system import line_array
+from clsas.engine.water.refraction import homogeneous
 from clsas.files import scene_files as config
 from clsas.measures.assessment import assess, survey_lines
 from clsas.measures.effects import BEAM, ENDS, KEYS, PATTERN, SINGLE, SWAY, track_errors_m
-from clsas.signal.refraction import homogeneous
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.simplify import APART, MOTION, REFRACTION, RELIEF
-from clsas.sonar.system import line_array
 from clsas.trials.reference import ideal
 
 CHANNELS, CARRIER, STEP = 96, 300e3, 0.012

@@ -7,12 +7,12 @@ import pytest
 from tiers import few
 
 import clsas
-from clsas.core.geometry import bistatic_range_m
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.geometry import bistatic_range_m
+from clsas.engine.data.system import Pulse, Sonar, line_array
+from clsas.engine.data.track import Pointing, Track
 from clsas.files.scene_files import built_in_scene, parse_scene
 from clsas.measures.limits_result import LABELS, Limit
-from clsas.sonar.beam import BeamWindow
-from clsas.sonar.system import Pulse, Sonar, line_array
-from clsas.sonar.track import Pointing, Track
 from clsas.trials.reference import ideal
 
 WIDE = Sonar.thesis_wide_beam()

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from scipy import integrate, optimize
 
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.image_error import relative_error_db
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.validate import ClsasWarning
 from clsas.measures.quality import measure_point
 
 # Closed forms of the point responses, in units of 1 / bandwidth.

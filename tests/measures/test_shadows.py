@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import clsas
-from clsas.core.image_error import darkest_pixels
+from clsas.engine.data.image_error import darkest_pixels
 from clsas.measures.shadows import dark_level_db
 
 

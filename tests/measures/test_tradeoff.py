@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clsas
-from clsas.core.grid import Grid
+from clsas.engine.data.grid import Grid
 from clsas.measures.tradeoff import STAGES, summary
 from clsas.measures.tradeoff_result import Response, Row, Tradeoff
 

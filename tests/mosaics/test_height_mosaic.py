@@ -17,8 +17,8 @@ from stores import files_of, killed_at
 from tiers import also
 
 import clsas
-from clsas.core.digests import grid_digest
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.digests import grid_digest
+from clsas.engine.data.validate import ClsasWarning
 from clsas.mosaics import pyramid
 from clsas.mosaics.documents import read_document
 from clsas.mosaics.levels import LAYERS, SHADOWED

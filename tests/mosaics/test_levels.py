@@ -14,8 +14,8 @@ from stores import change, files_of, killed_at, written
 
 import clsas
 from clsas.cli import main
-from clsas.core.digests import grid_digest
-from clsas.core.grid import Grid
+from clsas.engine.data.digests import grid_digest
+from clsas.engine.data.grid import Grid
 from clsas.mosaics import pyramid
 from clsas.mosaics.documents import read_document
 from clsas.mosaics.levels import Levels, aligned_side, chunk_side, levels_of
@@ -361,10 +361,10 @@ def test_numbers_of_other_programs_that_are_not_finite_are_refused(tmp_path, mon
     store = finished(tmp_path / "a.zarr", OF_PATCHES)
     pixels = PIXELS.copy()
     pixels[3, 5] = np.nan
-    checked = clsas.core.validate.array
+    checked = clsas.engine.data.validate.array
     with monkeypatch.context() as patch:
         patch.setattr(
-            "clsas.core.validate.array",
+            "clsas.engine.data.validate.array",
             lambda name, value, *rest, **options: (
                 value if name == "pixels" else checked(name, value, *rest, **options)
             ),

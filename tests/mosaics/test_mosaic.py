@@ -23,11 +23,13 @@ from cases import along_x, lines_over
 from tiers import also, few
 
 import clsas
-from clsas.core import validate
-from clsas.core.grid import Grid
-from clsas.core.image_error import relative_error_db
-from clsas.core.validate import ClsasWarning
-from clsas.factorized import planner
+from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.validate import ClsasWarning
+from clsas.engine.device.device import list_devices
+from clsas.engine.factorized import planner
 from clsas.mosaics import scheduling
 from clsas.mosaics.devices import claim_device
 from clsas.mosaics.documents import read_document
@@ -35,8 +37,6 @@ from clsas.mosaics.forming import open_visibility, stamped_files
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import END, open_survey
 from clsas.mosaics.visibility import SurveyVisibility
-from clsas.opencl.device import list_devices
-from clsas.sonar.beam import BeamWindow
 
 GRID = Grid.plane((-4, 4, 80), (30, 40, 60))
 LINES = lines_over(GRID, along_x(160, 0.05), carrier_hz=100e3, step_m=0.03)
@@ -724,7 +724,7 @@ class TestDistributed:
         np.testing.assert_array_equal(local, other)
 
     def test_only_workers_need_a_device(self, file, tmp_path, monkeypatch):
-        monkeypatch.setattr("clsas.opencl.device._raw_devices", list)
+        monkeypatch.setattr("clsas.engine.device.device._raw_devices", list)
         client = SimpleNamespace(get_executor=None)
         mosaic = clsas.mosaic(file, GRID, tmp_path / "a.zarr", client=client, **REQUEST)
         assert len(mosaic) == 8

@@ -9,9 +9,9 @@ import pytest
 from cases import along_x, lines_over
 
 import clsas
-from clsas.core.grid import Grid
-from clsas.opencl import device as module
-from clsas.opencl.device import DeviceError, list_devices, open_device
+from clsas.engine.data.grid import Grid
+from clsas.engine.device import device as module
+from clsas.engine.device.device import DeviceError, list_devices, open_device
 
 GRID = Grid.plane((-1, 1, 40), (20, 22, 33))
 LINES = lines_over(GRID, along_x(32, 0.05), carrier_hz=1e5, step_m=0.01)

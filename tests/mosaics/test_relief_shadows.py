@@ -5,7 +5,7 @@ import pytest
 from reliefs import BAND_HZ, CARRIER_HZ, track
 
 import clsas
-from clsas.core.digests import grid_digest
+from clsas.engine.data.digests import grid_digest
 from clsas.interferometry.baseline import Lattice
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.shadows import in_shadow

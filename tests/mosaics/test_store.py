@@ -14,8 +14,8 @@ from stores import change
 
 import clsas
 from clsas.cli import main
-from clsas.core.georeference import Georeference
-from clsas.core.grid import Grid
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.grid import Grid
 from clsas.mosaics.documents import read_attributes, read_document
 from clsas.mosaics.store import Store
 

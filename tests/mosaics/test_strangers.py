@@ -12,8 +12,8 @@ import pytest
 from stores import GRID, LINES, REQUEST, change, change_metadata, files_of
 
 import clsas
-from clsas.core import validate
-from clsas.core.digests import digest
+from clsas.engine.data import validate
+from clsas.engine.data.digests import digest
 
 numcodecs = pytest.importorskip("numcodecs")
 zarr = pytest.importorskip("zarr")

@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 from cases import along_x, lines_over
 
-from clsas.core.geometry import pairwise_range_m
-from clsas.core.georeference import Georeference
-from clsas.core.grid import Grid
-from clsas.core.image_error import relative_error_db
-from clsas.core.lines import RangeLines
-from clsas.core.sound_speed import SoundSpeed
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.data.validate import ClsasWarning
+from clsas.engine.imaging import backproject
 from clsas.files.hdf5 import FileFormatError, load, save
-from clsas.imaging import backproject
 from clsas.mosaics.mosaic import mosaic
 from clsas.mosaics.survey import (
     END,
@@ -26,7 +27,6 @@ from clsas.mosaics.survey import (
     open_survey,
     warn_of_order,
 )
-from clsas.sonar.beam import BeamWindow
 
 GRID = Grid.plane((-3, 3, 61), (30, 90, 121))
 TRACK = along_x(120, 0.05)

@@ -36,7 +36,7 @@ from tiers import also, few
 
 import clsas
 from clsas.cli import main
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.validate import ClsasWarning
 from clsas.navigation.autofocus import autofocus
 
 RECORDED = Path(__file__).parents[2] / "../shared/data/gotcha/data_3dsar_pass1_az001_HH.mat"
@@ -243,7 +243,7 @@ def test_a_gap_of_the_track():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("default::clsas.core.validate.ClsasWarning")
+@pytest.mark.filterwarnings("default::clsas.engine.data.validate.ClsasWarning")
 @pytest.mark.parametrize("case", ["zeros", "beyond", "one pixel"])
 def test_nothing_to_focus_on(case):
     _, nominal = recorded(points(), np.zeros(PINGS))

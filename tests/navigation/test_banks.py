@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import detrend
 
 import clsas
-from clsas.sonar.system import line_array, stacked
+from clsas.engine.data.system import line_array, stacked
 
 PULSE = clsas.Pulse(carrier_hz=100e3, bandwidth_hz=30e3, duration_s=1e-3)
 BASELINE_M = 0.2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clsas
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.validate import ClsasWarning
 from clsas.navigation.overlap import Array
 
 PINGS, RECEIVERS, ADVANCE = 12, 24, 12

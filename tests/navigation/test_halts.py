@@ -9,12 +9,12 @@ from studies.navigating import said_to_be_on, with_noise
 from tiers import also, few
 
 import clsas
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.validate import ClsasWarning
+from clsas.engine.signal.readout import Readout
 from clsas.navigation.autofocus import autofocus
 from clsas.navigation.checks import mean_wavelength_m
 from clsas.navigation.halts import halt
 from clsas.navigation.responses import READ_DB, Passage, brightest, contributions
-from clsas.signal.readout import Readout
 
 
 def found_halt(lines, grid):

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 import clsas
 from clsas.cli import main
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.validate import ClsasWarning
 from clsas.navigation.known_points import UNKNOWNS, calibrate_track
 
 SONAR = clsas.Sonar(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import clsas
+from clsas.engine.data import looking
 from clsas.navigation.overlap import Array, moved
-from clsas.sonar import looking
 
 LOOK = np.array([0.0, np.cos(0.3), -np.sin(0.3)])
 

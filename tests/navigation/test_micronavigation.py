@@ -28,7 +28,7 @@ from tiers import also
 
 import clsas
 from clsas.cli import main
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.validate import ClsasWarning
 from clsas.navigation.micronavigation import micronavigate
 from clsas.navigation.overlap import Array, overlap
 

@@ -10,7 +10,7 @@ from studies.focusing import GRID, PINGS, SONAR, points, recorded, smooth_m, spe
 from tiers import also
 
 import clsas
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.validate import ClsasWarning
 from clsas.navigation.autofocus import autofocus
 
 SPEED_M_S = 1500.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from cases import along_x
 
-from clsas.core.lines import RangeLines
+from clsas.engine.data.lines import RangeLines
 from clsas.navigation.swath import checked_swath
 
 FIRST_M = np.array([10.0, 11.5, 12.0, 10.0])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import clsas
-from clsas.core.image import Image
+from clsas.engine.data.image import Image
 from clsas.navigation.autofocus import Autofocus
 from clsas.navigation.micronavigation import Micronavigation
 

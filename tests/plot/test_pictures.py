@@ -14,8 +14,8 @@ from tiers import also
 
 import clsas
 from clsas import plot
-from clsas.core.grid import Grid
-from clsas.core.image import Image
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
 from clsas.measures.tradeoff_result import Row, Tradeoff
 from clsas.plot.colours import colour_map
 

@@ -6,8 +6,8 @@ from cases import along_x, lines_over
 
 import clsas
 from clsas import plot
-from clsas.core.grid import Grid
-from clsas.core.image import Image
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
 from clsas.plot.levels import amplitude_at
 from clsas.plot.windows import window_around
 

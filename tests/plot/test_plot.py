@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from clsas import plot
-from clsas.core.georeference import Georeference
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.signal.echoes import Echoes
 from clsas.measures.quality import measure_point
-from clsas.signal.echoes import Echoes
 
 pytest.importorskip("matplotlib")
 
@@ -199,8 +199,8 @@ def test_every_figure_is_drawn_without_a_warning(tmp_path, recwarn):
 @pytest.mark.exhaustive
 def test_no_global_state_is_touched():
     code = (
-        "import sys, numpy as np; from clsas import plot; from clsas.core.grid import Grid; "
-        "from clsas.core.image import Image; assert 'matplotlib' not in sys.modules; "
+        "import sys, numpy as np; from clsas import plot; from clsas.engine.data.grid import Grid; "
+        "from clsas.engine.data.image import Image; assert 'matplotlib' not in sys.modules; "
         "plot.image_db(Image(np.ones((2, 2), complex), Grid.plane((0, 1, 2), (0, 1, 2)))); "
         "assert 'matplotlib.pyplot' not in sys.modules"
     )

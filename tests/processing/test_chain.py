@@ -11,9 +11,9 @@ from click.testing import CliRunner
 
 import clsas
 from clsas.cli import main
-from clsas.core.atomic import locked
-from clsas.core.digests import with_digest
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.atomic import locked
+from clsas.engine.data.digests import with_digest
+from clsas.engine.data.validate import ClsasWarning
 from clsas.files.process_tables import STEPS
 from clsas.processing import folders
 from clsas.processing import steps as steps_module

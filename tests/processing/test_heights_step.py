@@ -14,7 +14,7 @@ from tiers import also
 import clsas
 from clsas.cli import main
 from clsas.cli.processing import _in_words
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.validate import ClsasWarning
 from clsas.files.process_tables import checked_steps
 from clsas.files.scene_files import read_scene
 from clsas.mosaics.documents import read_document

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import clsas
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.validate import ClsasWarning
 from clsas.files.scene_files import SceneFile
 from clsas.processing import chain
 from clsas.processing.record import StepRecord, file_digest, read_records, write_records

@@ -3,7 +3,7 @@
 import pytest
 from studies import blurred_wreck
 
-from clsas.core.validate import ClsasWarning
+from clsas.engine.data.validate import ClsasWarning
 from clsas.trials import wreck
 
 pytest.importorskip("matplotlib")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from clsas.opencl.device import open_device
+from clsas.engine.device.device import open_device
 
 ROOT = Path(__file__).parents[2]
 

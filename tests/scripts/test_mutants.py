@@ -29,9 +29,9 @@ def test_every_fault_can_be_planted(mutants):
 
 def test_what_is_likely_to_find_a_fault_runs_first(mutants):
     kernel = mutants.Fault("", "", "cl/beam.h", "", "")
-    before = mutants.Result("tests/sonar/test_beam.py::test_x", "fast", 1.0)
+    before = mutants.Result("tests/engine/data/test_beam.py::test_x", "fast", 1.0)
     first, *_, last = mutants.runs(kernel, ROOT, before)
-    assert first == ("fast", ["tests/sonar/test_beam.py::test_x"])
+    assert first == ("fast", ["tests/engine/data/test_beam.py::test_x"])
     assert last == ("change", ["tests"])
     near = [tests for _, tests in mutants.runs(kernel, ROOT, None)]
     assert near[0][0] == "tests/imagers"

@@ -3,10 +3,10 @@ import re
 import pytest
 from studies import predictions
 
-from clsas.core.grid import Grid
-from clsas.factorized import measured_costs as costs
-from clsas.imaging import plan
-from clsas.opencl.device import open_device
+from clsas.engine.data.grid import Grid
+from clsas.engine.device.device import open_device
+from clsas.engine.factorized import measured_costs as costs
+from clsas.engine.imaging import plan
 from clsas.trials import cases
 from clsas.trials.cases import Case
 

@@ -4,7 +4,7 @@ from cases import along_x, beside, patch, thesis_lines
 from thesis.range_errors import range_errors_m
 
 from clsas import plan
-from clsas.factorized.virtual_channels import stage_errors_m
+from clsas.engine.factorized.virtual_channels import stage_errors_m
 
 SPACING_M, SIDE_M, NEAREST_M = 8.25e-3, 5.0, 40.0  # THESIS chapter 5
 STAGES = [[(2, 2)], [(3, 8)], [(8, 2)], [(2, 2)] * 3, [(4, 8), (2, 2)]]

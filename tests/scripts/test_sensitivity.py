@@ -2,9 +2,9 @@ import pytest
 from studies import sensitivity
 from studies.scaling import scaled
 
-from clsas.factorized import search
-from clsas.factorized.costs import Costs
-from clsas.opencl.device import open_device
+from clsas.engine.device.device import open_device
+from clsas.engine.factorized import search
+from clsas.engine.factorized.costs import Costs
 
 
 def named(name):

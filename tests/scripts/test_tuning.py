@@ -2,8 +2,8 @@ import pytest
 from studies import tuning
 from studies.scaling import scaled
 
-from clsas.factorized import stages
-from clsas.opencl.device import open_device
+from clsas.engine.device.device import open_device
+from clsas.engine.factorized import stages
 
 
 @pytest.mark.watches("scripts/studies")
@@ -32,4 +32,4 @@ def test_a_device_of_one_lane_has_work_groups_to_tune(monkeypatch):
     single = dataclasses.replace(device, info=info, _kernels={})
     named = {(each.module.__name__, each.name) for each in tuning.constants(single)}
     assert (stages.__name__, "_GROUP") in named
-    assert ("clsas.factorized.costs", "_BATCH_BYTES") in named
+    assert ("clsas.engine.factorized.costs", "_BATCH_BYTES") in named

@@ -8,8 +8,8 @@ from bent import shot
 
 import clsas
 from clsas import Pointing, PointTargets, Pulse, Sonar, SoundSpeed, Track, simulate, simulate_lines
-from clsas.core.ray_tables import TABLE_ERROR, Q, RayTable, quantity_of, table_around
-from clsas.core.rays import farthest_m, rays
+from clsas.engine.water.ray_tables import TABLE_ERROR, Q, RayTable, quantity_of, table_around
+from clsas.engine.water.rays import farthest_m, rays
 from clsas.simulation.height_field import BentRays
 from clsas.simulation.recording import FOCUSED
 from clsas.simulation.refraction import MOST_FOCUS, Sightlines

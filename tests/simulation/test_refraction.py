@@ -5,8 +5,8 @@ from cases import along_x
 
 import clsas
 from clsas import PointTargets, Pulse, Sonar, SoundSpeed, Track, simulate, simulate_lines
+from clsas.engine.data.track import Channels
 from clsas.simulation.refraction import BlockRays
-from clsas.sonar.track import Channels
 from clsas.trials import oracle
 
 PROFILE = SoundSpeed([0, 12, 15, 60], [1505, 1504, 1494, 1490])
@@ -66,7 +66,7 @@ def test_tables_serve_many_points_and_moving_receivers(climb):
 
     many, few = delays(points), delays(points[:100])
     # Once the echo is there, the receiver is where the ray ends.
-    from clsas.core.rays import rays
+    from clsas.engine.water.rays import rays
 
     def time_s(antenna):
         offset = points[:100] - antenna

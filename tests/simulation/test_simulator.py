@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from scipy.special import erfc, fresnel
 
-from clsas.core.geometry import bistatic_range_m
-from clsas.core.validate import ClsasWarning
-from clsas.signal.echoes import Echoes
+from clsas.engine.data.geometry import bistatic_range_m
+from clsas.engine.data.system import Pulse, Sonar, line_array
+from clsas.engine.data.track import Pointing, Track, channels
+from clsas.engine.data.validate import ClsasWarning
+from clsas.engine.signal.echoes import Echoes
 from clsas.simulation.patterns import needed_terms
 from clsas.simulation.scenes import Observer, PointTargets, Seabed
 from clsas.simulation.simulator import simulate, simulate_lines
-from clsas.sonar.system import Pulse, Sonar, line_array
-from clsas.sonar.track import Pointing, Track, channels
 
 C = 1500.0
 CARRIER = 1e6

@@ -10,7 +10,7 @@ from stored_tables import printed
 from studies import tables
 from studies.scaling import scaled
 
-from clsas.sonar.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow
 from clsas.trials import bench, cases, dunes
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "bench"

@@ -7,10 +7,10 @@ import pytest
 from cases import CARRIER, STEP, along_x, bistatic, made, noise, patch, thesis_lines
 from exactly import prepare, same_interpolator
 
-from clsas.core.grid import Grid
-from clsas.core.image import Image
-from clsas.core.image_error import relative_error_db
-from clsas.core.lines import RangeLines
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
+from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.lines import RangeLines
 from clsas.trials import reference
 from clsas.trials.reference import ideal, sampled_error_db
 

@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from clsas.cli import main
-from clsas.opencl.device import DeviceError
+from clsas.engine.device.device import DeviceError
 from clsas.trials import selftest
 
 

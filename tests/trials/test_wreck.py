@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import clsas
-from clsas.core.image import Image
-from clsas.core.lines import RangeLines
-from clsas.sonar.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.image import Image
+from clsas.engine.data.lines import RangeLines
 from clsas.trials import bench, cases, wreck
 
 

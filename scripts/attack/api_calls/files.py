@@ -10,8 +10,8 @@ import numpy as np
 
 import clsas
 from api_calls.scene import Call, nothing, scene
-from clsas.core.digests import grid_digest
-from clsas.factorized.costs import Costs
+from clsas.engine.data.digests import grid_digest
+from clsas.engine.factorized.costs import Costs
 from clsas.mosaics.documents import read_document
 from clsas.mosaics.record import Record
 

@@ -12,7 +12,7 @@ import scipy.io
 
 import clsas
 from api_calls.scene import EMPTY, LARGE, Call, fields, nothing, scene
-from clsas.factorized.costs import Costs
+from clsas.engine.factorized.costs import Costs
 
 
 def imaging(folder: Path) -> dict[str, Call]:

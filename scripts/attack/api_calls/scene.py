@@ -15,8 +15,8 @@ import numpy as np
 import scipy.io
 
 import clsas
-from clsas.core.extras import is_installed
-from clsas.factorized.costs import Costs
+from clsas.engine.data.extras import is_installed
+from clsas.engine.factorized.costs import Costs
 
 RESULTS = (
     "Assessment", "Autofocus", "Calibration", "Certificate", "Effect", "Finding", "Inspection",

@@ -1,0 +1,1 @@
+"""The engine: from lines to an image, with NumPy, SciPy and PyOpenCL alone."""

@@ -1,0 +1,1 @@
+"""Range lines, grids, images, beams and tracks, and checks of arguments."""

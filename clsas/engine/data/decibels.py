@@ -1,0 +1,68 @@
+"""Errors and amplitudes in decibels; the power of errors adds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.engine.data import validate
+
+
+def power(error_db: float) -> float:
+    """Return the power of a relative rms error."""
+    return 10 ** (error_db / 10)
+
+
+def in_db(power: float) -> float:
+    """Return a relative rms error from its power."""
+    return 10 * math.log10(max(power, 1e-30))
+
+
+def largest_amplitude(values: NDArray) -> float:
+    """Return the largest amplitude of real or complex values, even if it exceeds float32."""
+    scale, amplitude = _scaled_amplitude(values)
+    return scale * float(amplitude.max())
+
+
+def level_db(values: NDArray, reference: float | None = None) -> NDArray[np.float32]:
+    """Return amplitudes relative to a reference in dB, minus infinity where they are 0.
+
+    Parameters
+    ----------
+    values : ndarray, real or complex
+    reference : float, optional
+        Amplitude of 0 dB. The default is the largest amplitude of the values.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If `reference` is not a positive number.
+    """
+    if reference is not None:
+        reference = validate.positive("reference", reference)
+    scale, amplitude = _scaled_amplitude(values)
+    if not scale:
+        return np.full(amplitude.shape, -np.inf, np.float32)
+    if reference is None:
+        unit_db = 20 * math.log10(float(amplitude.max()))
+    else:  # the quotient of two extreme numbers may overflow
+        unit_db = 20 * (math.log10(reference) - math.log10(scale))
+    with np.errstate(divide="ignore"):
+        level = np.log10(amplitude, out=amplitude)
+    level *= np.float32(20)
+    level -= np.float32(unit_db)
+    return level
+
+
+def _scaled_amplitude(values: NDArray) -> tuple[float, NDArray[np.float32]]:
+    """Return a scale and the amplitudes divided by it, so that no square over- or underflows."""
+    parts = np.ascontiguousarray(values)
+    if parts.dtype.kind == "c":
+        parts = parts.view(parts.real.dtype)
+    scale = max(float(parts.max()), -float(parts.min()))
+    if not scale:
+        return 0.0, np.zeros(values.shape, np.float32)
+    scaled = np.divide(parts, parts.dtype.type(scale)).view(values.dtype)
+    return scale, np.abs(scaled).astype(np.float32, copy=False)

@@ -1,0 +1,499 @@
+"""Georeferences: where the coordinates of lines, grids and images lie on Earth.
+
+pyproj is imported only when coordinates are converted or a coordinate reference system is checked,
+so that georeferenced files can be read without it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.engine.data import projections, reprs, validate
+
+if TYPE_CHECKING:
+    import pyproj
+
+    from clsas.engine.data.grid import Grid
+
+_LOCAL = ("latitude_deg", "longitude_deg", "height_m", "heading_deg")
+_MOST_HEIGHT_M = 1e5
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """Place of the coordinates x, y and z on Earth.
+
+    There are two kinds. With `projected`, x and y are easting and northing of a map projection.
+    With `local`, the origin has a latitude and longitude, and the x axis a heading. The map of a
+    local georeference is a transverse Mercator projection centred on the origin.
+
+    Lines, grids and tracks carry a georeference, which passes from lines to images, mosaics and
+    files. Create one with `projected` or `local`, which check it.
+
+    Attributes
+    ----------
+    crs : str or None
+        Coordinate reference system in which x is the easting and y the northing, such as
+        "EPSG:32632"; None for a local georeference.
+    latitude_deg, longitude_deg : float or None
+        Geodetic latitude and longitude (WGS 84) of the origin, degrees; None if projected.
+    height_m : float or None
+        Height of the origin, metres; None if projected.
+    heading_deg : float or None
+        Heading of the x axis, degrees clockwise from true north at the origin, from 0 up to 360;
+        None if projected.
+    vertical_datum : str or None
+        Name of the surface from which heights are counted, such as "EGM2008". None means that of
+        the coordinate reference system, or the WGS 84 ellipsoid.
+
+    See Also
+    --------
+    Track.from_geographic : Track of latitudes and longitudes, with its georeference.
+    export : Write an image as a map.
+
+    Notes
+    -----
+    The scale of the transverse Mercator projection at its origin is ``1 + height_m / R``, where R
+    is the Gaussian radius of curvature there. Distances in the scene are therefore true at the
+    height of the origin, not on the ellipsoid. Up to 5 km from the origin they are true to 3e-7
+    (Snyder 1987), plus up to 3e-7 for every kilometre of height or depth. On maps such as UTM,
+    distances differ from true ones by up to 1e-3, which defocuses images of long apertures:
+    prefer a local georeference for imaging.
+
+    References
+    ----------
+    Snyder, "Map Projections: A Working Manual", US Geological Survey Professional Paper 1395, 1987.
+
+    Examples
+    --------
+    A scene near Bergen whose x axis points to the south-west:
+
+    >>> import clsas
+    >>> place = clsas.Georeference.local(60.39, 5.32, heading_deg=217)
+    >>> place
+    Georeference(latitude 60.39 deg, longitude 5.32 deg, height 0 m, heading 217 deg)
+    >>> grid = clsas.Grid.plane(x=(0, 50, 501), y=(20, 60, 401), georeference=place)
+    """
+
+    crs: str | None = None
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+    height_m: float | None = None
+    heading_deg: float | None = None
+    vertical_datum: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check every field and convert it."""
+
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        if self.vertical_datum is not None:
+            put("vertical_datum", _words("vertical_datum", self.vertical_datum))
+        local = [name for name in _LOCAL if getattr(self, name) is not None]
+        if self.crs is not None:
+            put("crs", _words("crs", self.crs))
+            if local:
+                raise ValueError(f"{local[0]} must be left out with crs, which places the origin")
+            return
+        for name in _LOCAL:
+            if getattr(self, name) is None:
+                raise ValueError(f"{name} must be given unless crs is")
+        latitude, longitude = projections.checked(self.latitude_deg, self.longitude_deg, ())
+        put("latitude_deg", float(latitude))
+        put("longitude_deg", float(longitude))
+        put("height_m", _height("height_m", self.height_m))
+        put("heading_deg", _heading("heading_deg", self.heading_deg))
+
+    def __repr__(self) -> str:
+        """Return the coordinate reference system, or origin and heading."""
+        return reprs.summary(self, *self._words())
+
+    def __str__(self) -> str:
+        """Return the coordinate reference system, or origin and heading, in words."""
+        return ", ".join(self._words())
+
+    def _words(self) -> list[str]:
+        datum = [] if self.vertical_datum is None else [f"heights above {self.vertical_datum}"]
+        if self.crs is not None:
+            # WKT takes pages; its name is at the start.
+            return [self.crs if len(self.crs) < 60 else f"{self.crs[:50]}...", *datum]
+        return [
+            f"latitude {self.latitude_deg:.10g} deg",
+            f"longitude {self.longitude_deg:.10g} deg",
+            f"height {self.height_m:.6g} m",
+            f"heading {self.heading_deg:.8g} deg",
+            *datum,
+        ]
+
+    @classmethod
+    def projected(cls, crs: str, *, vertical_datum: str | None = None) -> Georeference:
+        """Return the georeference of coordinates that are easting, northing and height.
+
+        Parameters
+        ----------
+        crs : str
+            Projected coordinate reference system in metres: "EPSG:32632", or anything else that
+            pyproj reads, such as WKT.
+        vertical_datum : str, optional
+            Name of the surface from which z is counted.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If `crs` is unknown, is not a projection in metres, or its axes do not point east and
+            north, such as those of polar stereographic projections.
+        ImportError
+            If pyproj is not installed (extra `maps`).
+
+        Examples
+        --------
+        >>> import clsas
+        >>> clsas.Georeference.projected("epsg:32632")
+        Georeference(EPSG:32632)
+        """
+        found = projections.known(_words("crs", crs))
+        authority = found.to_authority(min_confidence=100)
+        name = crs if authority is None else ":".join(authority)
+        return cls(crs=name, vertical_datum=vertical_datum)
+
+    @classmethod
+    def local(
+        cls,
+        latitude_deg: float,
+        longitude_deg: float,
+        height_m: float = 0.0,
+        *,
+        heading_deg: float,
+        vertical_datum: str | None = None,
+    ) -> Georeference:
+        """Return the georeference of coordinates about an origin.
+
+        Parameters
+        ----------
+        latitude_deg, longitude_deg : float
+            Geodetic latitude and longitude (WGS 84) of the origin, degrees: -90 to 90, and -180 to
+            360.
+        height_m : float
+            Height of the origin above the WGS 84 ellipsoid or `vertical_datum`, metres; negative
+            below it.
+        heading_deg : float
+            Heading of the x axis, degrees clockwise from true north, -360 to 360. The y axis points
+            to port of it, and z up.
+        vertical_datum : str, optional
+            Name of the surface from which heights are counted.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a value is of another type or outside its limits.
+        """
+        return cls(
+            latitude_deg=latitude_deg,
+            longitude_deg=longitude_deg,
+            height_m=height_m,
+            heading_deg=heading_deg,
+            vertical_datum=vertical_datum,
+        )
+
+    @property
+    def is_projected(self) -> bool:
+        """True if x and y are easting and northing of a coordinate reference system."""
+        return self.crs is not None
+
+    @property
+    def is_north_up(self) -> bool:
+        """True if x points east and y north on the map, so that x and y are its axes."""
+        return self.is_projected or self.heading_deg == 90.0
+
+    def wkt(self) -> str:
+        """Return the coordinate reference system of the map as WKT, version 2:2019.
+
+        Raises
+        ------
+        ValueError
+            If the coordinate reference system is unknown.
+        ImportError
+            If pyproj is not installed (extra `maps`).
+        """
+        return self.map_crs().to_wkt("WKT2_2019")
+
+    def map_crs(self) -> pyproj.CRS:
+        """Return the coordinate reference system of the map as an object of pyproj.
+
+        Raises
+        ------
+        ValueError, ImportError
+            As for `wkt`.
+        """
+        if self.crs is not None:
+            return projections.known(self.crs)
+        assert self.latitude_deg is not None
+        assert self.longitude_deg is not None
+        assert self.height_m is not None
+        return projections.centred_on(self.latitude_deg, self.longitude_deg, self.height_m)
+
+    def to_map(self, positions_m: ArrayLike) -> NDArray[np.float64]:
+        """Return easting, northing and height of positions x, y, z, float64 [..., 3], metres.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the positions are not finite real numbers of shape [..., 3].
+        """
+        found = _positions("positions_m", positions_m).copy()
+        if self.is_projected:
+            return found
+        found[..., :2] = found[..., :2] @ self.axes
+        found[..., 2] += self.height_m or 0.0
+        return found
+
+    def from_map(self, places_m: ArrayLike) -> NDArray[np.float64]:
+        """Return positions x, y, z from easting, northing and height, float64 [..., 3], metres.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the places are not finite real numbers of shape [..., 3].
+        """
+        found = _positions("places_m", places_m).copy()
+        if self.is_projected:
+            return found
+        found[..., :2] = found[..., :2] @ self.axes.T
+        found[..., 2] -= self.height_m or 0.0
+        return found
+
+    def to_geographic(self, positions_m: ArrayLike) -> NDArray[np.float64]:
+        """Return latitude (deg), longitude (deg) and height (m) of positions, float64 [..., 3].
+
+        Heights are not converted between vertical datums.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the positions are not finite real numbers of shape [..., 3], or lie outside the
+            projection.
+        ImportError
+            If pyproj is not installed (extra `maps`).
+
+        Warns
+        -----
+        ClsasWarning
+            If PROJ lacks the grid of a datum shift that would be more accurate there.
+        """
+        found = geographic(self, positions_m)
+        self._warn_of_missing_grid(found)
+        return found
+
+    def from_geographic(
+        self, latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike
+    ) -> NDArray[np.float64]:
+        """Return positions x, y, z of latitudes, longitudes and heights, float64 [..., 3], metres.
+
+        Parameters
+        ----------
+        latitude_deg, longitude_deg : array_like
+            Geodetic latitudes and longitudes (WGS 84), degrees.
+        height_m : array_like
+            Heights, metres, above the same surface as those of this georeference.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a value is outside its limits, latitude and longitude are probably swapped, or a
+            position lies outside the projection.
+        ImportError
+            If pyproj is not installed (extra `maps`).
+
+        Warns
+        -----
+        ClsasWarning
+            As for `to_geographic`.
+
+        Examples
+        --------
+        >>> import clsas
+        >>> place = clsas.Georeference.local(60.39, 5.32, heading_deg=90)
+        >>> place.from_geographic(60.39, 5.32, 10.0)
+        array([ 0.,  0., 10.])
+        """
+        latitude, longitude = projections.checked(latitude_deg, longitude_deg)
+        height = validate.array("height_m", height_m, np.float64, None)
+        latitude, longitude, height = projections.alike(latitude, longitude, height)
+        easting_m, northing_m = projections.to_map(self.map_crs()).transform(longitude, latitude)
+        place_m = np.stack([easting_m, northing_m, height], axis=-1)
+        if not np.isfinite(place_m).all():
+            raise ValueError(f"latitude_deg and longitude_deg must lie within the map of {self}")
+        self._warn_of_missing_grid(np.stack([latitude, longitude], axis=-1))
+        return self.from_map(place_m)
+
+    def convergence_deg(
+        self, latitude_deg: ArrayLike, longitude_deg: ArrayLike
+    ) -> NDArray[np.float64]:
+        """Return the angle from the map's north to true north, degrees, positive anticlockwise.
+
+        A true heading is that on the map plus the convergence.
+
+        Raises
+        ------
+        TypeError, ValueError, ImportError
+            As for `from_geographic`.
+        """
+        latitude, longitude = projections.alike(*projections.checked(latitude_deg, longitude_deg))
+        crs = self.map_crs()  # raises if pyproj is missing
+        import pyproj
+
+        factors = pyproj.Proj(crs).get_factors(longitude, latitude)
+        return np.asarray(factors.meridian_convergence, np.float64)
+
+    def affine(self, grid: Grid) -> tuple[float, float, float, float, float, float]:
+        """Return the transform from columns and rows of a grid to easting and northing.
+
+        The numbers (a, b, c, d, e, f) are in the order of rasterio and of world files by columns:
+
+            easting = a column + b row + c,   northing = d column + e row + f.
+
+        Column and row count from the outer corner of pixel [0, 0], whose centre is at (0.5, 0.5),
+        as GDAL does.
+
+        Parameters
+        ----------
+        grid : Grid
+            A plane or height map that is not vertical.
+
+        Raises
+        ------
+        ValueError
+            If the grid consists of points, or its rows and columns lie above each other.
+
+        Examples
+        --------
+        >>> import clsas
+        >>> place = clsas.Georeference.projected("EPSG:32632")
+        >>> place.affine(clsas.Grid.plane((500_000, 500_100, 101), (6_700_000, 6_700_050, 101)))
+        (1.0, 0.0, 499999.5, 0.0, 0.5, 6699999.75)
+        """
+        from clsas.engine.data import map_grids  # imports Grid, which imports this module
+
+        return map_grids.affine(self, grid)
+
+    def north_up(self, grid: Grid, pixel_m: float | None = None) -> Grid:
+        """Return the smallest horizontal grid along the axes of the map that covers another one.
+
+        Its columns run east and its rows north. Edges of its pixels are at whole multiples of their
+        size, so that images of neighbouring scenes fit together.
+
+        Parameters
+        ----------
+        grid : Grid
+            A horizontal plane.
+        pixel_m : float, optional
+            Distance of its pixels, metres; by default the smaller one of `grid`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the grid is not a horizontal plane, or `pixel_m` is not a positive number, or so
+            small that pixels would not fit into memory.
+
+        Examples
+        --------
+        >>> import clsas
+        >>> place = clsas.Georeference.local(60.39, 5.32, heading_deg=45)
+        >>> grid = clsas.Grid.plane((0, 10, 101), (20, 25, 51), georeference=place)
+        >>> north_up = place.north_up(grid)
+        >>> north_up.shape
+        (109, 108)
+        >>> place.affine(north_up)[1], place.affine(north_up)[3]
+        (0.0, 0.0)
+        """
+        from clsas.engine.data import map_grids
+
+        return map_grids.north_up(self, grid, pixel_m)
+
+    @property
+    def axes(self) -> NDArray[np.float64]:
+        """Easting and northing of the unit vectors x and y, float64 [2, 2]."""
+        if self.heading_deg is None:
+            return np.eye(2)
+        quarter, rest = divmod(self.heading_deg, 90.0)  # exact for multiples of 90 degrees
+        sine, cosine = math.sin(math.radians(rest)), math.cos(math.radians(rest))
+        for _ in range(int(quarter)):
+            sine, cosine = cosine, -sine
+        return np.array([[sine, cosine], [-cosine, sine]])
+
+    def _warn_of_missing_grid(self, geographic_deg: NDArray[np.float64]) -> None:
+        """Warn if PROJ lacks a better datum shift at the first of latitudes and longitudes."""
+        if self.is_projected and geographic_deg.size:
+            latitude, longitude = geographic_deg.reshape(-1, geographic_deg.shape[-1])[0, :2]
+            projections.warn_of_missing_grid(self.map_crs(), str(self), latitude, longitude)
+
+
+def geographic(place: Georeference, positions_m: ArrayLike) -> NDArray[np.float64]:
+    """Return what `Georeference.to_geographic` does, and leave out its warning."""
+    place_m = place.to_map(positions_m)
+    easting_m, northing_m = place_m[..., 0], place_m[..., 1]
+    longitude, latitude = projections.to_map(place.map_crs()).transform(
+        easting_m, northing_m, direction="INVERSE"
+    )
+    found = np.stack([latitude, longitude, place_m[..., 2]], axis=-1)
+    if not np.isfinite(found).all():
+        raise ValueError(f"positions_m must lie within the map of {place}")
+    return found
+
+
+class Recorded(Protocol):
+    """Range lines or echoes."""
+
+    @property
+    def georeference(self) -> Georeference | None:
+        """Georeference of the coordinates; None if unknown."""
+
+
+def placed(lines: Recorded, grid: Grid) -> Grid:
+    """Return a grid with the georeference of the lines, unless it has one of its own.
+
+    Raises
+    ------
+    ValueError
+        If lines and grid have different georeferences.
+    """
+    if lines.georeference is None or lines.georeference == grid.georeference:
+        return grid
+    if grid.georeference is None:
+        return replace(grid, georeference=lines.georeference)
+    raise ValueError(
+        f"grid must have the georeference of the lines ({lines.georeference}), "
+        f"got {grid.georeference}"
+    )
+
+
+def _words(name: str, value: object) -> str:
+    """Return a text that is not empty."""
+    text = validate.text(name, value)
+    if not text.strip():
+        raise ValueError(f"{name} must not be empty")
+    if "\0" in text:  # PROJ would ignore everything after it
+        raise ValueError(f"{name} must be text without NUL, got {validate.shown(text)}")
+    return text.strip()
+
+
+def _height(name: str, value: Any) -> float:
+    return validate.number(name, value, "m", least=-_MOST_HEIGHT_M, most=_MOST_HEIGHT_M)
+
+
+def _heading(name: str, value: Any) -> float:
+    return validate.number(name, value, "degrees", least=-360.0, most=360.0) % 360.0
+
+
+def _positions(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    """Return positions [..., 3], checked."""
+    found = validate.array(name, value, np.float64, None)
+    if found.ndim == 0 or found.shape[-1] != 3:
+        raise ValueError(f"{name} must have shape [..., 3], got {found.shape}")
+    return found

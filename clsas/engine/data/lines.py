@@ -1,0 +1,517 @@
+"""Range lines: pulse-compressed echoes with their geometry, the input of every imager."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsas.engine.data import banks, conditioning, pings, reprs, validate
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.sound_speed import SoundSpeed, check_reaches
+
+_PER_CHANNEL = (
+    "first_range_m",
+    "tx_m",
+    "rx_m",
+    "rx_velocity_m_s",
+    "look_direction",
+    "bank_numbers",
+)
+GOLDEN = (np.sqrt(5) - 1) / 2
+"""Golden ratio minus 1. Modulo 1, its multiples fill [0, 1) evenly, but never in regular steps."""
+
+_UNIT = 1e-12  # error of a unit vector's length, far above rounding
+
+SAMPLED_CHANNELS = 128
+"""Number of channels that represent all in estimates of geometry and coverage. Half or twice as
+many change predicted errors by less than 0.2 dB (`scripts/bench sensitivity`)."""
+
+
+@dataclass(frozen=True, eq=False)
+class RangeLines:
+    """Pulse-compressed complex echoes of every channel, with the channels' geometry.
+
+    A channel is one (ping, receiver) pair, in ping-major order. Range is half the two-way path,
+    rho(x) = (|x - tx| + |x - rx|) / 2. For a monostatic sonar this is the distance to the point. A
+    point of amplitude A at range rho appears in a line as
+
+        A p(r - rho) exp(-j 2 k rho),   k = 2 pi carrier_hz / sound_speed_m_s,
+
+    with sample n of channel i at r = first_range_m[i] + n range_step_m.
+
+    Parameters
+    ----------
+    samples : array_like of complex, shape [channels, length]
+        Samples, stored as complex64.
+    first_range_m : float or array_like, shape [channels]
+        Range of each channel's first sample, metres. One number applies to all channels.
+    range_step_m : float
+        Range between samples, metres: sound_speed_m_s / (2 sample rate).
+    tx_m, rx_m : array_like of float, shape [channels, 3] or [3]
+        Transmitter and receiver positions (x, y, z) at transmission, metres, stored as float64. One
+        position applies to all channels. For a monostatic sonar give `rx_m=tx_m`.
+    carrier_hz : float
+        Frequency that was mixed out, hertz; 0 if the lines are still on their carrier.
+    sound_speed_m_s : float
+        Speed of the waves, metres per second.
+    rx_velocity_m_s : array_like of float, shape [channels, 3] or [3], optional
+        Velocity of the receivers while the sound travels, metres per second. None means
+        stop-and-hop.
+    look_direction : array_like of float, shape [channels, 3] or [3], optional
+        Direction in which the beam of each channel looks (x, y, z): the normal of the elements'
+        face. Vectors of any length are stored as unit vectors. None means that the direction is
+        unknown, or that the elements look to all sides. It does not change images, but imagers
+        warn if pixels lie behind the elements.
+    georeference : Georeference, optional
+        Where the coordinates lie on Earth. Images of these lines have it too.
+    bank_numbers : array_like of int, shape [channels], optional
+        Receiver bank of each channel, counted from 0, for sonars with several rows of receivers at
+        different heights. None means that all receivers are one bank.
+    sound_speed : SoundSpeed, optional
+        Sound speed over depth. Imagers then account for refraction, and `sound_speed_m_s` only
+        converts times to ranges: range r belongs to the two-way delay 2 r / sound_speed_m_s. None
+        means that the speed is `sound_speed_m_s` everywhere.
+
+    Raises
+    ------
+    TypeError
+        If an argument has the wrong type. This includes real samples, which have no phase.
+    ValueError
+        If shapes disagree, an array is empty, a value is NaN or infinite, a step or speed is not
+        positive, the carrier is negative, a receiver is not slower than the waves, a direction has
+        length zero, or the largest sample is too large or too small for complex64.
+
+    See Also
+    --------
+    compress : Range lines of recorded echoes.
+    from_phase_history : Range lines of samples over frequency.
+    from_full_matrix : Range lines of an array whose elements transmit in turn.
+
+    Notes
+    -----
+    Samples are large, so arrays that need no conversion are not copied. The fields are read-only
+    views of them. Do not write into your arrays afterwards, because new values are not checked.
+
+    Examples
+    --------
+    Two pings of a monostatic sonar, half a metre apart:
+
+    >>> import clsas
+    >>> import numpy as np
+    >>> lines = clsas.RangeLines(
+    ...     np.ones((2, 101), complex), first_range_m=40.0, range_step_m=0.05,
+    ...     tx_m=[[0, 0, 0], [0.5, 0, 0]], rx_m=[[0, 0, 0], [0.5, 0, 0]],
+    ...     carrier_hz=100e3, sound_speed_m_s=1500.0,
+    ... )
+    >>> lines
+    RangeLines(2 channels of 101 samples, range 40 to 45 m in steps of 50 mm, carrier 100 kHz)
+    >>> lines.ping_starts
+    array([0, 1])
+    """
+
+    samples: NDArray[np.complex64]
+    first_range_m: NDArray[np.float64]
+    range_step_m: float
+    tx_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+    carrier_hz: float
+    sound_speed_m_s: float
+    rx_velocity_m_s: NDArray[np.float64] | None = None
+    look_direction: NDArray[np.float64] | None = None
+    georeference: Georeference | None = None
+    bank_numbers: NDArray[np.int64] | None = None
+    sound_speed: SoundSpeed | None = None
+
+    if TYPE_CHECKING:  # the constructor converts array_like arguments
+
+        def __init__(
+            self,
+            samples: ArrayLike,
+            first_range_m: ArrayLike,
+            range_step_m: float,
+            tx_m: ArrayLike,
+            rx_m: ArrayLike,
+            carrier_hz: float,
+            sound_speed_m_s: float,
+            rx_velocity_m_s: ArrayLike | None = None,
+            look_direction: ArrayLike | None = None,
+            georeference: Georeference | None = None,
+            bank_numbers: ArrayLike | None = None,
+            sound_speed: SoundSpeed | None = None,
+        ) -> None: ...
+
+    def __post_init__(self) -> None:
+        """Check every field and convert it."""
+
+        def put(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        put("samples", validate.array("samples", self.samples, np.complex64, (None, None)))
+        put("range_step_m", validate.positive("range_step_m", self.range_step_m, "m"))
+        for name, value in checked_channels(self, "first_range_m").items():
+            put(name, value)
+
+    def __repr__(self) -> str:
+        """Return sizes and extents, because the arrays are long."""
+        range_m = float(self.first_range_m.min()), float(self.last_range_m.max())
+        return reprs.summary(
+            self,
+            f"{self.channels} channels of {self.length} samples",
+            f"{self.banks} banks" if self.banks > 1 else None,
+            f"range {reprs.span(*range_m, 'm')} in steps of "
+            f"{reprs.quantity(self.range_step_m, 'm')}",
+            f"carrier {reprs.quantity(self.carrier_hz, 'Hz')}",
+        )
+
+    @property
+    def per_channel(self) -> dict[str, Any]:
+        """Fields with an entry per channel, by name, without those that are None.
+
+        Code that selects, joins or compares lines takes the fields from here.
+        """
+        fields = {name: getattr(self, name) for name in _PER_CHANNEL}
+        return {name: values for name, values in fields.items() if values is not None}
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return self.samples.shape[0]
+
+    @property
+    def length(self) -> int:
+        """Samples per channel."""
+        return self.samples.shape[1]
+
+    @property
+    def banks(self) -> int:
+        """Number of receiver banks that the channels belong to."""
+        return len(banks.present(self.bank_numbers))
+
+    @property
+    def phase_centres_m(self) -> NDArray[np.float64]:
+        """Midpoints between transmitters and receivers, metres, shape [channels, 3]."""
+        return (self.tx_m + self.rx_m) / 2
+
+    @property
+    def ping_starts(self) -> NDArray[np.int64]:
+        """First channel of every ping, int64 [pings].
+
+        Consecutive channels with one transmitter position are a ping. Several transmissions from
+        one position therefore count as one; `clsas.engine.data.pings.Transmissions` separates them.
+        """
+        return pings.ping_starts(self.tx_m)
+
+    @property
+    def ping_numbers(self) -> NDArray[np.int64]:
+        """Number of every channel's ping, from 0, shape [channels]."""
+        return pings.ping_numbers(self.ping_starts, self.channels)
+
+    @property
+    def ping_centres_m(self) -> NDArray[np.float64]:
+        """Mean phase centre of every ping, metres, shape [pings, 3]."""
+        return pings.means(self.phase_centres_m, self.ping_starts)
+
+    @property
+    def wavenumber_rad_m(self) -> float:
+        """Wavenumber k of the carrier, radians per metre (one way)."""
+        return 2 * np.pi * self.carrier_hz / self.sound_speed_m_s
+
+    @property
+    def carrier_cycles_per_m(self) -> float:
+        """Phase of the carrier per metre of range (two-way), cycles per metre."""
+        return 2 * self.carrier_hz / self.sound_speed_m_s
+
+    @property
+    def last_range_m(self) -> NDArray[np.float64]:
+        """Range of each channel's last sample, metres, shape [channels]."""
+        return self.first_range_m + (self.length - 1) * self.range_step_m
+
+    def select(self, channels: slice | ArrayLike) -> RangeLines:
+        """Return the lines of some channels.
+
+        Parameters
+        ----------
+        channels : slice or array_like
+            Indices, a mask of bools, or a slice, with which samples are shared and not copied.
+
+        Raises
+        ------
+        TypeError
+            If `channels` is neither a slice nor whole numbers nor bools.
+        ValueError
+            If an index is out of range, a mask is not one bool per channel, or no channel is
+            selected.
+        """
+        index = self._index(channels)
+        if len(range(self.channels)[index] if isinstance(index, slice) else index) == 0:
+            raise ValueError("channels must select at least one line, got none")
+        return self._selected(index)
+
+    def bank(self, number: int) -> RangeLines:
+        """Return the lines of one receiver bank, whose `bank_numbers` are None.
+
+        Parameters
+        ----------
+        number : int
+            Number of the bank, one of `bank_numbers`, or 0 if these are None.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If there is no such bank.
+
+        Examples
+        --------
+        Three pings of a sonar with two banks, 0.3 m apart, of two receivers each:
+
+        >>> import clsas
+        >>> import numpy as np
+        >>> pulse = clsas.Pulse(carrier_hz=100e3, bandwidth_hz=20e3, duration_s=1e-3)
+        >>> rx_m = [[0, 0, 0], [0.1, 0, 0], [0, 0, 0.3], [0.1, 0, 0.3]]
+        >>> sonar = clsas.Sonar(pulse, rx_m, bank_numbers=[0, 0, 1, 1])
+        >>> track = clsas.Track.straight([0, 0, 10], [2, 0, 0], pings=3, ping_interval_s=0.05)
+        >>> point = clsas.PointTargets([[0.1, 40, 0]])
+        >>> lines = clsas.compress(clsas.simulate(sonar, track, point))
+        >>> lines.channels, lines.banks
+        (12, 2)
+        >>> upper = lines.bank(1)
+        >>> upper.channels, float(upper.rx_m[:, 2].min())
+        (6, 10.3)
+        """
+        index = banks.members(self.bank_numbers, number)
+        return self if self.bank_numbers is None else self._selected(index, bank_numbers=None)
+
+    def _selected(self, index: slice | NDArray[np.int64], **changes: Any) -> RangeLines:
+        """Return some channels, with fields replaced."""
+        of_channels = {name: values[index] for name, values in self.per_channel.items()}
+        return replace(self, samples=self.samples[index], **(of_channels | changes))
+
+    def _index(self, channels: slice | ArrayLike) -> slice | NDArray[np.int64]:
+        """Return the channels, checked, as a slice or as indices [n]."""
+        if isinstance(channels, slice):
+            return validate.selection("channels", channels)
+        try:
+            given = np.atleast_1d(channels)
+        except ValueError as error:
+            raise ValueError(f"channels must be a regular array: {error}") from None
+        if given.ndim != 1:
+            raise ValueError(f"channels must have one axis, got shape {given.shape}")
+        given = given if given.size else given.astype(int)
+        if given.dtype.kind not in "iub":
+            got = validate.shown(channels)
+            raise TypeError(f"channels must be a slice, whole numbers or bools, got {got}")
+        if given.dtype.kind != "b":
+            return validate.indices("channels", given, self.channels, least=-self.channels)
+        if len(given) != self.channels:
+            raise ValueError(
+                f"channels must be one bool for each of {self.channels} channels, got {len(given)}"
+            )
+        return np.flatnonzero(given)
+
+    def high_passed(self, cutoff_hz: float) -> RangeLines:
+        """Return the lines without frequencies below a cutoff.
+
+        Recorders add constants and slow drifts. In lines on their carrier these lie near 0 Hz,
+        where they add up coherently over a whole image.
+
+        Parameters
+        ----------
+        cutoff_hz : float
+            Cutoff frequency in the recorded signal, before `carrier_hz` was mixed out, hertz.
+            Frequencies from the cutoff upwards pass unchanged. The filter falls to zero at half the
+            cutoff, or at the lowest frequency that the samples represent if that is higher. It has
+            no delay.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the cutoff is not a number, is outside the sampled band (carrier_hz plus or minus
+            half the sample rate), or is below one cycle per line.
+        """
+        return conditioning.high_passed(self, cutoff_hz)
+
+    def tapered_ends(self, length_m: float) -> RangeLines:
+        """Return the lines with both ends faded to zero.
+
+        Lines that end abruptly within strong echoes cannot be interpolated well, even far from
+        their ends.
+
+        Parameters
+        ----------
+        length_m : float
+            Length over which a raised cosine falls from 1 to 0 at each end, metres. At most half a
+            line.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the length is not a number, or is outside its limits.
+        """
+        return conditioning.tapered_ends(self, length_m)
+
+    def without_background(
+        self, statistic: str = "mean", *, receivers: int | None = None
+    ) -> RangeLines:
+        """Return the lines without the background that all pings have in common.
+
+        Direct arrivals, ringing and interference of the electronics lie at the same delay in every
+        ping. Echoes of points move through the lines and mostly remain. A reflector at constant
+        range, such as a flat seabed seen vertically, is removed as well.
+
+        Parameters
+        ----------
+        statistic : {"mean", "median"}
+            Estimate of the background over the pings, for every receiver and sample. The median (of
+            real and imaginary parts) is less affected by strong echoes.
+        receivers : int, optional
+            Number of channels per ping. By default consecutive channels with one transmitter
+            position are a ping.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If there are fewer than 2 pings, pings have different numbers of channels, or the lines
+            of a receiver do not begin at the same range in all pings.
+        """
+        return conditioning.without_background(self, statistic, receivers)
+
+    def without_still_pings(self, least_advance_m: float | None = None) -> RangeLines:
+        """Return the lines without pings taken standing still.
+
+        A platform that stands still repeats one view of the scene. Hundreds of equal pings add up
+        to bright circles around their position, which hide the image formed by the moving pings.
+        The first ping of every halt is kept.
+
+        Parameters
+        ----------
+        least_advance_m : float, optional
+            A ping is dropped if it lies closer than this to the last ping that was kept, metres.
+            The default is a tenth of the usual advance, the median over the pings that move.
+            Because noise in positions brings single pings together, the default drops only halts of
+            five pings or more, and pings that repeat the position of the one before exactly.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the distance is not a positive number, or only one of several pings would be kept.
+        """
+        return pings.without_still_pings(self, least_advance_m)
+
+    def weighted(self, weights: ArrayLike) -> RangeLines:
+        """Return the lines, each multiplied by a weight.
+
+        Parameters
+        ----------
+        weights : array_like of float or complex, shape [channels]
+            Gains, apodization or phase corrections; 0 silences a channel.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the weights are not finite numbers, one per channel, or weighted samples exceed
+            float32.
+        """
+        return conditioning.weighted(self, weights)
+
+    def without_samples(self) -> RangeLines:
+        """Return the geometry of these lines, with a single sample of zero per channel."""
+        return replace(self, samples=np.zeros((self.channels, 1), np.complex64))
+
+
+def checked_channels(received: Any, start: str) -> dict[str, Any]:
+    """Return the fields that range lines and echoes share, checked and converted.
+
+    Parameters
+    ----------
+    received : RangeLines or Echoes
+        Object whose `samples` have been checked.
+    start : str
+        Name of the field that has the first range or time of every channel.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a field has the wrong type or shape, or is outside its limits.
+    """
+    validate.instance("georeference", received.georeference, Georeference, type(None))
+    validate.instance("sound_speed", received.sound_speed, SoundSpeed, type(None))
+    channels = received.samples.shape[0]
+    shapes: dict[str, tuple[int, ...]] = {start: (channels,)}
+    shapes |= {"tx_m": (channels, 3), "rx_m": (channels, 3)}
+    for name in ("rx_velocity_m_s", "look_direction"):
+        if getattr(received, name) is not None:
+            shapes[name] = (channels, 3)
+    checked: dict[str, Any] = {
+        name: validate.array(name, getattr(received, name), np.float64, shape, broadcast=True)
+        for name, shape in shapes.items()
+    }
+    checked["carrier_hz"] = validate.number("carrier_hz", received.carrier_hz, "Hz", least=0.0)
+    speed_m_s = validate.positive("sound_speed_m_s", received.sound_speed_m_s, "m/s")
+    checked["sound_speed_m_s"] = speed_m_s
+    if "rx_velocity_m_s" in checked:
+        fastest_m_s = float(np.linalg.norm(checked["rx_velocity_m_s"], axis=1).max())
+        validate.number("the speed of rx_velocity_m_s", fastest_m_s, "m/s", below=speed_m_s)
+    if received.bank_numbers is not None:
+        checked["bank_numbers"] = banks.checked_numbers(received.bank_numbers, channels, "channels")
+    if "look_direction" in checked:
+        checked["look_direction"] = _unit_vectors("look_direction", checked["look_direction"])
+    if received.sound_speed is not None:
+        for name in ("tx_m", "rx_m"):
+            check_reaches(received.sound_speed, checked[name][:, 2], name)
+    return checked
+
+
+def _unit_vectors(name: str, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return vectors scaled to length 1. Those that have it already are returned bit for bit."""
+    largest = np.abs(vectors).max(axis=1, keepdims=True)
+    if not largest.all():
+        raise ValueError(f"{name} must not have a vector of length 0")
+    scaled = vectors / largest  # avoids overflow and underflow in the norm
+    length = np.linalg.norm(scaled, axis=1, keepdims=True)
+    if np.abs(length * largest - 1).max() < _UNIT:
+        return vectors
+    scaled /= length
+    scaled.flags.writeable = False
+    return scaled
+
+
+def some_channels(count: int, most: int = SAMPLED_CHANNELS) -> NDArray[np.int64]:
+    """Return up to `most` of `count` channels, spread evenly but at irregular intervals.
+
+    With regular intervals, all of them could belong to one receiver of an array.
+    """
+    if count <= most:
+        return np.arange(count)
+    number = np.arange(most)
+    return ((number + number * GOLDEN % 1) * count / most).astype(np.int64)
+
+
+def antennas_of(
+    lines: RangeLines, channels: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None, float]:
+    """Return the transmitters, receivers and velocities of some channels, and the sound speed.
+
+    Functions of ranges take them after the points.
+    """
+    velocity = lines.rx_velocity_m_s
+    moving = None if velocity is None else velocity[channels]
+    return lines.tx_m[channels], lines.rx_m[channels], moving, lines.sound_speed_m_s
+
+
+def steepest(lines: RangeLines) -> float:
+    """Return an upper bound on the change of range per metre that a point moves.
+
+    With unit vectors u from both antennas, the gradient of range is (u_tx + u_rx) / 2 divided by
+    1 + u_rx . velocity / c.
+    """
+    return 1 / (1 - min(fastest(lines), 0.999))
+
+
+def fastest(lines: RangeLines) -> float:
+    """Return the speed of the fastest receiver divided by the sound speed."""
+    if lines.rx_velocity_m_s is None:
+        return 0.0
+    return float(np.linalg.norm(lines.rx_velocity_m_s, axis=1).max()) / lines.sound_speed_m_s

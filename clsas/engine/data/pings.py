@@ -1,0 +1,217 @@
+"""Pings: which channels were received from one transmission, and whether the platform moved.
+
+Range lines have positions but no times, so pings follow from the positions. Consecutive channels
+with one transmitter position are a ping (`ping_starts`). A platform that stands still transmits
+several times from one position. Where that matters, `transmission_starts` also begins a ping where
+the first receiver's position comes again, and `Transmissions` describes the pings found in this
+way. Both agree for a platform that never stands still.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.engine.data import validate
+
+if TYPE_CHECKING:
+    from clsas.engine.data.lines import RangeLines
+
+STILL = 0.1
+"""Share of the usual advance within which a platform counts as standing still."""
+# Pings of the shortest halt. Noise in positions brings two or three pings together without a halt.
+_LEAST_HALT = 5
+# Share of pings after which the track turns back. If it is larger, the pings are out of order, and
+# the steps between them show neither halts nor gaps.
+_DISORDER = 0.03
+_UNEVEN = 0.25  # interquartile range of steps over their median, above which they are uneven
+_LOCAL = 11  # steps that are averaged to find the local course
+# Quantile of the steps that represents a step of a moving platform. Up to 5 % of the steps may be
+# gaps, and up to 95 % may be taken standing still.
+_USUAL_QUANTILE = 0.95
+
+
+def ping_starts(tx_m: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the first channel of every ping, [pings].
+
+    Consecutive channels with one transmitter position, `tx_m` [channels, 3], are a ping.
+    """
+    return np.flatnonzero(np.append(True, (np.diff(tx_m, axis=0) != 0).any(axis=1)))
+
+
+def transmission_starts(tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the first channel of every transmission, also of several from one position.
+
+    Among the channels with one transmitter position, a transmission begins wherever the position of
+    the first receiver comes again. `tx_m` and `rx_m` are [channels, 3].
+    """
+    starts = ping_starts(tx_m)
+    first_rx_m = rx_m[starts][ping_numbers(starts, len(tx_m))]
+    return np.flatnonzero((rx_m == first_rx_m).all(axis=1))
+
+
+def channels_per_ping(starts: NDArray[np.int64], channels: int) -> NDArray[np.int64]:
+    """Return the number of channels of every ping, given the first channels and their number."""
+    return np.diff(np.append(starts, channels))
+
+
+def ping_numbers(starts: NDArray[np.int64], channels: int) -> NDArray[np.int64]:
+    """Return the number of every channel's ping, [channels]."""
+    return np.repeat(np.arange(len(starts)), channels_per_ping(starts, channels))
+
+
+@dataclass(frozen=True, eq=False)
+class Transmissions:
+    """Pings of range lines, where several may have been transmitted from one position.
+
+    See `transmission_starts` for where each begins.
+
+    Attributes
+    ----------
+    starts : int64 [transmissions + 1]
+        First channel of every transmission, followed by the number of channels.
+    centres_m : float64 [transmissions, 3]
+        Mean phase centre of every transmission, metres.
+    places_m : float64 [transmissions, 3]
+        Position of the platform, metres. It is the mean phase centre, or the mean receiver position
+        where the receivers advance more evenly, as with transmitters that alternate fore and aft.
+    """
+
+    starts: NDArray[np.int64]
+    centres_m: NDArray[np.float64]
+    places_m: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, lines: RangeLines) -> Transmissions:
+        """Return the transmissions of range lines."""
+        starts = transmission_starts(lines.tx_m, lines.rx_m)
+        centres_m = means(lines.phase_centres_m, starts)
+        places_m = _more_even(centres_m, means(lines.rx_m, starts))
+        return cls(np.append(starts, lines.channels), centres_m, places_m)
+
+    @property
+    def count(self) -> int:
+        """Number of transmissions."""
+        return len(self.centres_m)
+
+    @property
+    def receivers(self) -> NDArray[np.int64]:
+        """Number of channels of every transmission."""
+        return np.diff(self.starts)
+
+    @property
+    def steps_m(self) -> NDArray[np.float64]:
+        """Distance from every transmission to the next, metres."""
+        return _steps_m(self.places_m)
+
+    @property
+    def usual_step_m(self) -> float:
+        """Median advance while the platform moves, metres; 0 if it never does."""
+        steps_m = self.steps_m[self.steps_m > 0]
+        if not steps_m.size:
+            return 0.0
+        most_m = np.quantile(steps_m, _USUAL_QUANTILE, method="lower")
+        return float(np.median(steps_m[steps_m >= STILL * most_m]))
+
+    def advancing(self, least_m: float | None = None) -> NDArray[np.bool_]:
+        """Return a mask of the transmissions that were not made standing still.
+
+        Parameters
+        ----------
+        least_m : float, optional
+            Least distance from the previous transmission in the mask, metres. By default it is
+            `STILL` times the usual advance. Because noise in positions brings single transmissions
+            together, the default drops only runs of five or more, and those that repeat the
+            position of the one before exactly.
+        """
+        if least_m is not None:
+            return self._beyond(least_m)
+        still = ~self._beyond(STILL * self.usual_step_m)
+        edges = np.flatnonzero(np.diff(still, prepend=False, append=False)).reshape(-1, 2)
+        for first, stop in edges[np.diff(edges, axis=1)[:, 0] + 1 < _LEAST_HALT]:
+            # The halt begins with the transmission before, which still counts as advancing.
+            still[first:stop] = self.steps_m[first - 1 : stop - 1] == 0
+        return ~still
+
+    def _beyond(self, least_m: float) -> NDArray[np.bool_]:
+        """Return a mask of transmissions, each at least `least_m` from the previous one in it."""
+        kept = np.zeros(self.count, bool)
+        last_m = None
+        for number, place_m in enumerate(self.places_m.tolist()):
+            if last_m is None or math.dist(place_m, last_m) >= least_m > 0:
+                kept[number], last_m = True, place_m
+        return kept
+
+    @property
+    def turns(self) -> NDArray[np.int64]:
+        """Numbers of the transmissions after which the track turns back on its local course."""
+        from scipy.ndimage import uniform_filter1d  # slow to import
+
+        numbers = np.flatnonzero(self._beyond(STILL * self.usual_step_m))
+        moves_m = np.diff(self.places_m[numbers], axis=0)
+        if len(moves_m) < 2:
+            return np.zeros(0, np.int64)
+        # The local course is the mean direction of a few steps. A track may turn over many pings,
+        # but not from one ping to the next.
+        moves_m /= np.linalg.norm(moves_m, axis=1, keepdims=True)
+        course = uniform_filter1d(moves_m, min(_LOCAL, len(moves_m)), axis=0)
+        return numbers[np.flatnonzero(np.einsum("pi,pi->p", moves_m, course) < 0)]
+
+    @property
+    def disordered(self) -> bool:
+        """True if the track turns back after more than 3 % of the transmissions.
+
+        The pings are then out of order, and steps between them do not show gaps.
+        """
+        return self.turns.size > _DISORDER * self.count
+
+    def channels(self, some: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return the channels of the transmissions in a mask."""
+        return np.flatnonzero(np.repeat(some, self.receivers))
+
+
+def without_still_pings(lines: RangeLines, least_advance_m: float | None) -> RangeLines:
+    """Return lines without pings taken standing still; see `RangeLines.without_still_pings`."""
+    if least_advance_m is not None:
+        least_advance_m = validate.positive("least_advance_m", least_advance_m, "m")
+    found = Transmissions.of(lines)
+    kept = found.advancing(least_advance_m)
+    if kept.sum() < min(2, found.count):
+        near = (
+            "are at one position"
+            if least_advance_m is None
+            else f"lie within least_advance_m = {least_advance_m:g} m"
+        )
+        raise ValueError(
+            f"lines must come from a platform that moves: of {found.count} pings ({lines.channels} "
+            f"lines) only the first would stay, because all {near}. Check the positions"
+        )
+    return lines if kept.all() else lines.select(found.channels(kept))
+
+
+def means(values: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the mean over every ping of vectors [channels, 3], given the pings' first channels."""
+    counts = channels_per_ping(starts, len(values))
+    return np.add.reduceat(values, starts, axis=0) / counts[:, None]
+
+
+def _more_even(centres_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the phase centres, or the receivers' means if only the latter advance evenly."""
+    uneven, of_rx = _unevenness(centres_m), _unevenness(rx_m)
+    return rx_m if uneven > _UNEVEN and of_rx < _UNEVEN / 2 else centres_m
+
+
+def _unevenness(places_m: NDArray[np.float64]) -> float:
+    """Return the interquartile range of steps over their median."""
+    steps_m = _steps_m(places_m)
+    low_m, usual_m, high_m = np.quantile(steps_m, (0.25, 0.5, 0.75)) if steps_m.size else (0, 0, 0)
+    return float(high_m - low_m) / float(usual_m) if usual_m else math.inf
+
+
+def _steps_m(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    steps_m: NDArray[np.float64] = np.linalg.norm(np.diff(places_m, axis=0), axis=1)
+    return steps_m

@@ -1,0 +1,1 @@
+"""Sound speed that varies with depth: rays, and what replaces them in an image."""

@@ -1,0 +1,254 @@
+"""Apparent antennas: antennas in homogeneous water that receive like those in a profile.
+
+See `clsas.engine.water.refraction` for the method.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.signal.readout import Readout
+from clsas.engine.water.ray_delays import FLIGHT_STEPS, RaySample, at_speed, straight_m, times_s
+from clsas.engine.water.rays import Rays, rays, shadow
+
+_NODES = 48  # distances from which the change of a range axis follows
+_DEGREE = 20  # of the polynomial through them
+_CHANGED_AT_ONCE = 1 << 16  # samples that are interpolated together; they fit into a cache
+_BEYOND = 0.1  # of the distances of sample pixels, by which those of others may extend farther
+_RESAMPLED_DB = -80.0  # largest error of the interpolation of samples
+_MARGIN_DB = 13.0  # by which interpolation is better than the image: its share is a twentieth
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """Apparent antennas, and the change of every line's range axis.
+
+    In homogeneous water of speed c, a sample at range r belongs to the delay 2 (r + offset(r))/c.
+
+    Attributes
+    ----------
+    sound_speed_m_s : float
+        Speed at the seabed.
+    level_m : float
+        Height of the seabed that the offsets are for.
+    tx_z_m, rx_z_m : float64 [channels]
+        Apparent heights of the transmitters, and of the receivers at transmission.
+    ahead_s : float64 [channels]
+        Time by which the delay at the middle is longer than in homogeneous water. A moving receiver
+        is ahead by as much at transmission, so that it is in the right place when echoes arrive.
+    climb : float64 [channels]
+        Apparent over real vertical velocity of moving receivers: the ratio of the sines of the
+        angles at which echoes arrive.
+    kinds : int64 [channels]
+        Number of every channel's pair of heights.
+    limits_m : float64 [kinds, 2]
+        Ranges between which the offsets are polynomials. They continue linearly.
+    coefficients : float64 [degree + 1, kinds]
+        Chebyshev coefficients of the offsets, metres.
+    accuracy_db : float
+        Error of the interpolation of samples.
+    """
+
+    sound_speed_m_s: float
+    level_m: float
+    tx_z_m: NDArray[np.float64]
+    rx_z_m: NDArray[np.float64]
+    ahead_s: NDArray[np.float64]
+    climb: NDArray[np.float64]
+    kinds: NDArray[np.int64]
+    limits_m: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
+    accuracy_db: float
+
+    @classmethod
+    def of(
+        cls,
+        lines: RangeLines,
+        sample: RaySample,
+        allowed_db: float | None,
+        middle_m: NDArray[np.float64],
+    ) -> Change:
+        """Return the change for lines with a profile.
+
+        The directions of echoes are right at the distances `middle_m`, [channels] or [1].
+        """
+        profile = lines.sound_speed
+        assert profile is not None
+        seen = sample.visible.any(axis=1)
+        heights = sample.points_m[seen, 2]
+        level = float(heights.min() + heights.max()) / 2
+        near, far = _limits_m(sample, level)
+        speed = float(profile.at(level))
+        tx_z = lines.tx_m[:, 2]
+        rx_z, middle_s = lines.rx_m[:, 2], np.zeros(lines.channels)
+        if lines.rx_velocity_m_s is not None:  # heights when the echoes of the middle arrive
+            middle_s = 2 * _times(profile, middle_m, tx_z, level)
+            rx_z = rx_z + middle_s * lines.rx_velocity_m_s[:, 2]
+        given = np.stack([tx_z, rx_z, np.broadcast_to(middle_m, tx_z.shape)], axis=1)
+        triples, kinds = np.unique(given, axis=0, return_inverse=True)
+        kinds, middle_m, pairs = kinds.reshape(-1), triples[:, 2], triples[:, :2]
+        apparent = np.stack(
+            [_apparent_z(profile, middle_m, each, level) for each in pairs.T], axis=1
+        )
+        nodes = (near + far + (far - near) * chebyshev.chebpts2(_NODES)) / 2
+        delay = sum(_times(profile, nodes, each[:, None], level) for each in pairs.T)
+        range_m = sum(np.hypot(nodes, each[:, None] - level) for each in apparent.T) / 2
+        offset = speed * delay / 2 - range_m
+        limits = np.stack([range_m.min(axis=1), range_m.max(axis=1)], axis=1)
+        scaled = _scaled(range_m, limits)
+        degree = min(_DEGREE, _NODES - 1) if far > near else 0
+        coefficients = np.stack(
+            [chebyshev.chebfit(x, y, degree) for x, y in zip(scaled, offset, strict=True)], axis=1
+        )
+        accuracy_db = _RESAMPLED_DB if allowed_db is None else allowed_db - _MARGIN_DB
+        accuracy_db = min(accuracy_db, _RESAMPLED_DB)
+        path_m = sum(np.hypot(middle_m, each - level) for each in apparent.T)[kinds]
+        tx_z, rx_z = apparent[kinds].T
+        climb = np.ones(lines.channels)
+        if lines.rx_velocity_m_s is not None:
+            arriving = _rays_to(profile, middle_m, pairs[:, 1], level)
+            climb = (-arriving.one_slope_s_m / arriving.other_slope_s_m)[kinds]
+            rx_z = rx_z - path_m / speed * climb * lines.rx_velocity_m_s[:, 2]
+        return cls(
+            speed, level, tx_z, rx_z, middle_s - path_m / speed, climb, kinds, limits, coefficients,
+            accuracy_db,
+        )  # fmt: skip
+
+    def antennas(self, lines: RangeLines, channels: NDArray[np.int64] | slice) -> RangeLines:
+        """Return lines of some channels with apparent antennas and unchanged samples."""
+        tx_m, rx_m, velocity = np.array(lines.tx_m), np.array(lines.rx_m), lines.rx_velocity_m_s
+        if velocity is not None:
+            rx_m += self.ahead_s[channels, None] * velocity
+            velocity = velocity.copy()
+            velocity[:, 2] *= self.climb[channels]
+        tx_m[:, 2], rx_m[:, 2] = self.tx_z_m[channels], self.rx_z_m[channels]
+        moved = at_speed(lines, self.sound_speed_m_s)
+        return replace(moved, tx_m=tx_m, rx_m=rx_m, rx_velocity_m_s=velocity)
+
+    def offsets_m(
+        self, channels: NDArray[np.int64], range_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the offsets at some ranges of some channels, [channels, n], metres."""
+        kinds = self.kinds[channels]
+        limits, coefficients = self.limits_m[kinds], self.coefficients[:, kinds]
+        scaled = _scaled(range_m, limits)
+        inside = np.clip(scaled, -1, 1)
+        value = chebyshev.chebval(inside, coefficients[..., None], tensor=False)
+        if not np.array_equal(inside, scaled):
+            slopes = chebyshev.chebval(
+                np.array([-1.0, 1.0]), chebyshev.chebder(coefficients)[..., None], tensor=False
+            )
+            slope = np.where(scaled < 0, slopes[:, :1], slopes[:, 1:])
+            value = value + slope * (scaled - inside)
+        return np.asarray(value, np.float64)
+
+    def lines(self, lines: RangeLines, sound_speed_m_s: float) -> RangeLines:
+        """Return lines of the geometry in homogeneous water, with samples over changed ranges.
+
+        Where offsets change by a share of the range, so do the frequencies of echoes, the carrier
+        included. Lines get as many more samples as their band then needs.
+        """
+        changed = self.antennas(lines, slice(None))
+        highest = 2 * lines.carrier_hz / sound_speed_m_s + 0.5 / changed.range_step_m
+        finer = 1 + 2 * highest * self._steepest * changed.range_step_m
+        length = 1 + math.ceil((lines.length - 1) * finer)
+        changed = replace(changed, range_step_m=changed.range_step_m / finer)
+        everyone = np.arange(lines.channels)
+        first_m = changed.first_range_m.copy()
+        for _ in range(FLIGHT_STEPS):  # so that the first sample stays the first
+            first_m = changed.first_range_m - self.offsets_m(everyone, first_m[:, None])[:, 0]
+        samples = np.empty((lines.channels, length), np.complex64)
+        readout = Readout.of(lines, self.accuracy_db)
+        steps_m = changed.range_step_m * np.arange(length)
+        cycles_per_m = 2 * lines.carrier_hz / sound_speed_m_s
+        scale = lines.sound_speed_m_s / sound_speed_m_s
+        rows = max(1, _CHANGED_AT_ONCE // length)
+        for first in range(0, lines.channels, rows):
+            some = everyone[first : first + rows]
+            range_m = first_m[some, None] + steps_m
+            offset_m = self.offsets_m(some, range_m)
+            turns = cycles_per_m * offset_m
+            values = readout.read(some, scale * (range_m + offset_m))
+            samples[some] = values * np.exp(2j * np.pi * (turns - np.rint(turns)))
+        return replace(changed, samples=samples, first_range_m=first_m)
+
+    @property
+    def _steepest(self) -> float:
+        """Largest change of an offset per metre of range."""
+        half_m = np.maximum(np.diff(self.limits_m), 1e-9) / 2
+        scaled = np.linspace(-1, 1, _NODES)
+        slopes = chebyshev.chebval(scaled, chebyshev.chebder(self.coefficients)) / half_m
+        return float(np.abs(slopes).max())
+
+    def error(self, sample: RaySample, points_m: NDArray[np.float64] | None = None) -> float:
+        """Return the squared phase error of the worst sample pixel, rad^2.
+
+        `points_m` are the apparent positions of the sample pixels, if they differ.
+        """
+        lines = self.antennas(sample.lines, sample.channels)
+        range_m = straight_m(lines, sample.points_m if points_m is None else points_m)
+        return sample.error(lines, range_m + self.offsets_m(sample.channels, range_m.T).T)
+
+
+def _limits_m(sample: RaySample, level_m: float) -> tuple[float, float]:
+    """Return the distances between which a level has all ranges of the visible pixels, metres.
+
+    Pixels above the level are as far away as pixels of the level that are nearer, and pixels below
+    it as far away as farther ones. Other pixels may be a little nearer or farther than those of
+    the sample. Where rays do not reach farther, the limit is the farthest pixel.
+    """
+    distance = sample.distances_m
+    antenna_z = sample.lines.phase_centres_m[:, 2]
+    square = distance**2 + (sample.points_m[:, 2:] - antenna_z) ** 2 - (level_m - antenna_z) ** 2
+    on_level = np.sqrt(np.maximum(square, 0.0))[sample.visible]
+    distance = distance[sample.visible]
+    near, far = min(on_level.min(), distance.min()), max(on_level.max(), distance.max())
+    near, far = near - min(_BEYOND * (far - near), near / 2), far + _BEYOND * (far - near)
+    profile = sample.lines.sound_speed
+    assert profile is not None
+    for z in (antenna_z.min(), antenna_z.max()):
+        if not rays(profile, np.array([far]), z, level_m).exists.all():
+            far = distance.max()
+    return float(near), float(far)
+
+
+def _times(
+    profile: SoundSpeed, distance_m: NDArray[np.float64], z_m: NDArray[np.float64], level_m: float
+) -> NDArray[np.float64]:
+    """Return the travel times from heights to distances on a level; both arrays broadcast."""
+    return times_s(profile, _rays_to(profile, distance_m, z_m, level_m), z_m, level_m)
+
+
+def _rays_to(
+    profile: SoundSpeed, distance_m: NDArray[np.float64], z_m: NDArray[np.float64], level_m: float
+) -> Rays:
+    """Return the rays from heights to distances on a level; raise ValueError if one is missing."""
+    found = rays(profile, distance_m, z_m, level_m)
+    if not found.exists.all():
+        dark = ~found.exists
+        distance, z = (
+            float(np.broadcast_to(each, dark.shape)[dark][0]) for each in (distance_m, z_m)
+        )
+        raise ValueError(f"sound_speed: {shadow(profile, distance, z, level_m)}")
+    return found
+
+
+def _apparent_z(
+    profile: SoundSpeed, distance_m: NDArray[np.float64], z_m: NDArray[np.float64], level_m: float
+) -> NDArray[np.float64]:
+    """Return heights from which straight rays reach a level in the direction of the real ones."""
+    found = _rays_to(profile, distance_m, z_m, level_m)
+    return level_m - distance_m * found.other_slope_s_m / found.slowness_s_m
+
+
+def _scaled(range_m: NDArray[np.float64], limits_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ranges scaled so that the limits become -1 and 1, [n, m]."""
+    low, high = limits_m[:, :1], limits_m[:, 1:]
+    return (2 * range_m - (low + high)) / np.maximum(high - low, 1e-9)

@@ -1,0 +1,112 @@
+"""Apparent pixels: where the pixels of a relief lie in homogeneous water."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.data.threads import in_threads
+from clsas.engine.water.apparent_antennas import Change
+from clsas.engine.water.ray_delays import FLIGHT_STEPS, RaySample
+from clsas.engine.water.ray_times import RayTimes
+from clsas.engine.water.rays import rays
+
+_MOVED_AT_ONCE = 1 << 15  # pixels whose apparent positions are found together; bounds memory
+_NEWTON_STEPS = 3  # the first one leaves micrometres for antennas decimetres apart
+_LEAST_SLOPE = 1e-3  # of range over height; below it a pixel is level with the antennas
+_AROUND = 0.02  # share of a distance, over which the curvature of rays is measured
+
+
+def apparent_grid(grid: Grid, lines: RangeLines, sample: RaySample, change: Change) -> Grid:
+    """Return a grid with apparent positions of the pixels, for directions right at its middle.
+
+    In a linear gradient, rays near the horizontal are parabolas, straight in coordinates that bend
+    with them. Verticals converge there. A pixel at height h above the level therefore moves away
+    from the middle of the grid horizontally by h/R times its distance, where R is the radius of the
+    rays. It moves vertically so that the delay to the nearest channel is right.
+    """
+    profile = lines.sound_speed
+    assert profile is not None
+    # A track at the usual heights, from which each pixel is seen by a channel at the nearest place.
+    usual = int(np.argsort(lines.phase_centres_m[:, 2])[lines.channels // 2])
+    level = _at_heights(lines, float(lines.tx_m[usual, 2]), float(lines.rx_m[usual, 2]))
+    middles_m = sample.middles_m(lines)
+    if np.ptp(lines.tx_m[:, 2]) or np.ptp(lines.rx_m[:, 2]):
+        change = Change.of(level, sample, None, middles_m)
+    centres_m = level.phase_centres_m
+    moved_m = grid.positions_m().reshape(-1, 3).copy()
+    distance_m, nearest = cKDTree(centres_m[:, :2]).query(moved_m[:, :2], workers=-1)
+    bend = _curvature(profile, float(np.median(distance_m)), level.tx_m[0, 2], change.level_m)
+    limits = [(float(each.min()), float(each.max())) for each in (distance_m, moved_m[:, 2])]
+    times = RayTimes(profile, limits[0], limits[1], expected=grid.size)
+    real_z_m = [float(each[0, 2]) for each in (level.tx_m, level.rx_m)]
+
+    def move(first: int) -> None:
+        some = slice(first, first + _MOVED_AT_ONCE)
+        z_m = moved_m[some, 2]
+        delay_s = np.sum([times.between(distance_m[some], z, z_m) for z in real_z_m], axis=0)
+        # The sample shows that there are rays to all pixels that channels see.
+        delay_s = np.where(np.isfinite(delay_s), delay_s, 0.0)
+        channel, away_m = nearest[some], moved_m[some, :2] - sample.centre_m
+        moved_m[some, :2] += bend * (z_m - change.level_m)[:, None] * away_m
+        wanted_m = change.sound_speed_m_s * delay_s / 2
+        range_m = wanted_m.copy()
+        for _ in range(FLIGHT_STEPS):
+            range_m = wanted_m - change.offsets_m(channel, range_m[:, None])[:, 0]
+        aside_m = np.linalg.norm(moved_m[some, :2] - centres_m[channel, :2], axis=1)
+        apparent_z_m = change.tx_z_m[channel], change.rx_z_m[channel]
+        moved_m[some, 2] = _heights(range_m, aside_m, apparent_z_m, change.level_m)
+
+    for _ in in_threads(move, range(0, len(moved_m), _MOVED_AT_ONCE)):
+        pass
+    return Grid.points(moved_m.reshape(*grid.shape, 3), georeference=grid.georeference)
+
+
+def _heights(
+    range_m: NDArray[np.float64],
+    aside_m: NDArray[np.float64],
+    antennas_z_m: tuple[NDArray[np.float64], NDArray[np.float64]],
+    level_m: float,
+) -> NDArray[np.float64]:
+    """Return heights at some ranges of a transmitter and a receiver above each other, [n].
+
+    Newton's method starts at the height that one antenna between them gives.
+    """
+    middle_m = sum(antennas_z_m) / 2
+    side = np.sign(middle_m - level_m)
+    height_m = middle_m - side * np.sqrt(np.maximum(range_m**2 - aside_m**2, 0.0))
+    for _ in range(_NEWTON_STEPS):
+        below_m = [each - height_m for each in antennas_z_m]
+        paths_m = [np.hypot(aside_m, each) for each in below_m]
+        excess_m = sum(paths_m) / 2 - range_m
+        slope = -sum(b / p for b, p in zip(below_m, paths_m, strict=True)) / 2
+        height_m = height_m - np.divide(
+            excess_m, slope, out=np.zeros_like(height_m), where=np.abs(slope) > _LEAST_SLOPE
+        )
+    return height_m
+
+
+def _at_heights(lines: RangeLines, tx_z_m: float, rx_z_m: float) -> RangeLines:
+    """Return the geometry of lines with all antennas at the same heights, at rest."""
+    tx_m, rx_m = np.array(lines.tx_m), np.array(lines.rx_m)
+    tx_m[:, 2], rx_m[:, 2] = tx_z_m, rx_z_m
+    return replace(lines.without_samples(), tx_m=tx_m, rx_m=rx_m, rx_velocity_m_s=None)
+
+
+def _curvature(profile: SoundSpeed, distance_m: float, z_m: float, level_m: float) -> float:
+    """Return the curvature of the rays that reach a level, 1/m; positive if they bend down.
+
+    With the slope T of the ray at the level, D T falls by D^2/(2 R) below the height difference.
+    """
+    around_m = distance_m * np.array([1 - _AROUND, 1 + _AROUND])
+    found = rays(profile, around_m, z_m, level_m)
+    if not found.exists.all():
+        return 0.0
+    fall_m = -around_m * found.other_slope_s_m / found.slowness_s_m
+    return float(-2 * np.diff(fall_m)[0] / np.diff(around_m**2)[0])

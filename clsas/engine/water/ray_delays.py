@@ -1,0 +1,282 @@
+"""Two-way delays along exact rays, of pairs of channels and points and of a sample of a scene."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.grid import Grid, spread_indices
+from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.data.visibility import sines
+from clsas.engine.water.rays import Rays, rays, shadow
+from clsas.engine.water.thinning import FEW, vertical_errors_s
+
+POINTS = 9
+"""Number of sample pixels along either side of a grid; points without rows have its square."""
+
+_PARTS = 8  # along either side of a grid, whose highest and lowest pixels are sampled as well
+
+FLIGHT_STEPS = 4
+"""Iterations for a moving receiver. Each multiplies the error by v/c, which is below 0.05."""
+
+_CHANNELS = 48  # sample channels, beside the first, the last, and those at extreme heights
+_LEVEL = 1e-2  # sine of an angle below which rays count as level
+_BEYOND_BEAM = 0.05  # sine by which a sample pixel may lie outside the beam
+
+
+def at_speed(lines: RangeLines, sound_speed_m_s: float) -> RangeLines:
+    """Return the same lines over ranges of another speed of sound, without a profile."""
+    scale = sound_speed_m_s / lines.sound_speed_m_s
+    return replace(
+        lines,
+        first_range_m=lines.first_range_m * scale,
+        range_step_m=lines.range_step_m * scale,
+        sound_speed_m_s=sound_speed_m_s,
+        sound_speed=None,
+    )
+
+
+def delays_s(
+    lines: RangeLines, channels: NDArray[np.int64], points_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the two-way delays along exact rays of pairs of channels and points, [n], seconds.
+
+    Raises
+    ------
+    ValueError
+        If no direct ray connects a pair.
+    """
+    profile = lines.sound_speed
+    assert profile is not None
+    tx_m, rx_m = lines.tx_m[channels], lines.rx_m[channels]
+    out = one_way_s(profile, points_m, tx_m)
+    if lines.rx_velocity_m_s is None:
+        monostatic = np.array_equal(tx_m, rx_m)
+        return 2 * out if monostatic else out + one_way_s(profile, points_m, rx_m)
+    velocity, delay = lines.rx_velocity_m_s[channels], 2 * out
+    for _ in range(FLIGHT_STEPS):
+        delay = out + one_way_s(profile, points_m, rx_m + velocity * delay[:, None])
+    return delay
+
+
+def one_way_s(
+    profile: SoundSpeed, points_m: NDArray[np.float64], antennas_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the travel times between pairs of points and antennas, [n], seconds.
+
+    Raises
+    ------
+    ValueError
+        If no direct ray connects a pair.
+    """
+    offset = points_m - antennas_m
+    distance = np.hypot(offset[:, 0], offset[:, 1])
+    found = rays(profile, distance, antennas_m[:, 2], points_m[:, 2])
+    if not found.exists.all():
+        dark = np.flatnonzero(~found.exists)
+        nearest = dark[distance[dark].argmin()]
+        place = distance[nearest], antennas_m[nearest, 2], points_m[nearest, 2]
+        raise ValueError(f"sound_speed: {shadow(profile, *map(float, place))}")
+    return times_s(profile, found, antennas_m[:, 2], points_m[:, 2])
+
+
+def times_s(
+    profile: SoundSpeed,
+    found: Rays,
+    one_z_m: NDArray[np.float64],
+    other_z_m: NDArray[np.float64] | float,
+) -> NDArray[np.float64]:
+    """Return the times of rays between heights, with what thinning the profile left out, seconds.
+
+    By Fermat's principle, rays of the thinned profile serve for the given one. Where a ray falls at
+    an angle, its time errs by the vertical error over the sine, at the lower end less the upper.
+    """
+    time_s = found.time_s
+    if len(profile.depth_m) <= FEW:
+        return time_s
+    for z_m, slope_s_m in (one_z_m, found.one_slope_s_m), (other_z_m, found.other_slope_s_m):
+        sine = -slope_s_m * profile.at(z_m)
+        error_s = np.broadcast_to(vertical_errors_s(profile, z_m), sine.shape)
+        time_s = time_s + np.divide(
+            error_s, sine, out=np.zeros_like(sine), where=np.abs(sine) > _LEVEL
+        )
+    return time_s
+
+
+def in_beam(
+    lines: RangeLines,
+    points_m: NDArray[np.float64],
+    beam: BeamWindow,
+    along: NDArray[np.float64],
+    slack_m: float,
+) -> NDArray[np.bool_]:
+    """Return which points may lie in the beam of channels, [points, channels].
+
+    Parameters
+    ----------
+    lines : RangeLines
+    points_m : float64 [points, 3]
+    beam : BeamWindow
+    along : float64 [channels, 3]
+        Directions of the beam.
+    slack_m : float
+        Distance from a point within which pixels count as well.
+    """
+    sine = sines(points_m, lines.phase_centres_m, along).T
+    around = _BEYOND_BEAM + slack_m / np.maximum(straight_m(lines, points_m), 1e-30)
+    return (sine > beam.limits[0] - around) & (sine < beam.limits[1] + around)
+
+
+@dataclass(frozen=True, eq=False)
+class RaySample:
+    """Sample pixels and channels with their exact ranges, [points, channels].
+
+    Attributes
+    ----------
+    lines : RangeLines
+        Lines of the sample channels, with the profile.
+    channels : int64 [channels]
+    pixels : int64 [points]
+        Indices of the pixels.
+    points_m : float64 [points, 3]
+        Their positions.
+    visible : bool
+        False for pixels outside the beam or beyond the ends of a line.
+    delay_s : float64
+        Two-way delays along exact rays; 0 where not visible.
+    """
+
+    lines: RangeLines
+    channels: NDArray[np.int64]
+    pixels: NDArray[np.int64]
+    points_m: NDArray[np.float64]
+    visible: NDArray[np.bool_]
+    delay_s: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, lines: RangeLines, grid: Grid, beam: BeamWindow | None) -> RaySample:
+        """Return a sample of lines and grid."""
+        extreme = [f(each[:, 2]) for each in (lines.tx_m, lines.rx_m)
+                   for f in (np.argmin, np.argmax)]  # fmt: skip
+        some = np.union1d(
+            some_channels(lines.channels, _CHANNELS), [0, lines.channels - 1, *extreme]
+        ).astype(np.int64)
+        part, pixels = lines.select(some), sample_pixels(grid)
+        points_m = grid.at(pixels)
+        assert part.sound_speed is not None
+        # Sound is faster or slower than the nominal speed, and pixels lie around the sample.
+        range_m = straight_m(part, points_m)
+        ratio = part.sound_speed_m_s / part.sound_speed.speed_m_s
+        slack_m = float(np.ptp(points_m, axis=0).max()) / max(POINTS - 1, 1)
+        visible = range_m * ratio.max() + slack_m >= part.first_range_m
+        visible &= range_m * ratio.min() - slack_m <= part.last_range_m
+        if beam is not None:
+            visible &= in_beam(part, points_m, beam, beam.directions(lines)[some], slack_m)
+        return cls(part, some, pixels, points_m, visible, np.zeros(visible.shape)).at(points_m)
+
+    def at(self, points_m: NDArray[np.float64]) -> RaySample:
+        """Return the same pairs of channels and points, with the points elsewhere.
+
+        Raises
+        ------
+        ValueError
+            If no direct ray connects a visible pair.
+        """
+        delay_s = np.zeros(self.visible.shape)
+        point, channel = np.nonzero(self.visible)
+        delay_s[self.visible] = delays_s(self.lines, channel, points_m[point])
+        return replace(self, points_m=points_m, delay_s=delay_s)
+
+    @property
+    def distances_m(self) -> NDArray[np.float64]:
+        """Horizontal distances of the points from the phase centres."""
+        offset = self.points_m[:, None, :2] - self.lines.phase_centres_m[:, :2]
+        return np.hypot(offset[..., 0], offset[..., 1])
+
+    @property
+    def middle_m(self) -> NDArray[np.float64]:
+        """Middle of the visible distances, [1]."""
+        distance = self.distances_m[self.visible]
+        return np.array([max((distance.min() + distance.max()) / 2, 1e-3)])
+
+    @property
+    def centre_m(self) -> NDArray[np.float64]:
+        """Middle of the pixels that are visible, x and y."""
+        seen_m = self.points_m[self.visible.any(axis=1), :2]
+        return (seen_m.min(axis=0) + seen_m.max(axis=0)) / 2
+
+    def middles_m(self, lines: RangeLines) -> NDArray[np.float64]:
+        """Return the distance of every channel from the middle of the grid, [channels]."""
+        distance = self.distances_m[self.visible]
+        offset_m = lines.phase_centres_m[:, :2] - self.centre_m
+        return np.clip(np.hypot(*offset_m.T), max(distance.min(), 1e-3), distance.max())
+
+    def mean_speed_m_s(self) -> float:
+        """Return the speed with which straight rays fit the delays best, by least squares."""
+        lines, speed = self.lines, self.lines.sound_speed_m_s
+        for _ in range(2):  # the positions of moving receivers depend a little on the speed
+            range_m = pairwise_range_m(
+                self.points_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, speed
+            )[self.visible]
+            delay = self.delay_s[self.visible]
+            speed = float(2 * (range_m @ delay) / (delay @ delay))
+        return speed
+
+    def error(self, lines: RangeLines, range_m: NDArray[np.float64]) -> float:
+        """Return the mean squared phase error of the worst pixel if its ranges are others.
+
+        Parameters
+        ----------
+        lines : RangeLines
+            Lines in which the ranges apply.
+        range_m : float64 [points, channels]
+
+        Returns
+        -------
+        float
+            Mean over the channels that see the pixel, rad^2: its relative error power.
+        """
+        square = np.where(
+            self.visible, (2 * range_m / lines.sound_speed_m_s - self.delay_s) ** 2, 0.0
+        )
+        seen = np.maximum(np.count_nonzero(self.visible, axis=1), 1)
+        highest_hz = lines.carrier_hz + lines.sound_speed_m_s / (2 * lines.range_step_m)
+        return float((2 * np.pi * highest_hz) ** 2 * (square.sum(axis=1) / seen).max())
+
+
+def sample_pixels(grid: Grid) -> NDArray[np.int64]:
+    """Return the indices of sample pixels, [n].
+
+    They are spread evenly, edges included. On a grid with relief, the highest and the lowest pixel
+    of each of 64 parts follow, so that no rock lies unseen between the others.
+    """
+    spread = spread_indices(grid, POINTS if len(grid.shape) == 2 else POINTS**2)
+    if grid.is_planar:
+        return spread
+    height_m = grid.height_m if grid.points_m is None else grid.points_m[..., 2]
+    assert height_m is not None
+    number = np.arange(grid.size).reshape(grid.shape)
+    sides = [min(n, _PARTS if len(grid.shape) == 2 else _PARTS**2) for n in grid.shape]
+    slices = [
+        [slice(i * n // side, (i + 1) * n // side) for i in range(side)]
+        for n, side in zip(grid.shape, sides, strict=True)
+    ]
+    extreme = [
+        number[part].flat[find(height_m[part])]
+        for part in itertools.product(*slices)
+        for find in (np.argmax, np.argmin)
+    ]
+    return np.union1d(spread, extreme)
+
+
+def straight_m(lines: RangeLines, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the ranges along straight rays, [points, channels], metres."""
+    return pairwise_range_m(
+        points_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
+    )

@@ -1,1 +1,0 @@
-"""Sonars: pulses and elements, tracks, sampling limits, beam weights and visibility."""
