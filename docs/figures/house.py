@@ -14,13 +14,13 @@ FLOORS = (
     ),
     ((("exact", "the image, whatever it takes\ntiles, backprojection"),), RED),
     ((("factorized", "the image, fast\ntrack, plan, tree, stages, leaves"),), RED),
-    ((("simulation", "what would be received?\nscenes, simulator"),), TEAL),
     (
         (
-            ("navigation", "where was the sonar?\nmicronavigation, autofocus"),
-            ("inspection", "is the recording sound?\nlevels, spacing, phase sign"),
-            ("measures", "how good is the image?\nquality, tradeoff, effects"),
-            ("interferometry", "how high is the seabed?\ninterferograms, heights"),
+            ("simulation", "what would be received?\nscenes, simulator"),
+            ("navigation", "where was the sonar?\ntracks, autofocus"),
+            ("inspection", "is the recording sound?\nlevels, phase sign"),
+            ("measures", "how good is the image?\nquality, effects"),
+            ("interferometry", "how high is it?\nheights"),
         ),
         BLUE,
     ),
@@ -47,11 +47,10 @@ FLOWS = (
     "spectra, rays, buffers",
     "exact images",
     "plans, images",
-    "lines of known scenes",
     "corrected lines, findings, figures",
     "stored images, pictures",
 )
-WIDTH, HEIGHT, STEP = 9.6, 0.92, 1.4
+WIDTH, HEIGHT, STEP = 11.0, 0.92, 1.4
 
 figure, axes = canvas(WIDTH, STEP * len(FLOORS) + 0.05)
 for floor, (rooms, colour) in enumerate(FLOORS):
