@@ -47,7 +47,9 @@ def test_the_seed_that_is_printed_repeats_the_order():
 
     def order(*options):
         command = [sys.executable, "-m", "pytest", "-vv", "-p", "no:cacheprovider"]
-        files = [f"tests/engine/data/test_{name}.py" for name in ("image", "lines", "pings", "tables")]
+        files = [
+            f"tests/engine/data/test_{name}.py" for name in ("image", "lines", "pings", "tables")
+        ]
         done = subprocess.run(
             [*command, *options, *files], cwd=TESTS.parent, capture_output=True, text=True
         )

@@ -153,7 +153,7 @@ def test_exact(name, asked_db, platform, recwarn):
     prepared = prepare(
         known.lines, known.grid, device=platform, accuracy_db=asked_db, beam=known.beam
     )
-    bound_db = promised(asked_db, prepared.predicted_error_db, recwarn)
+    bound_db = promised(asked_db, prepared.error_db, recwarn)
     assert known.error_db(execute(prepared).pixels) <= bound_db
 
 

@@ -11,8 +11,9 @@ from typing import Any
 
 from clsas.engine.data import validate
 
-# Most memory that parsing a byte takes, which tests/engine/data/test_reading.py measures. The worst cases
-# are empty lists in JSON, nested tables in TOML, one long heading over columns, and short rows.
+# Most memory that parsing a byte takes, which tests/engine/data/test_reading.py measures. The worst
+# cases are empty lists in JSON, nested tables in TOML, one long heading over columns, and short
+# rows.
 JSON_BYTES = 32
 TOML_BYTES = 500
 COLUMNS_BYTES = 40

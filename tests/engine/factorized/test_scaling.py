@@ -172,7 +172,7 @@ def test_a_device_is_measured(platform):
 def test_images_whose_times_do_not_repeat_are_timed_for_longer(platform, monkeypatch):
     """Runs take 20 ms. Kernels of pixels off the plane take longer from run to run."""
     clock = itertools.count()  # ticks of a microsecond
-    runs = {"Exact": 0, "Exact off the plane": 0, "Plan": 0}
+    runs = {"ExactPrediction": 0, "ExactPrediction off the plane": 0, "Plan": 0}
 
     def run(image, device):
         for _ in range(20_000):
@@ -188,7 +188,7 @@ def test_images_whose_times_do_not_repeat_are_timed_for_longer(platform, monkeyp
     monkeypatch.setattr(costs.time, "perf_counter", lambda: 1e-6 * next(clock))
     costs.measure(platform)
     assert runs == {
-        "Exact": pytest.approx(6, abs=1),
-        "Exact off the plane": pytest.approx(6 + 15, abs=2),
+        "ExactPrediction": pytest.approx(6, abs=1),
+        "ExactPrediction off the plane": pytest.approx(6 + 15, abs=2),
         "Plan": pytest.approx(6, abs=1),
     }

@@ -12,6 +12,7 @@ from factorizing import (
     over,
     swaying,
 )
+from studies.scaling import scaled
 
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.geometry import bistatic_range_m
@@ -32,7 +33,6 @@ from clsas.engine.factorized.tree import (
 )
 from clsas.engine.forming import scene_of_plan
 from clsas.engine.imaging import backproject, factorize, plan
-from clsas.trials import cases
 
 HANN = BEAMS[0]
 SIDES = ((64, 48), (32, 16), (16, 4))
@@ -187,14 +187,14 @@ def test_visible_stretches_are_hardly_longer_than_they_must_be(beam, range_m):
 @pytest.fixture(scope="module")
 def wide_plan():
     """A plan with a narrow beam, for a scene that extends past both ends of the track."""
-    case = cases.scaled(512)
+    case = scaled(512)
     lines, grid = case.lines(), case.grid
     return plan(lines, grid, tolerance_db=-40, beam=case.beam, costs=EXACT_IS_SLOW)
 
 
 @pytest.fixture(scope="module")
 def wide(wide_plan):
-    case, chosen = cases.scaled(512), wide_plan
+    case, chosen = scaled(512), wide_plan
     lines, grid = case.lines(), case.grid
     return geometry_of(scene_of_plan(lines, grid, chosen), chosen.factorization)
 
@@ -210,7 +210,7 @@ def any_track(request, wide):
     """The same geometry, and one with a gap in the track longer than a root and its beam."""
     if request.param == "whole":
         return wide
-    case = cases.scaled(512)
+    case = scaled(512)
     lines = case.lines()
     lines = lines.select(np.flatnonzero(np.abs(lines.tx_m[:, 0] - 2) > 8))
     beam = BeamWindow(3.0, "hann")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from bent import ranges_m, travel_times
 from cases import along_x, lines_over
+from rays import rays
 
 import clsas
 from clsas import BeamWindow, ClsasWarning, Grid, SoundSpeed
@@ -12,7 +13,6 @@ from clsas.engine.data.simplify import REFRACTION
 from clsas.engine.exact.layout import gather
 from clsas.engine.water.ray_delays import RaySample, delays_s, sample_pixels
 from clsas.engine.water.refraction import homogeneous
-from clsas.trials import oracle
 
 PROFILE = SoundSpeed([0, 12, 15, 60], [1505, 1504, 1494, 1490])
 SEABED = -25.0
@@ -214,7 +214,7 @@ def test_delays_in_profiles_of_many_depths(speed_m_s, tx):
     lines = over(tx=tx, profile=profile)
     channel, points = np.arange(0, 150, 20), GRID.spread(3)[:8]
     distance_m = np.hypot(*(points - tx[channel])[:, :2].T)
-    time_s, _ = oracle.rays(DEPTHS, speed_m_s, distance_m, -tx[channel, 2], 25.0)
+    time_s, _ = rays(DEPTHS, speed_m_s, distance_m, -tx[channel, 2], 25.0)
     assert np.abs(delays_s(lines, channel, points) - 2 * time_s).max() < 2.5e-10
     assert error_db(lines)[0] < -78
 
