@@ -25,13 +25,13 @@ def constants(device: Device) -> list[Constant]:
     """Return the constants that affect imaging times on a device."""
     batch = "_CACHED_BYTES" if device.info.kind == "cpu" else "_BATCH_BYTES"
     names = [
-        ("exact.run", "_CHANNELS_AT_ONCE"),
-        ("exact.run", "_PART_BYTES"),
-        ("factorized.costs", batch),
-        ("factorized.stages", "_GROUPS_PER_UNIT"),
+        ("engine.exact.run", "_CHANNELS_AT_ONCE"),
+        ("engine.exact.run", "_PART_BYTES"),
+        ("engine.factorized.costs", batch),
+        ("engine.factorized.stages", "_GROUPS_PER_UNIT"),
     ]
     if device.info.width == 1:
-        names += [("factorized.stages", "_GROUP"), ("opencl.upsampling", "_GROUP")]
+        names += [("engine.factorized.stages", "_GROUP"), ("engine.device.upsampling", "_GROUP")]
     return [Constant(importlib.import_module(f"clsas.{room}"), name) for room, name in names]
 
 
