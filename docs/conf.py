@@ -51,13 +51,13 @@ autosummary_filename_map = {
 autosummary_filename_map |= {
     f"clsas.{path}": f"clsas.{path.rpartition('.')[2]}"
     for path in (
-        "plans.factorization.ExactImage",
-        "plans.factorization.Factorization",
-        "plans.predictions.Prediction",
+        "engine.factorized.plan.ExactImage",
+        "engine.factorized.plan.Factorization",
+        "engine.factorized.plan.Prediction",
         "measures.cuts.Cut",
         "measures.quality.PointResponse",
         "mosaics.record.Record",
-        "opencl.device.DeviceInfo",
+        "engine.device.device.DeviceInfo",
     )
 }
 
