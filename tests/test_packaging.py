@@ -91,7 +91,7 @@ def test_kernels_scenes_and_types_travel_in_the_wheel(wheel):
 def test_the_wheel_images_on_its_own(wheel, tmp_path):
     program = """
 import sys, clsas
-from clsas.engine.device.device import kernel_source
+from clsas.engine.device.kernels import kernel_source
 print(clsas.__file__)
 origin = [[0.0, 0.0, 0.0]]
 lines = clsas.RangeLines([[0j, 0j, 1, 0j, 0j]], 1.0, 0.1, origin, origin, 0, 1500)

@@ -92,7 +92,7 @@ EVERY_VARIANT = {
     "test_unused_memory.py::test_what_unused_memory_holds_does_not_matter": (
         "exact--80", "factorized", "plane-half",
     ),
-    "test_upsampling.py::test_the_error_is_as_predicted": ("--60",),
+    "test_buffers.py::test_the_error_is_as_predicted": ("--60",),
     "test_kernels.py::test_the_vector_widths_give_their_values": EVERY_CASE,
     # Plans know a device's width, without running anything.
     "test_planner.py::test_half_precision_is_for_tolerances_and_devices_that_allow_it": EVERY_CASE,
@@ -117,8 +117,8 @@ SOME_ELSEWHERE = {
 
 
 EVERY_CHANGE = (
-    "test_device.py", "test_kernels.py", "test_phases.py", "test_unused_memory.py",
-    "test_upsampling.py", "test_stages.py::test_overlapping_pings_of_a_swaying_array",
+    "test_buffers.py", "test_device.py", "test_kernels.py", "test_unused_memory.py",
+    "test_stages.py::test_overlapping_pings_of_a_swaying_array",
 )  # fmt: skip
 """Tests whose repetitions run for every change; those of others run with all tests only."""
 

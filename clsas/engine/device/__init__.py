@@ -1,1 +1,1 @@
-"""OpenCL: devices, kernels, buffers, upsampling, sine and cosine."""
+"""OpenCL: devices, kernels, buffers."""

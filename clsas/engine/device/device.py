@@ -1,4 +1,7 @@
-"""Choice of an OpenCL device, building of kernels, and profiling."""
+"""OpenCL devices: choosing and opening one, and running kernels on it.
+
+Errors say what is missing: a driver, a private cache for PoCL, or a process that was not forked.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,14 @@ import math
 import os
 import re
 import statistics
+import tempfile
 import threading
 import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from textwrap import indent
 from typing import Any
 
@@ -22,28 +27,42 @@ import pyopencl as cl
 from numpy.typing import DTypeLike
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.cache import made_private, private_folder, user_caches
+from clsas.engine.data.extras import install_command
 from clsas.engine.device.kernels import Kernel, kernel_parameters, kernel_source, whole_source
-from clsas.engine.device.refusals import (
-    POCL,
-    DeviceError,
-    check_cache,
-    check_process,
-    no_device,
-    no_match,
-    prepare_caches,
-)
 
 ENVIRONMENT_VARIABLE = "CLSAS_DEVICE"
 KINDS = ("gpu", "cpu", "accelerator")
 """Kinds of device, in the order in which they are preferred."""
-_PLATFORMS = {"pocl": "portable computing language"}
+POCL = "Portable Computing Language"
+"""Name of PoCL's platform."""
+_PLATFORMS = {"pocl": POCL.lower()}
 """Common names of platforms that are not part of the full name, in lower case."""
-_ALIGNMENT = 4096  # bytes: size of a page
+
+_HOW_TO_GET_A_DEVICE = """\
+No OpenCL device was found. Any one of the following provides one:
+  - a CPU driver from PyPI:  {command}
+  - the vendor's driver of your GPU or CPU, which installs an .icd file in /etc/OpenCL/vendors;
+    PyOpenCL's wheel looks there and in {folder}
+    (copy or write an .icd file there if the driver is part of your Python environment:
+    it is one line, the path of the driver's shared library).
+  The environment variable OCL_ICD_VENDORS, if it is set, replaces these folders."""
+
+_POCL_VARIABLE = "POCL_CACHE_DIR"
+# Space that PoCL needs to build a kernel. Those of an image took up to 1.2 MiB at a time, most of
+# which PoCL frees again. If less is left, LLVM ends the process.
+_KERNEL_BYTES = 4 << 20
 # Built kernels that a device keeps. They take up to 0.6 MiB each with PoCL, and up to 4 MiB with
 # Intel's runtime. An image uses 1 to 5 kernels.
 _MOST_KERNELS = 32
+_ALIGNMENT = 4096  # bytes: size of a page
 
-_GROUP = 64  # work-items of a work-group on a GPU: two warps, or a wavefront
+GROUP = 64
+"""Work-items of a work-group on a GPU: two warps, or a wavefront."""
+
+
+class DeviceError(RuntimeError):
+    """Error if no OpenCL device matches, a kernel cannot be built, or the process was forked."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +132,205 @@ class KernelTimes:
     total_s: float
 
 
+def open_device(request: Device | str | int | None = None) -> Device:
+    """Return `request` if it is an open device, or else the device that `choose` returns.
+
+    Every device is opened once per process.
+    """
+    if isinstance(request, Device):
+        return request
+    return _open(choose(request)[0].index)
+
+
+def choose(request: str | int | None = None) -> tuple[DeviceInfo, str]:
+    """Return the device that a request names, and the reason for the choice.
+
+    Parameters
+    ----------
+    request : str or int, optional
+        An index of `list_devices()`, a kind ("gpu", "cpu" or "accelerator"), a platform or part of
+        its name ("pocl", "intel", "nvidia", "amd"), or part of "platform: name". Upper and lower
+        case are the same. The first of these that matches is used, so that "intel" is Intel's
+        platform even if other platforms also support the Intel CPU. By default the environment
+        variable CLSAS_DEVICE is the request. If several devices match, or there is no request, the
+        first GPU is chosen, or else the CPU with the widest vectors.
+
+    Raises
+    ------
+    DeviceError
+        If there is no device, or none that matches. The message says how to get a device, or lists
+        the available ones.
+    """
+    devices = list_devices()
+    if not devices:
+        if why := _why_without_pocl(devices):
+            raise DeviceError(f"No OpenCL device was found: {why}")
+        folder, command = Path(cl.__file__).parent / ".libs", install_command("pocl")
+        raise DeviceError(_HOW_TO_GET_A_DEVICE.format(folder=folder, command=command))
+    source = ""
+    if request is None and os.environ.get(ENVIRONMENT_VARIABLE):
+        request = os.environ[ENVIRONMENT_VARIABLE]
+        source = f" by {ENVIRONMENT_VARIABLE}"
+    if request is None:
+        chosen = _first(devices)
+        if chosen.kind == "gpu":
+            return chosen, "the first GPU"
+        widest = f" with vectors of {chosen.width}" if chosen.width > 1 else ""
+        others = ". ".join(filter(None, ("there is no GPU", _prepare_caches())))
+        return chosen, f"the first {chosen.kind.upper()}{widest}; {others}"
+    if isinstance(request, str) and re.fullmatch(r"\s*[0-9]+\s*", request, re.ASCII):
+        request = int(request)
+    if isinstance(request, (int, np.integer)) and not isinstance(request, bool):
+        matching = [info for info in devices if info.index == request]
+    elif isinstance(request, str):
+        matching = _named(request.strip().lower(), devices)
+    else:
+        raise TypeError(f"device must be a name, an index or None, got {validate.shown(request)}")
+    if not matching:
+        have = "; ".join(f"{info.index}: {info.label}" for info in devices)
+        why = _why_without_pocl(devices)
+        raise DeviceError(
+            f"No device matches {validate.shown(request)}, which was requested{source}. "
+            f"Available: {have}{why and f'. {why}'}"
+        )
+    return _first(matching), f"requested{source} as {request!r}"
+
+
+def _first(devices: Sequence[DeviceInfo]) -> DeviceInfo:
+    """Return the preferred device of several: a GPU, or else the CPU with the widest vectors."""
+    return min(devices, key=lambda info: (KINDS.index(info.kind), -info.width, info.index))
+
+
+def _named(name: str, devices: Sequence[DeviceInfo]) -> list[DeviceInfo]:
+    """Return the devices of a kind, or else of a platform, or else with a name in their label."""
+    if not name:
+        return []
+    names = name, _PLATFORMS.get(name, name)
+    for matches in (
+        lambda info: info.kind == name,
+        lambda info: any(each in info.platform.lower() for each in names),
+        lambda info: any(each in info.label.lower() for each in names),
+    ):
+        if matching := [info for info in devices if matches(info)]:
+            return matching
+    return []
+
+
+def _why_without_pocl(devices: Sequence[DeviceInfo]) -> str:
+    """Return why PoCL has no device although it is installed; "" if it has one, or is not."""
+    if any(info.platform == POCL for info in devices):
+        return ""
+    return _pocl_problem() if any(each.name == POCL for each in _platforms()) else ""
+
+
+def list_devices() -> list[DeviceInfo]:
+    """Return all OpenCL devices of all platforms.
+
+    Returns
+    -------
+    list of DeviceInfo
+        Empty if there is no device.
+
+    Raises
+    ------
+    DeviceError
+        In a process that was forked after its parent had used OpenCL.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> for device in clsas.list_devices():
+    ...     print(device.index, device.label)  # doctest: +SKIP
+    0 Portable Computing Language: pthread-AMD EPYC 7763 64-Core Processor
+    """
+    return [_describe(index, device) for index, device in enumerate(_raw_devices())]
+
+
+def _raw_devices() -> list[cl.Device]:
+    _check_process()
+    no_pocl = _prepare_caches()
+    devices = []
+    for platform in _platforms():
+        if no_pocl and platform.name == POCL:
+            continue
+        try:
+            devices += platform.get_devices()
+        except cl.RuntimeError:  # a platform without a device
+            continue
+    return devices
+
+
+def _platforms() -> list[cl.Platform]:
+    try:
+        return cl.get_platforms()
+    except cl.LogicError:  # the loader found no driver at all
+        return []
+
+
+def _describe(index: int, device: cl.Device) -> DeviceInfo:
+    is_cpu = bool(device.type & cl.device_type.CPU)
+    is_gpu = bool(device.type & cl.device_type.GPU)
+    platform = device.platform.name
+    width, permute, stage_width = 1, False, 1
+    if is_cpu and platform.startswith("Intel"):
+        # Intel's compiler vectorises exact images across work-items, which is faster than explicit
+        # vectors. It fails to do so in stages, which are then twelve times as slow as with explicit
+        # vectors.
+        lanes = device.native_vector_width_float
+        stage_width = lanes if lanes in (8, 16) else 4
+    elif is_cpu:
+        width, permute = _compiled_vectors(device)
+        stage_width = width
+    return DeviceInfo(
+        index=index,
+        platform=platform,
+        name=device.name.strip(),
+        driver=device.driver_version,
+        kind="gpu" if is_gpu else "cpu" if is_cpu else "accelerator",
+        compute_units=device.max_compute_units,
+        memory_bytes=device.global_mem_size,
+        max_buffer_bytes=device.max_mem_alloc_size,
+        fp64="cl_khr_fp64" in device.extensions.split(),
+        width=width,
+        stage_width=stage_width,
+        permute=permute,
+    )
+
+
+@functools.cache
+def _compiled_vectors(device: cl.Device) -> tuple[int, bool]:
+    """Return the number of floats in a vector of a CPU, and whether its compiler permutes them."""
+    try:
+        context = cl.Context([device])
+        kernel = cl.Kernel(_built(context, kernel_source("vector_size.cl")), "vector_size")
+        size = kernel.get_work_group_info(cl.kernel_work_group_info.COMPILE_WORK_GROUP_SIZE, device)
+    except (cl.Error, DeviceError):  # the error is reported when a kernel is built for an image
+        return 4, False
+    lanes, permute, _ = size
+    return (lanes, permute == 2) if lanes in (8, 16) else (4, False)
+
+
+@functools.cache
+def _open(index: int) -> Device:
+    device = _raw_devices()[index]
+    context = cl.Context([device])
+    queue = cl.CommandQueue(context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+    info = _describe(index, device)
+    return Device(info, context, queue, cl.CommandQueue(context))
+
+
+def _opened_alike(info: DeviceInfo) -> Device:
+    """Return the device of this process that matches a description, to unpickle a device."""
+    alike = [each for each in list_devices() if each.label == info.label]
+    if not alike:
+        known = ", ".join(each.label for each in list_devices())
+        raise DeviceError(
+            f"the pickled device {info.label!r} is not on this machine, which has: {known}"
+        )
+    same = [each for each in alike if each.index == info.index] or alike
+    return _open(same[0].index)
+
+
 @dataclass(eq=False)
 class Device:
     """Open device: its context, its queues and the kernels built so far.
@@ -129,6 +347,9 @@ class Device:
     _kernels: dict[tuple, Kernel] = field(default_factory=dict, repr=False)
     _build_times_s: list[float] = field(default_factory=list, repr=False)
     _events: list[tuple[str, cl.Event]] | None = field(default=None, repr=False)
+    # Held from when the arguments of a kernel are set until it is enqueued, because the kernel
+    # stores them.
+    _lock: threading.RLock = field(default_factory=threading.RLock, repr=False)
 
     def __repr__(self) -> str:
         """Return the platform and the name."""
@@ -137,10 +358,6 @@ class Device:
     def __reduce__(self) -> tuple[Callable[[DeviceInfo], Device], tuple[DeviceInfo]]:
         """Pickle the description only. The process that unpickles it opens its own device."""
         return _opened_alike, (self.info,)
-
-    # Held from when the arguments of a kernel are set until it is enqueued, because the kernel
-    # stores them.
-    _lock: threading.RLock = field(default_factory=threading.RLock, repr=False)
 
     def for_stages(self) -> Device:
         """Return the device with the width of factorized images; kernels and profile are shared."""
@@ -174,7 +391,7 @@ class Device:
         DeviceError
             If the driver's compiler refuses the kernel. The message contains the compiler's log.
         """
-        check_process()
+        _check_process()
         key = (name, *sorted(options.items()))
         with self._lock:
             kernel = self._kernels.pop(key, None) or self._build(name, options)
@@ -238,11 +455,11 @@ class Device:
         TypeError
             If an argument is missing, unknown, or does not fit its parameter.
         """
-        check_process()
+        _check_process()
         if local is None and self.info.width > 1:
             local = (1,) * len(size)
         elif local is None and self.info.kind == "gpu":
-            local = (math.gcd(size[0], _GROUP), *[1] * (len(size) - 1))
+            local = (math.gcd(size[0], GROUP), *[1] * (len(size) - 1))
         ordered = kernel.ordered(arguments)
         with self._lock:
             event = kernel.compiled(self.queue, size, local, *ordered, wait_for=wait_for)
@@ -252,7 +469,7 @@ class Device:
 
     def in_whole_groups(self, items: int) -> int:
         """Return a number of work-items, rounded up to whole work-groups on a GPU."""
-        return -(-items // _GROUP) * _GROUP if self.info.kind == "gpu" else items
+        return -(-items // GROUP) * GROUP if self.info.kind == "gpu" else items
 
     @contextlib.contextmanager
     def profile(self) -> Iterator[dict[str, KernelTimes]]:
@@ -274,13 +491,13 @@ class Device:
 
     def finish(self) -> None:
         """Wait until the device has finished everything that was enqueued."""
-        check_process()
+        _check_process()
         self.uploads.finish()
         self.queue.finish()
 
     def buffer(self, bytes_: int) -> cl.Buffer:
         """Return an uninitialised buffer. Keep it until the device is done with it."""
-        check_process()
+        _check_process()
         flags, bytes_ = cl.mem_flags.READ_WRITE, max(int(bytes_), 4)
         if self.info.kind != "cpu":
             return cl.Buffer(self.context, flags, bytes_)
@@ -293,14 +510,14 @@ class Device:
 
         Keep both, and do not change the array, until the device is done with them.
         """
-        check_process()
+        _check_process()
         how = cl.mem_flags.USE_HOST_PTR if self.info.kind == "cpu" else cl.mem_flags.COPY_HOST_PTR
         access = cl.mem_flags.READ_WRITE if array.flags.writeable else cl.mem_flags.READ_ONLY
         return cl.Buffer(self.context, access | how, hostbuf=array)
 
     def upload(self, array: np.ndarray) -> cl.Buffer:
         """Return a buffer with a copy of `array`, or an uninitialised buffer if it is empty."""
-        check_process()
+        _check_process()
         if not array.size:
             return self.buffer(0)
         flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
@@ -315,14 +532,6 @@ class Device:
         return buffer
 
 
-def aligned(make: Callable[..., np.ndarray], shape: tuple[int, ...], kind: DTypeLike) -> np.ndarray:
-    """Return an array made by np.empty or np.zeros that begins at the start of a page."""
-    count = math.prod(shape) * np.dtype(kind).itemsize
-    memory = make(count + _ALIGNMENT, np.uint8)
-    start = -memory.ctypes.data % _ALIGNMENT
-    return memory[start : start + count].view(kind).reshape(shape)
-
-
 def _built(context: cl.Context, text: str, options: Sequence[str] = ()) -> cl.Program:
     """Return a built program.
 
@@ -333,191 +542,84 @@ def _built(context: cl.Context, text: str, options: Sequence[str] = ()) -> cl.Pr
     pyopencl.RuntimeError
         If the driver's compiler refuses the program.
     """
-    check_cache(context.devices[0].platform.name)
+    if context.devices[0].platform.name == POCL and (why := _pocl_problem()):
+        raise DeviceError(why)
     with warnings.catch_warnings():
         # Some compilers print a greeting. If a build fails, the error contains the log in any case.
         warnings.simplefilter("ignore", cl.CompilerWarning)
         return cl.Program(context, text).build(list(options))
 
 
-def _describe(index: int, device: cl.Device) -> DeviceInfo:
-    is_cpu = bool(device.type & cl.device_type.CPU)
-    is_gpu = bool(device.type & cl.device_type.GPU)
-    platform = device.platform.name
-    width, permute, stage_width = 1, False, 1
-    if is_cpu and platform.startswith("Intel"):
-        # Intel's compiler vectorises exact images across work-items, which is faster than explicit
-        # vectors. It fails to do so in stages, which are then twelve times as slow as with explicit
-        # vectors.
-        lanes = device.native_vector_width_float
-        stage_width = lanes if lanes in (8, 16) else 4
-    elif is_cpu:
-        width, permute = _compiled_vectors(device)
-        stage_width = width
-    return DeviceInfo(
-        index=index,
-        platform=platform,
-        name=device.name.strip(),
-        driver=device.driver_version,
-        kind="gpu" if is_gpu else "cpu" if is_cpu else "accelerator",
-        compute_units=device.max_compute_units,
-        memory_bytes=device.global_mem_size,
-        max_buffer_bytes=device.max_mem_alloc_size,
-        fp64="cl_khr_fp64" in device.extensions.split(),
-        width=width,
-        stage_width=stage_width,
-        permute=permute,
-    )
+def aligned(make: Callable[..., np.ndarray], shape: tuple[int, ...], kind: DTypeLike) -> np.ndarray:
+    """Return an array made by np.empty or np.zeros that begins at the start of a page."""
+    count = math.prod(shape) * np.dtype(kind).itemsize
+    memory = make(count + _ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % _ALIGNMENT
+    return memory[start : start + count].view(kind).reshape(shape)
 
 
-@functools.cache
-def _compiled_vectors(device: cl.Device) -> tuple[int, bool]:
-    """Return the number of floats in a vector of a CPU, and whether its compiler permutes them."""
-    try:
-        context = cl.Context([device])
-        kernel = cl.Kernel(_built(context, kernel_source("vector_size.cl")), "vector_size")
-        size = kernel.get_work_group_info(cl.kernel_work_group_info.COMPILE_WORK_GROUP_SIZE, device)
-    except (cl.Error, DeviceError):  # the error is reported when a kernel is built for an image
-        return 4, False
-    lanes, permute, _ = size
-    return (lanes, permute == 2) if lanes in (8, 16) else (4, False)
+def _check_process() -> None:
+    """Raise DeviceError in a process that was forked after its parent had used OpenCL.
 
-
-def _raw_devices() -> list[cl.Device]:
-    check_process()
-    no_pocl = prepare_caches()
-    try:
-        platforms = cl.get_platforms()
-    except cl.LogicError:  # the loader found no driver at all
-        return []
-    devices = []
-    for platform in platforms:
-        if no_pocl and platform.name == POCL:
-            continue
-        try:
-            devices += platform.get_devices()
-        except cl.RuntimeError:  # a platform without a device
-            continue
-    return devices
-
-
-def list_devices() -> list[DeviceInfo]:
-    """Return all OpenCL devices of all platforms.
-
-    Returns
-    -------
-    list of DeviceInfo
-        Empty if there is no device.
-
-    Raises
-    ------
-    DeviceError
-        In a process that was forked after its parent had used OpenCL.
-
-    Examples
-    --------
-    >>> import clsas
-    >>> for device in clsas.list_devices():
-    ...     print(device.index, device.label)  # doctest: +SKIP
-    0 Portable Computing Language: pthread-AMD EPYC 7763 64-Core Processor
+    The threads of drivers exist only in the parent, and the forked process would wait for them for
+    ever.
     """
-    return [_describe(index, device) for index, device in enumerate(_raw_devices())]
-
-
-def choose(request: str | int | None = None) -> tuple[DeviceInfo, str]:
-    """Return the device that a request names, and the reason for the choice.
-
-    Parameters
-    ----------
-    request : str or int, optional
-        An index of `list_devices()`, a kind ("gpu", "cpu" or "accelerator"), a platform or part of
-        its name ("pocl", "intel", "nvidia", "amd"), or part of "platform: name". Upper and lower
-        case are the same. The first of these that matches is used, so that "intel" is Intel's
-        platform even if other platforms also support the Intel CPU. By default the environment
-        variable CLSAS_DEVICE is the request. If several devices match, or there is no request, the
-        first GPU is chosen, or else the CPU with the widest vectors.
-
-    Raises
-    ------
-    DeviceError
-        If there is no device, or none that matches. The message says how to get a device, or lists
-        the available ones.
-    """
-    devices = list_devices()
-    if not devices:
-        raise no_device()
-    source = ""
-    if request is None and os.environ.get(ENVIRONMENT_VARIABLE):
-        request = os.environ[ENVIRONMENT_VARIABLE]
-        source = f" by {ENVIRONMENT_VARIABLE}"
-    if request is None:
-        chosen = _first(devices)
-        if chosen.kind == "gpu":
-            return chosen, "the first GPU"
-        widest = f" with vectors of {chosen.width}" if chosen.width > 1 else ""
-        others = ". ".join(filter(None, ("there is no GPU", prepare_caches())))
-        return chosen, f"the first {chosen.kind.upper()}{widest}; {others}"
-    if isinstance(request, str) and re.fullmatch(r"\s*[0-9]+\s*", request, re.ASCII):
-        request = int(request)
-    if isinstance(request, (int, np.integer)) and not isinstance(request, bool):
-        matching = [info for info in devices if info.index == request]
-    elif isinstance(request, str):
-        matching = _named(request.strip().lower(), devices)
-    else:
-        raise TypeError(f"device must be a name, an index or None, got {validate.shown(request)}")
-    if not matching:
-        have = "; ".join(f"{info.index}: {info.label}" for info in devices)
-        name = validate.shown(request)
-        raise no_match(f"{name}, which was requested{source}. Available: {have}", devices)
-    return _first(matching), f"requested{source} as {request!r}"
-
-
-def _first(devices: Sequence[DeviceInfo]) -> DeviceInfo:
-    """Return the preferred device of several: a GPU, or else the CPU with the widest vectors."""
-    return min(devices, key=lambda info: (KINDS.index(info.kind), -info.width, info.index))
-
-
-def _named(name: str, devices: Sequence[DeviceInfo]) -> list[DeviceInfo]:
-    """Return the devices of a kind, or else of a platform, or else with a name in their label."""
-    if not name:
-        return []
-    names = name, _PLATFORMS.get(name, name)
-    for matches in (
-        lambda info: info.kind == name,
-        lambda info: any(each in info.platform.lower() for each in names),
-        lambda info: any(each in info.label.lower() for each in names),
-    ):
-        if matching := [info for info in devices if matches(info)]:
-            return matching
-    return []
-
-
-@functools.cache
-def _open(index: int) -> Device:
-    device = _raw_devices()[index]
-    context = cl.Context([device])
-    queue = cl.CommandQueue(context, properties=cl.command_queue_properties.PROFILING_ENABLE)
-    info = _describe(index, device)
-    return Device(info, context, queue, cl.CommandQueue(context))
-
-
-def _opened_alike(info: DeviceInfo) -> Device:
-    """Return the device of this process that matches a description, to unpickle a device."""
-    alike = [each for each in list_devices() if each.label == info.label]
-    if not alike:
-        known = ", ".join(each.label for each in list_devices())
+    if _first_process() != os.getpid():
         raise DeviceError(
-            f"the pickled device {info.label!r} is not on this machine, which has: {known}"
+            "OpenCL cannot be used in a process that was forked after its parent had used it, "
+            "because the threads of its drivers exist only in the parent. Start processes with "
+            'multiprocessing.get_context("spawn"), or fork before OpenCL is used and before '
+            "devices are listed"
         )
-    same = [each for each in alike if each.index == info.index] or alike
-    return _open(same[0].index)
 
 
-def open_device(request: Device | str | int | None = None) -> Device:
-    """Return `request` if it is an open device, or else the device that `choose` returns.
+@functools.cache
+def _first_process() -> int:
+    """Return the id of the process that called this first, also in processes forked from it."""
+    return os.getpid()
 
-    Every device is opened once per process.
+
+@functools.cache
+def _prepare_caches() -> str:
+    """Make PoCL and PyOpenCL use private folders; return why PoCL has none, or "" if it has one.
+
+    Both load code from their caches. Without this, PoCL uses the folder that a variable names, and
+    /tmp/pocl if there is no home directory, whoever can write there. It reads the variable when
+    platforms are first listed.
     """
-    if isinstance(request, Device):
-        return request
-    return _open(choose(request)[0].index)
+    try:
+        for name in ("pytools", "pyopencl"):
+            _check_space(made_private(user_caches() / name, "XDG_CACHE_HOME"))
+    except OSError:
+        # The variable PYOPENCL_NO_CACHE is read when PyOpenCL is imported, which is too early.
+        cl._PYOPENCL_NO_CACHE = True
+    given = os.environ.get(_POCL_VARIABLE)
+    try:
+        folder = made_private(Path(given), _POCL_VARIABLE) if given else private_folder("kernels")
+    except OSError as error:
+        os.environ[_POCL_VARIABLE] = os.devnull  # PoCL cannot write there, and has no device
+        return f"PoCL cannot be used: {error}"
+    os.environ[_POCL_VARIABLE] = str(folder.absolute())
+    return ""
+
+
+def _pocl_problem() -> str:
+    """Return why PoCL cannot write its cache folder, which it needs to build; "" if it can."""
+    if why := _prepare_caches():
+        return why
+    folder = os.environ[_POCL_VARIABLE]
+    try:
+        _check_space(Path(folder))
+    except OSError as error:
+        return (
+            f"PoCL cannot write {_KERNEL_BYTES >> 20} MiB to its cache folder {folder!r} "
+            f"({error.strerror}). Set the environment variable {_POCL_VARIABLE} to a folder that "
+            "can be written"
+        )
+    return ""
+
+
+def _check_space(folder: Path) -> None:
+    """Raise OSError if there is no space for a kernel in a folder, or it cannot be written."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        file.write(bytes(_KERNEL_BYTES))

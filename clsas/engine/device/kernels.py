@@ -1,17 +1,22 @@
-"""The kernels of `cl/`: their sources, and their arguments, which are given by name."""
+"""The kernels of `cl/`: their sources, their arguments, and their polynomials for sine and cosine.
+
+Arguments are given by name.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
+from numpy.typing import NDArray
 
 _INCLUDE = re.compile(r'#include "(?P<name>\w+\.h)"')
 _COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.DOTALL)
@@ -19,6 +24,18 @@ _PARAMETER = re.compile(r"(?P<type>.*?)(?P<name>\w+)", re.DOTALL)
 _TERM = re.compile(r"(?P<negated>!?)(?P<option>[A-Za-z_]\w*)")
 _LEAST_INT, _LARGEST_INT = -(2**31), 2**31 - 1
 _SCALARS = {"int": np.int32, "float": np.float32}
+_VECTORS = {"float2": 2, "float3": 3, "float4": 4}
+
+PHASE_TERMS = (4, 5, 6)
+"""Available numbers of terms of the polynomials for sine and cosine. Their relative rms errors are
+-61, -92 and -126 dB."""
+PRECISE_PHASE_TERMS = 7
+"""Number of terms with which the error is that of single precision. It is used for phases on which
+several parts of an image depend: those of upsampling and of stages."""
+FACTORIZED_PHASE_SHARE, EXACT_PHASE_SHARE = 0.03, 0.08
+"""Shares of the error power of an image that polynomials may add. Exact images may have the larger
+one, because the errors of their many channels average out."""
+_PHASES = (np.arange(2000) + 0.5) / 2000 - 0.5  # cycles
 
 
 def kernel_source(name: str) -> str:
@@ -29,17 +46,15 @@ def kernel_source(name: str) -> str:
     return (Path(__file__).parents[3] / "cl" / name).read_text()  # a source checkout
 
 
-def whole_source(name: str) -> str:
+def whole_source(name: str, included: set[str] | None = None) -> str:
     """Return the text of a file of `cl/` in which headers replace the lines that include them.
 
-    Each header is put in once. This is not left to the driver, because some drivers cannot read
-    paths with spaces, and some cache a program without noticing that a header has changed. The
-    compiler's messages still name the original files and lines.
+    Each header is put in once; `included` are the names of those that are already in. This is not
+    left to the driver, because some drivers cannot read paths with spaces, and some cache a program
+    without noticing that a header has changed. The compiler's messages still name the original
+    files and lines.
     """
-    return "\n".join(_with_headers(name, set()))
-
-
-def _with_headers(name: str, included: set[str]) -> list[str]:
+    included = set() if included is None else included
     text = [f'#line 1 "{name}"']
     for number, line in enumerate(kernel_source(name).splitlines(), start=1):
         include = _INCLUDE.fullmatch(line.strip())
@@ -48,9 +63,9 @@ def _with_headers(name: str, included: set[str]) -> list[str]:
             continue
         if include["name"] not in included:
             included.add(include["name"])
-            text += _with_headers(include["name"], included)
+            text.append(whole_source(include["name"], included))
         text.append(f'#line {number + 1} "{name}"')
-    return text
+    return "\n".join(text)
 
 
 def kernel_parameters(text: str, name: str, options: Mapping[str, int]) -> dict[str, str]:
@@ -145,10 +160,10 @@ class Kernel:
     compiled: cl.Kernel
 
     def __post_init__(self) -> None:
-        """Check the number of parameters, and set their types."""
-        self._converters = {
-            parameter: _converter(type_) for parameter, type_ in self.parameters.items()
-        }
+        """Check number and types of the parameters, and hand the types to PyOpenCL."""
+        for type_ in self.parameters.values():
+            if type_ != "buffer" and type_ not in _SCALARS and type_ not in _VECTORS:
+                raise ValueError(f"kernels with parameters of type {type_!r} cannot be run")
         if self.compiled.num_args != len(self.parameters):
             raise ValueError(
                 f"kernel {self.name} was built with {self.compiled.num_args} parameters, but its "
@@ -159,7 +174,7 @@ class Kernel:
             [_SCALARS.get(type_) for type_ in self.parameters.values()]
         )
 
-    def ordered(self, arguments: Mapping[str, object]) -> list[Any]:
+    def ordered(self, arguments: Mapping[str, Any]) -> list[Any]:
         """Return arguments in the order of the parameters, converted to their types.
 
         Raises
@@ -173,55 +188,69 @@ class Kernel:
             problems = [f"needs {', '.join(missing)}"] if missing else []
             problems += [f"does not take {', '.join(unknown)}"] if unknown else []
             raise TypeError(f"kernel {self.name} {' and '.join(problems)}")
-        ordered = []
-        for name, convert in self._converters.items():
-            try:
-                ordered.append(convert(arguments[name]))
-            except (TypeError, ValueError) as error:
+        ordered: list[Any] = []
+        for name, type_ in self.parameters.items():
+            value, converted = arguments[name], None
+            if type_ == "buffer":
+                expected = "a buffer"
+                if isinstance(value, cl.MemoryObjectHolder):
+                    converted = value
+            elif type_ == "int":
+                expected = "an int of 32 bits"
+                if isinstance(value, (int, np.integer)) and _LEAST_INT <= value <= _LARGEST_INT:
+                    converted = int(value)
+            elif type_ == "float":
+                expected = "a number"
+                if isinstance(value, (int, float, np.integer, np.floating)):
+                    converted = float(value)
+            else:
+                length = _VECTORS[type_]
+                expected = f"{length} numbers"
+                with contextlib.suppress(ValueError):  # of lists within a list
+                    value = np.asarray(value)
+                    if value.shape == (length,) and value.dtype.kind in "iuf":
+                        # OpenCL stores a vector of three like one of four.
+                        converted = np.zeros(4 if length == 3 else length, np.float32)
+                        converted[:length] = value
+            if converted is None:
                 raise TypeError(
-                    f"argument {name} of kernel {self.name} must be {error}, "
+                    f"argument {name} of kernel {self.name} must be {expected}, "
                     f"got {arguments[name]!r}"
-                ) from None
+                )
+            ordered.append(converted)
         return ordered
 
 
-def _converter(type_: str) -> Callable[[object], object]:
-    """Return a function that converts a value to a parameter's type.
+@functools.cache
+def sine_and_cosine(terms: int) -> NDArray[np.float32]:
+    """Return the coefficients of `cl/phases.h`, float32 [2, terms], highest power first.
 
-    The function raises a TypeError whose message says what is expected, such as "a buffer".
+    They are least-squares fits of sin(2 pi r)/r and cos(2 pi r) by powers of r^2, where r is the
+    phase in cycles, from -0.5 to 0.5.
     """
-    scalars = {"buffer": _buffer, "int": _int, "float": _float}
-    if type_ in scalars:
-        return scalars[type_]
-    vector = re.fullmatch(r"float([234])", type_)
-    if vector is None:
-        raise ValueError(f"kernels with parameters of type {type_!r} cannot be run")
-    return partial(_vector, int(vector[1]))
+    powers = _powers(terms)
+    sine = np.linalg.lstsq(_PHASES[:, None] * powers, np.sin(2 * np.pi * _PHASES), rcond=None)[0]
+    cosine = np.linalg.lstsq(powers, np.cos(2 * np.pi * _PHASES), rcond=None)[0]
+    return np.stack([sine, cosine]).astype(np.float32)
 
 
-def _buffer(value: object) -> object:
-    if not isinstance(value, cl.MemoryObjectHolder):
-        raise TypeError("a buffer")
-    return value
+@functools.cache
+def phase_error(terms: int) -> float:
+    """Return the relative rms error of exp(j 2 pi r) by these polynomials."""
+    sine, cosine = sine_and_cosine(terms).astype(np.float64) @ _powers(terms).T
+    found = cosine + 1j * _PHASES * sine
+    return float(np.sqrt(np.mean(np.abs(found - np.exp(2j * np.pi * _PHASES)) ** 2)))
 
 
-def _int(value: object) -> int:
-    if not isinstance(value, (int, np.integer)) or not _LEAST_INT <= value <= _LARGEST_INT:
-        raise TypeError("an int of 32 bits")
-    return int(value)
+def phase_terms_within(error_db: float, share: float) -> int:
+    """Return the number of terms for an image with a given relative rms error, dB.
+
+    `share` is the share of the error power that the polynomials may add.
+    """
+    most = np.sqrt(share) * 10 ** (error_db / 20)
+    found = (terms for terms in PHASE_TERMS if phase_error(terms) <= most)
+    return next(found, PHASE_TERMS[-1])
 
 
-def _float(value: object) -> float:
-    if not isinstance(value, (int, float, np.integer, np.floating)):
-        raise TypeError("a number")
-    return float(value)
-
-
-def _vector(length: int, value: object) -> np.ndarray:
-    vector = np.asarray(value)
-    if vector.shape != (length,) or vector.dtype.kind not in "iuf":
-        raise TypeError(f"{length} numbers")
-    # OpenCL stores a vector of three like one of four.
-    converted = np.zeros(4 if length == 3 else length, np.float32)
-    converted[:length] = vector
-    return converted
+def _powers(terms: int) -> NDArray[np.float64]:
+    return (_PHASES**2)[:, None] ** np.arange(terms)[::-1]

@@ -20,7 +20,7 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import fastest, some_channels
 from clsas.engine.data.visibility import sines
 from clsas.engine.data.wavelengths import cycles_per_m_at, wavelength_m
-from clsas.engine.device import phases
+from clsas.engine.device import kernels
 from clsas.engine.device.device import Device
 from clsas.engine.exact.layout import (
     Groups,
@@ -131,10 +131,10 @@ def decide(
     # Share the allowed error out: the geometry and the phases may add a little to it.
     accuracy_db = scene.ambiguity.of_passed_db(accuracy_db)
     if taps is not None and upsampling is not None:
-        geometry_error, phase_terms = GEOMETRY_ERROR, phases.TERMS[-1]
+        geometry_error, phase_terms = GEOMETRY_ERROR, kernels.PHASE_TERMS[-1]
     else:
         geometry_error = max(GEOMETRY_ERROR, 10 ** ((accuracy_db + _GEOMETRY_SHARE_DB) / 20))
-        phase_terms = phases.terms_within(accuracy_db, phases.EXACT_SHARE)
+        phase_terms = kernels.phase_terms_within(accuracy_db, kernels.EXACT_PHASE_SHARE)
 
     # All positions from which ranges or aspect angles are measured.
     antennas_m = lines.tx_m
@@ -185,7 +185,7 @@ def decide(
         spectrum,
         scene.ambiguity.rest_db(accuracy_db, 0.0 if estimate else scene.left_out_error),
         taps=taps,
-        other_error=math.hypot(geometry_error, phases.error(phase_terms)),
+        other_error=math.hypot(geometry_error, kernels.phase_error(phase_terms)),
         pixels_per_sample=grid.size / lines.length,
         lookup_cost=lookup_cost,
     )

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from clsas.engine.data.decibels import in_db, power
-from clsas.engine.device import phases
+from clsas.engine.device import kernels
 from clsas.engine.device.buffers import padded_length
 from clsas.engine.device.device import Device
 from clsas.engine.factorized.buffers import Level
@@ -222,8 +222,8 @@ class _Candidates:
         # Error power of the edges of the beam, and the least that is reserved for everything but
         # filters and roots.
         self.beam_edges = EDGES_SHARE * self.allowed if has_beam else 0.0
-        terms = phases.terms_within(self.tolerance_db, phases.FACTORIZED_SHARE)
-        of_phases = phases.error(terms) ** 2
+        terms = kernels.phase_terms_within(self.tolerance_db, kernels.FACTORIZED_PHASE_SHARE)
+        of_phases = kernels.phase_error(terms) ** 2
         self.reserved = self.beam_edges + _RESERVED_SHARE * self.allowed + of_phases
         self.margin_db = margin_db(roots)
         self._root_errors: dict[Side, float] = {}

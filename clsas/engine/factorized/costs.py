@@ -18,9 +18,9 @@ from clsas.engine.device.buffers import (
     lines_buffer,
     pixel_buffers,
     total_bytes,
+    upsampling_buffers,
 )
 from clsas.engine.device.device import Device, DeviceInfo
-from clsas.engine.device.upsampling import upsampling_buffers
 from clsas.engine.exact.decide import decide
 from clsas.engine.exact.layout import STACK, Groups, GroupsEstimate, Tiles, item_pixels
 from clsas.engine.exact.run import Blocks, band_parts, block_buffers, blocks_of, part_buffers

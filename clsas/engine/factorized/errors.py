@@ -23,7 +23,7 @@ from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.visibility import sines
 from clsas.engine.data.wavelengths import wavelength_m
-from clsas.engine.device import phases
+from clsas.engine.device import kernels
 from clsas.engine.device.device import Device
 from clsas.engine.exact.decide import ROUNDING
 from clsas.engine.exact.layout import BLOCKS, lookup_room
@@ -818,9 +818,13 @@ def with_arithmetic(
     """
     errors = lines.errors
     if tolerance_db is None:
-        return errors, phases.terms_within(errors.total_db, phases.FACTORIZED_SHARE), False
-    terms = phases.terms_within(tolerance_db, phases.FACTORIZED_SHARE)
-    errors = replace(errors, phases=phases.error(terms) ** 2)
+        return (
+            errors,
+            kernels.phase_terms_within(errors.total_db, kernels.FACTORIZED_PHASE_SHARE),
+            False,
+        )
+    terms = kernels.phase_terms_within(tolerance_db, kernels.FACTORIZED_PHASE_SHARE)
+    errors = replace(errors, phases=kernels.phase_error(terms) ** 2)
     if not can_halve:
         return errors, terms, False
     rounding = _half_rounding(roots, summed, bands)

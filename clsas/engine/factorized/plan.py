@@ -28,7 +28,7 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.reading import parse_json
 from clsas.engine.data.simplify import EFFECTS
 from clsas.engine.data.tables import Report, Table
-from clsas.engine.device.phases import TERMS
+from clsas.engine.device.kernels import PHASE_TERMS
 from clsas.engine.factorized.track import Shape
 from clsas.engine.factorized.virtual_channels import InterpolatedAperture, NearestBeams
 from clsas.engine.signal.ambiguity import BEST_DB
@@ -373,7 +373,7 @@ class Factorization:
     limits: tuple[float, float] | None
     roots_at_once: int
     roots_prepared: int
-    phase_terms: int = TERMS[-1]
+    phase_terms: int = PHASE_TERMS[-1]
     stretch: float = 0.0
     kind: Literal["factorized"] = "factorized"
 
@@ -402,7 +402,7 @@ class Factorization:
             closest_m=partial(validate.number, unit="m", least=0.0, most=1e12),
             roots_at_once=_whole,
             roots_prepared=_whole,
-            phase_terms=partial(validate.count, least=TERMS[0], most=TERMS[-1]),
+            phase_terms=partial(validate.count, least=PHASE_TERMS[0], most=PHASE_TERMS[-1]),
             stretch=partial(validate.number, least=-0.5, most=1.0),
             kind=partial(validate.one_of, allowed=("factorized",)),
         )

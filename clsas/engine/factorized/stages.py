@@ -16,7 +16,7 @@ from scipy.spatial.distance import cdist
 
 from clsas.engine.data import validate
 from clsas.engine.data.lines import RangeLines, some_channels
-from clsas.engine.device import phases
+from clsas.engine.device import kernels
 from clsas.engine.device.buffers import (
     GUARD,
     MARGIN,
@@ -25,10 +25,10 @@ from clsas.engine.device.buffers import (
     lines_buffer,
     padded_length,
     phase_polynomials,
+    upsample,
     upsampled_lines,
 )
 from clsas.engine.device.device import Device, aligned
-from clsas.engine.device.upsampling import upsample
 from clsas.engine.factorized.buffers import (
     CHUNK,
     DeviceLines,
@@ -320,7 +320,7 @@ class Stages:
             "APERTURE_TAPS": aperture.taps,
             "HALF": int(lines.half_precision),
             "CHUNK": CHUNK,
-            "PHASE_TERMS": phases.PRECISE_TERMS,
+            "PHASE_TERMS": kernels.PRECISE_PHASE_TERMS,
         }
         ramp = int(geometry.ramps)
         if geometry.track.is_sheet:
@@ -332,7 +332,7 @@ class Stages:
         self._filters = {
             "range_filter": filter_table(device, align.coefficients),
             "aperture_filter": filter_table(device, aperture.coefficients),
-            "phase_polynomials": phase_polynomials(device, phases.PRECISE_TERMS),
+            "phase_polynomials": phase_polynomials(device, kernels.PRECISE_PHASE_TERMS),
         }
         self._parents = {
             level: device.upload(tree.parents(level).astype(np.int32))

@@ -5,7 +5,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from clsas.engine.device import kernels, phases
+from clsas.engine.device import kernels
 from clsas.engine.device.device import DeviceError
 from clsas.engine.device.kernels import kernel_parameters, kernel_source, whole_source
 from clsas.engine.factorized.buffers import stage_tables
@@ -232,14 +232,14 @@ def test_the_vector_widths_give_their_values(device, monkeypatch):
     monkeypatch.setattr(
         kernels, "kernel_source", lambda name: source if name == "turn.cl" else kernel_source(name)
     )
-    kernel = device.kernel("turn", WIDTH=width, PHASE_TERMS=phases.PRECISE_TERMS)
+    kernel = device.kernel("turn", WIDTH=width, PHASE_TERMS=kernels.PRECISE_PHASE_TERMS)
     rng = np.random.default_rng(1)
     t = np.concatenate([rng.uniform(-0.5, 0.5, 3000), rng.uniform(-3e3, 3e3, 1000), np.zeros(96)])
     t = t.astype(np.float32)
     t[-9:] = np.arange(-4, 5) / 4
     sine, cosine = np.empty_like(t), np.empty_like(t)
     results = {"sine": device.buffer(t.nbytes), "cosine": device.buffer(t.nbytes)}
-    polynomials = device.upload(phases.polynomials(phases.PRECISE_TERMS))
+    polynomials = device.upload(kernels.sine_and_cosine(kernels.PRECISE_PHASE_TERMS))
     size = (len(t) // width,)
     device.run(kernel, size, t=device.upload(t), polynomials=polynomials, **results)
     cl.enqueue_copy(device.queue, sine, results["sine"])
@@ -260,3 +260,25 @@ def test_no_kernel_needs_double_precision(name):
     assert not re.search(r"\b(double\d*|cl_khr_fp64|as_double\d*|convert_double\d*)\b", code)
     # A literal without its f is a double.
     assert not re.findall(r"(?<![\w.])(?:\d+\.\d*|\.\d+|\d+[eE])(?:[eE]?[+-]?\d+)?(?![\w.])", code)
+
+
+@pytest.mark.parametrize("terms", kernels.PHASE_TERMS)
+def test_polynomials_are_sine_and_cosine(terms):
+    r = np.random.default_rng(terms).uniform(-0.5, 0.5, 20000)
+    sine, cosine = (
+        np.polyval(each.astype(np.float64), r**2) for each in kernels.sine_and_cosine(terms)
+    )
+    off = cosine + 1j * r * sine - np.exp(2j * np.pi * r)
+    rms = np.sqrt(np.mean(np.abs(off) ** 2))
+    assert rms == pytest.approx(kernels.phase_error(terms), rel=0.1)
+    assert np.abs(off).max() <= 5 * rms
+
+
+@pytest.mark.parametrize("most", [kernels.FACTORIZED_PHASE_SHARE, kernels.EXACT_PHASE_SHARE])
+def test_an_image_has_as_many_terms_as_it_needs(most):
+    for error_db in np.arange(-85, -1):
+        terms = kernels.phase_terms_within(error_db, most)
+        share = (kernels.phase_error(terms) / 10 ** (error_db / 20)) ** 2
+        assert share <= most
+        fewer = [n for n in kernels.PHASE_TERMS if n < terms]
+        assert all(kernels.phase_error(n) ** 2 > most * 10 ** (error_db / 10) for n in fewer)

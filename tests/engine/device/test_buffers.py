@@ -6,10 +6,9 @@ import pytest
 from cases import burst, flat
 
 from clsas.engine.data.image_error import relative_error_db
-from clsas.engine.device import upsampling as module
-from clsas.engine.device.buffers import MARGIN, padded_length
+from clsas.engine.device import buffers as module
+from clsas.engine.device.buffers import MARGIN, padded_length, upsample
 from clsas.engine.device.device import open_device
-from clsas.engine.device.upsampling import upsample
 from clsas.engine.signal.interpolation import PHASES, UPSAMPLING_TAPS, upsampler
 
 
