@@ -190,7 +190,8 @@ class Kernel:
             raise TypeError(f"kernel {self.name} {' and '.join(problems)}")
         ordered: list[Any] = []
         for name, type_ in self.parameters.items():
-            value, converted = arguments[name], None
+            value: Any = arguments[name]
+            converted: Any = None
             if type_ == "buffer":
                 expected = "a buffer"
                 if isinstance(value, cl.MemoryObjectHolder):

@@ -818,11 +818,8 @@ def with_arithmetic(
     """
     errors = lines.errors
     if tolerance_db is None:
-        return (
-            errors,
-            kernels.phase_terms_within(errors.total_db, kernels.FACTORIZED_PHASE_SHARE),
-            False,
-        )
+        terms = kernels.phase_terms_within(errors.total_db, kernels.FACTORIZED_PHASE_SHARE)
+        return errors, terms, False
     terms = kernels.phase_terms_within(tolerance_db, kernels.FACTORIZED_PHASE_SHARE)
     errors = replace(errors, phases=kernels.phase_error(terms) ** 2)
     if not can_halve:

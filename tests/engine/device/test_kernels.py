@@ -101,6 +101,7 @@ WRONG = {
     "an array for a float": ("factor", [2.5], r"a number, got \[2.5\]"),
     "a number for a vector": ("pair", 1.0, "2 numbers, got 1.0"),
     "a vector of another length": ("three", (1, 2, 3, 4), r"3 numbers, got \(1, 2, 3, 4\)"),
+    "uneven lists for a vector": ("pair", [[1], [2, 3]], r"2 numbers, got \[\[1\], \[2, 3\]\]"),
     "complex numbers for a vector": ("pair", (1, 2j), r"2 numbers, got \(1, 2j\)"),
 }
 
@@ -265,9 +266,8 @@ def test_no_kernel_needs_double_precision(name):
 @pytest.mark.parametrize("terms", kernels.PHASE_TERMS)
 def test_polynomials_are_sine_and_cosine(terms):
     r = np.random.default_rng(terms).uniform(-0.5, 0.5, 20000)
-    sine, cosine = (
-        np.polyval(each.astype(np.float64), r**2) for each in kernels.sine_and_cosine(terms)
-    )
+    coefficients = kernels.sine_and_cosine(terms).astype(np.float64)
+    sine, cosine = (np.polyval(each, r**2) for each in coefficients)
     off = cosine + 1j * r * sine - np.exp(2j * np.pi * r)
     rms = np.sqrt(np.mean(np.abs(off) ** 2))
     assert rms == pytest.approx(kernels.phase_error(terms), rel=0.1)
