@@ -3,6 +3,10 @@
 Samples beyond the ends of a line are unknown. If the band fills the whole sampled band, it is also
 unknown to which end of the band the energy between its edges belongs. Every imager adds these
 errors to its prediction, and warns if they are too large.
+
+The lines also decide how large any error becomes relative to the image. It is larger if most of
+what the channels receive cancels in the image (`brightness`), and may be larger by chance if the
+image has few resolution cells (`scatter`).
 """
 
 from __future__ import annotations
@@ -10,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
 from clsas.engine.data import validate
@@ -17,11 +22,10 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.lines import GOLDEN, RangeLines, antennas_of, some_channels
 from clsas.engine.data.visibility import sines
-from clsas.engine.signal.brightness import brightness
-from clsas.engine.signal.scatter import independent_pixels, scatter
-from clsas.engine.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum
+from clsas.engine.data.wavelengths import cycles_per_m_at, wavelength_m
+from clsas.engine.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum, representative_channels
 
 BEST_DB = -85.0
 """Smallest relative rms error of an image that single precision allows."""
@@ -29,16 +33,6 @@ BEST_DB = -85.0
 # Margin by which a request may be out of reach without a warning: images at `BEST_DB` err by 3 dB
 # less.
 _CLOSE_DB = 2.5
-# Error power near an end over the power of the end, measured on noise in 40 to 90 % of the band.
-_AT_END = 0.03
-_END = 4  # samples whose mean power is taken as that of an end: the taps on one side of a filter
-_NEAR_END = 5  # samples around an end within which interpolators differ: half of 8 taps, plus one
-# An end fades if the power of its last sample is below this share of the mean of so many samples.
-_CUT, _FADING = 0.01, 16
-# Half bandwidth, cycles per sample, up to which a cut affects only the samples within `_NEAR_END`.
-_THIN = 0.42
-_CHANNELS = 64  # channels sampled; half or twice as many change nothing
-_POINTS = 16  # points sampled along either side of the grid
 # Share of the allowed error power above which to warn: the error is then 1.8 dB above the request.
 _MOST = 0.5
 _LEAST = 1e-3  # share of the allowed error power below which errors are ignored
@@ -60,7 +54,7 @@ class Ambiguity:
         Power of the image over the power that its beam passes; see `brightness`.
     scatter : float
         Factor by which chance may raise the relative error power of images with few resolution
-        cells; see `clsas.engine.signal.scatter`.
+        cells; see `scatter`.
     """
 
     ends: float = 0.0
@@ -154,6 +148,20 @@ def ambiguity(
     )
 
 
+# Unknown samples beyond the ends of lines.
+
+# Error power near an end over the power of the end, measured on noise in 40 to 90 % of the band.
+_AT_END = 0.03
+_END = 4  # samples whose mean power is taken as that of an end: the taps on one side of a filter
+_NEAR_END = 5  # samples around an end within which interpolators differ: half of 8 taps, plus one
+# An end fades if the power of its last sample is below this share of the mean of so many samples.
+_CUT, _FADING = 0.01, 16
+# Half bandwidth, cycles per sample, up to which a cut affects only the samples within `_NEAR_END`.
+_THIN = 0.42
+_END_CHANNELS = 64  # channels sampled; half or twice as many change nothing
+_END_POINTS = 16  # points sampled along either side of the grid
+
+
 def ends_error(
     lines: RangeLines,
     grid: Grid,
@@ -176,8 +184,8 @@ def ends_error(
 
     times the power of an end sample, unless the lines fade.
     """
-    some = some_channels(lines.channels, _CHANNELS)
-    part, points_m = lines.select(some), grid.spread(_POINTS)
+    some = some_channels(lines.channels, _END_CHANNELS)
+    part, points_m = lines.select(some), grid.spread(_END_POINTS)
     range_m = pairwise_range_m(
         points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
     )
@@ -195,8 +203,7 @@ def ends_error(
     last = lines.length - 1
     first = np.clip(nearest, 0, last).astype(np.int64)
     end = np.clip(farthest, -1, last).astype(np.int64) + 1
-    square = part.samples.real.astype(np.float64) ** 2
-    square += part.samples.imag.astype(np.float64) ** 2
+    square = _square(part)
     imaged = end > first
     if not imaged.any():
         return 0.0
@@ -219,9 +226,8 @@ def ends_error(
 
 def end_powers(lines: RangeLines) -> tuple[float, float]:
     """Return the power of the first and last samples over the mean power; 0 where lines fade."""
-    part = lines.select(some_channels(lines.channels, _CHANNELS))
-    square = part.samples.real.astype(np.float64) ** 2
-    square += part.samples.imag.astype(np.float64) ** 2
+    part = lines.select(some_channels(lines.channels, _END_CHANNELS))
+    square = _square(part)
     mean = float(square.mean())
     if not mean:
         return 0.0, 0.0
@@ -232,6 +238,236 @@ def end_powers(lines: RangeLines) -> tuple[float, float]:
     return first, last
 
 
+def _square(lines: RangeLines) -> NDArray[np.float64]:
+    """Return the power of all samples."""
+    square = lines.samples.real.astype(np.float64) ** 2
+    square += lines.samples.imag.astype(np.float64) ** 2
+    return square
+
+
 def _ends_loudly(square: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask of lines that do not fade towards the first sample of `square`, [n, length]."""
     return square[:, 0] > _CUT * square[:, :_FADING].mean(axis=1)
+
+
+# Power of the image over the power that its channels receive.
+
+# Channels summed coherently. With half as many, echoes from beside a pixel cancel less, and images
+# of points at the edge of the beam look 3 dB brighter than they are; twice as many change 1 dB.
+_GROUP_CHANNELS = 64
+_LEAST_GROUP = 32
+_MOST_CHANNELS = 1024  # channels summed together if groups are dark: a plain choice
+_GROUPS = 4  # groups of channels, spread evenly along the lines
+# Points along either side of the grid: first without and with a beam, whose coverage may vary, and
+# then if those find little power.
+_FEW, _SOME, _MANY = 8, 16, 48
+_PAIRS_AT_ONCE = 1 << 16  # of points and channels; bounds memory
+_DARKEST = 1e-8  # least ratio returned, far below what any image resolves
+_DARK = 0.5  # ratio above which images are not dark; sampling alone changes it by 1 dB
+
+
+def brightness(
+    lines: RangeLines,
+    grid: Grid,
+    spectrum: Spectrum,
+    beam: BeamWindow | None,
+    along: NDArray[np.float64] | None,
+) -> float:
+    """Return the power of an image over the power that its channels receive, 1 unless it is dark.
+
+    If most echoes at the ranges of the pixels come from places beside the grid, or from such that
+    the beam hardly covers, most of what the channels receive cancels in the image. Interpolation
+    errors do not cancel. They are therefore larger relative to such an image than relative to one
+    of a seabed.
+
+    Parameters
+    ----------
+    lines, grid, spectrum
+        Lines, pixels, and the spectrum of the lines.
+    beam, along : BeamWindow and float64 [channels, 3], or None
+        Weights of the channels, and the unit directions of the track at the channels.
+
+    Notes
+    -----
+    With z_i = w_i s_i(rho_i) exp(j 2 k rho_i), sums of z_i over groups of neighbouring channels
+    keep what arrives from about the direction of a pixel: the beam of a group is so wide that no
+    bright echo within the grid is missed. The brightness is the power of these sums, averaged over
+    pixels and groups, over the power of all z_i. If it is low, it is that of the sums of all
+    channels, where echoes from beside the grid cancel further.
+    """
+    if lines.channels < 2 * _LEAST_GROUP or lines.length < 2:
+        return 1.0
+    if beam is None and len(grid.spread(_FEW)) < _FEW**2:
+        return 1.0  # a few pixels are dark by chance, which `scatter` allows for
+    group = min(_GROUP_CHANNELS, lines.channels // 2)
+    centres_m = lines.phase_centres_m  # in any order
+    order = np.argsort(centres_m[:, np.ptp(centres_m, axis=0).argmax()], kind="stable")
+    middles = order[np.linspace(0, lines.channels - 1, 2 * _GROUPS + 1)[1::2].astype(np.int64)]
+    channels = np.stack(
+        [
+            np.argpartition(np.sum((centres_m - centres_m[each]) ** 2, axis=1), group - 1)[:group]
+            for each in middles
+        ]
+    )
+    found = 1.0
+    for most in (_FEW if beam is None else _SOME, _MANY):
+        points_m = grid.spread(most)
+        found = _brightness_of_groups(lines, channels, points_m, spectrum, beam, along)
+        if found > _DARK:
+            return 1.0
+    # Echoes from beside the grid also cancel between groups.
+    whole = order[some_channels(lines.channels, _MOST_CHANNELS)][None]
+    found = min(found, _brightness_of_groups(lines, whole, points_m, spectrum, beam, along))
+    return max(found, _DARKEST)
+
+
+def _brightness_of_groups(
+    lines: RangeLines,
+    groups: NDArray[np.int64],
+    points_m: NDArray[np.float64],
+    spectrum: Spectrum,
+    beam: BeamWindow | None,
+    along: NDArray[np.float64] | None,
+) -> float:
+    """Return the power of sums over groups [groups, channels], relative to that of their terms."""
+    channels = groups.ravel()
+    part, row = lines.select(channels), np.arange(len(channels))
+    coherent = passed = 0.0
+    at_once = max(_PAIRS_AT_ONCE // len(channels), 1)
+    for first in range(0, len(points_m), at_once):
+        some_m = points_m[first : first + at_once]
+        range_m = pairwise_range_m(
+            some_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
+        )
+
+        # Linear interpolation about the centre of the band, [points, channels].
+        sample = (range_m - part.first_range_m) / part.range_step_m
+        lower = np.floor(sample)
+        inside = (lower >= 0) & (lower < part.length - 1)
+        index = np.where(inside, lower, 0).astype(np.int64)
+        between = sample - lower
+        values = (1 - between) * part.samples[row, index]
+        values = values + between * part.samples[row, index + 1] * np.exp(
+            -2j * np.pi * spectrum.centre
+        )
+
+        # Phases that focus on the points, and the weights of the beam.
+        turns = spectrum.centre * between
+        turns += part.carrier_cycles_per_m * range_m
+        values *= np.exp(2j * np.pi * (turns - np.rint(turns)))
+        values *= inside
+        if beam is not None and along is not None:
+            values *= _beam_weights(lines, channels, some_m, beam, along)
+
+        sums = values.reshape(len(some_m), *groups.shape).sum(axis=-1)
+        coherent += float(np.vdot(sums, sums).real)
+        passed += float(np.vdot(values, values).real)
+    return coherent / passed if passed else 1.0
+
+
+def _beam_weights(
+    lines: RangeLines,
+    channels: NDArray[np.int64],
+    points_m: NDArray[np.float64],
+    beam: BeamWindow,
+    along: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the weights of the beam, [points, channels]."""
+    sine = sines(points_m, lines.phase_centres_m[channels], along[channels]).T
+    weights: NDArray[np.float64] = beam.weights(sine, wavelength_m(lines))
+    return weights
+
+
+# Chance in images with few resolution cells.
+
+_PIXELS = 256  # pixels sampled; with more independent pixels, the scatter is below `_SPARE_DB`
+_NOISE_CHANNELS = 256  # channels sampled in addition to the loudest; a beam passes some of them
+# Terms sampled of the sums over channels and frequencies; twice as many change nothing.
+_TERMS = 256
+_KEPT = 0.995  # share of images that must meet their accuracy
+_SPARE_DB = 1.0  # by which the errors of most images stay below their predictions
+_LEAST_WEIGHT = 1e-3  # mean weight of channels down to which normalising beams amplify pixels
+
+
+def scatter(independent: float) -> float:
+    """Return the factor of relative error power that 99.5 % of noise images do not exceed.
+
+    By chance, the power of an image with few resolution cells may be far below its expected value,
+    and the power of its errors far above.
+
+    Parameters
+    ----------
+    independent : float
+        Number of `independent_pixels` of the images.
+
+    Notes
+    -----
+    The ratio of two mean powers over N independent complex Gaussian values has the F distribution
+    of 2 N and 2 N degrees of freedom.
+    """
+    quantile = scipy.special.fdtri(2 * independent, 2 * independent, _KEPT)
+    return max(float(quantile) / power(_SPARE_DB), 1.0)
+
+
+def independent_pixels(
+    lines: RangeLines,
+    grid: Grid,
+    spectrum: Spectrum,
+    energy: NDArray[np.float64],
+    beam: BeamWindow | None,
+    along: NDArray[np.float64] | None,
+) -> float:
+    """Return the number of independent pixels of a noise image, from 1 to 256.
+
+    Parameters
+    ----------
+    lines, grid, spectrum, beam, along
+        As for `brightness`.
+    energy : float64 [channels]
+        Energy of every line, in any unit.
+
+    Notes
+    -----
+    A pixel is a sum of many terms, one for every channel and frequency. N is the inverse of the
+    mean squared correlation of two pixels, over all pairs. Terms are sampled in proportion to their
+    power. Sums of so few terms are correlated by 1/`_TERMS` even if the phases are random. This is
+    subtracted, which overestimates N by up to a third for N up to 60.
+    """
+    is_whole = grid.size <= _PIXELS
+    number = np.arange(_PIXELS)
+    points_m = grid.at(
+        np.arange(grid.size) if is_whole else (number * GOLDEN % 1 * grid.size).astype(np.int64)
+    )
+    some, factor = representative_channels(lines, _NOISE_CHANNELS, energy)
+    weights = np.ones((len(points_m), len(some)))
+    if beam is not None and along is not None:
+        weights = _beam_weights(lines, some, points_m, beam, along)
+        if beam.normalise:
+            weights /= np.maximum(weights.mean(axis=1, keepdims=True), _LEAST_WEIGHT)
+    seen = np.mean(weights**2, axis=0)
+    held = np.cumsum(seen * factor.astype(np.float64) ** 2 * (energy[some] / (energy.max() or 1.0)))
+    if not held[-1]:
+        return float(_PIXELS)
+    term = np.arange(_TERMS)
+    chosen = np.searchsorted(held, (term + 0.5) / _TERMS * held[-1])
+    away = 2 * (term * GOLDEN % 1) - 1
+    share = np.cumsum(spectrum.share)
+    frequency = np.copysign(np.interp(np.abs(away), share / share[-1], spectrum.frequency), away)
+    channels = some[chosen]
+    range_m = pairwise_range_m(points_m, *antennas_of(lines, channels))
+    turns = range_m * cycles_per_m_at(lines, spectrum.centre + frequency)
+    terms = np.exp(2j * np.pi * (turns - np.rint(turns))).astype(np.complex64)
+    sample = (range_m - lines.first_range_m[channels]) / lines.range_step_m
+    is_reached = (sample > -1) & (sample < lines.length)
+    terms *= is_reached * weights[:, chosen] / np.sqrt(_TERMS * seen[chosen])
+    alike = np.abs(terms @ terms.conj().T) ** 2
+    own = np.abs(terms).astype(np.float64) ** 2
+    both = np.multiply.outer(own.sum(axis=1), own.sum(axis=1))
+    if not is_whole:  # a pixel is not sampled twice
+        np.fill_diagonal(alike, 0.0)
+        np.fill_diagonal(both, 0.0)
+    if not both.any():
+        return float(_PIXELS)
+    by_few = 1 / _TERMS
+    mean = float(alike.sum(dtype=np.float64) / both.sum())
+    return 1 / float(np.clip((mean - by_few) / (1 - by_few), 1 / _PIXELS, 1.0))

@@ -8,7 +8,7 @@ from tiers import also
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.visibility import sines
 from clsas.engine.data.wavelengths import wavelength_m
-from clsas.engine.signal.brightness import brightness
+from clsas.engine.signal.ambiguity import brightness
 from clsas.engine.signal.spectrum import measure_spectrum
 
 BEAM = BeamWindow(20.0, "hann", along=[1, 0, 0])

@@ -9,7 +9,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.visibility import sines
-from clsas.engine.signal.scatter import independent_pixels, scatter
+from clsas.engine.signal.ambiguity import independent_pixels, scatter
 from clsas.engine.signal.spectrum import Spectrum
 
 STEP_M, WAVELENGTH_M, SPEED_M_S = 0.1, 0.15, 1500.0
