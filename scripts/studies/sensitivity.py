@@ -239,7 +239,7 @@ def changes(device: Device, patterns: Sequence[str] = ("",)) -> Iterator[list[st
         scene.run()
     usual = [_best(scene) for scene in scenes]
     for constant in constants(patterns):
-        name = f"{constant.module.__name__.removeprefix('clsas.')}.{constant.name}"
+        name = f"{constant.module.__name__.removeprefix('clsas.engine.')}.{constant.name}"
         for other in sorted({*constant.neighbours} - {constant.value}):
             row = [name, f"{constant.value:.4g}", f"{other:.4g}"]
             with constant.set_to(other):

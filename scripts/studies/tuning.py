@@ -25,14 +25,14 @@ def constants(device: Device) -> list[Constant]:
     """Return the constants that affect imaging times on a device."""
     batch = "_CACHED_BYTES" if device.info.kind == "cpu" else "_BATCH_BYTES"
     names = [
-        ("engine.exact.run", "_CHANNELS_AT_ONCE"),
-        ("engine.exact.run", "_PART_BYTES"),
-        ("engine.factorized.costs", batch),
-        ("engine.factorized.stages", "_GROUPS_PER_UNIT"),
+        ("exact.run", "_CHANNELS_AT_ONCE"),
+        ("exact.run", "_PART_BYTES"),
+        ("factorized.costs", batch),
+        ("factorized.stages", "_GROUPS_PER_UNIT"),
     ]
     if device.info.width == 1:
-        names += [("engine.factorized.stages", "_GROUP"), ("engine.device.upsampling", "_GROUP")]
-    return [Constant(importlib.import_module(f"clsas.{room}"), name) for room, name in names]
+        names += [("factorized.stages", "_GROUP"), ("device.buffers", "_LINE_ITEMS")]
+    return [Constant(importlib.import_module(f"clsas.engine.{room}"), name) for room, name in names]
 
 
 def changes(device: Device, case: Case = FFBP_2K) -> Iterator[list[str]]:
@@ -65,7 +65,7 @@ def changes(device: Device, case: Case = FFBP_2K) -> Iterator[list[str]]:
                 with constant.set_to(value):
                     times[number] = _seconds(form)
         medians = {key: statistics.median(times) for key, times in seconds.items()}
-        name = f"{constant.module.__name__.removeprefix('clsas.')}.{constant.name}"
+        name = f"{constant.module.__name__.removeprefix('clsas.engine.')}.{constant.name}"
         for value in values:
             cells = []
             for form in imagers:

@@ -2,6 +2,7 @@ import pytest
 from studies import tuning
 from studies.scaling import scaled
 
+from clsas.engine.device import buffers
 from clsas.engine.device.device import open_device
 from clsas.engine.factorized import stages
 
@@ -32,4 +33,5 @@ def test_a_device_of_one_lane_has_work_groups_to_tune(monkeypatch):
     single = dataclasses.replace(device, info=info, _kernels={})
     named = {(each.module.__name__, each.name) for each in tuning.constants(single)}
     assert (stages.__name__, "_GROUP") in named
+    assert (buffers.__name__, "_LINE_ITEMS") in named
     assert ("clsas.engine.factorized.costs", "_BATCH_BYTES") in named

@@ -15,7 +15,7 @@ from clsas.engine.data.beam import INTERVALS, BeamWindow
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.threads import in_threads
 from clsas.engine.data.wavelengths import wavelength_m
-from clsas.engine.device.device import GROUP, Device, aligned
+from clsas.engine.device.device import Device, aligned
 from clsas.engine.device.kernels import PRECISE_PHASE_TERMS, Kernel, sine_and_cosine
 from clsas.engine.signal.interpolation import PHASES, Gain, Resampling, Upsampler
 
@@ -27,6 +27,7 @@ GUARD = 16
 """Zeros on either side of the line of a virtual channel, which the last stage's lookup may read."""
 GIVEN_BYTES = 64 << 20
 """Largest size of the lines that are on a device at once before they are upsampled."""
+_LINE_ITEMS = 64  # work-items that share a line if each has one lane
 _LINES_AT_ONCE = 32  # lines that are upsampled together, so that they stay in a core's cache
 
 
@@ -328,7 +329,7 @@ def upsample(
         some = samples[start : start + at_once]
         event = device.run(
             kernel,
-            (1 if width > 1 else GROUP, len(some)),
+            (1 if width > 1 else _LINE_ITEMS, len(some)),
             samples=device.share(some),
             count=count,
             filters=filters,

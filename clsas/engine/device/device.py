@@ -56,9 +56,7 @@ _KERNEL_BYTES = 4 << 20
 # Intel's runtime. An image uses 1 to 5 kernels.
 _MOST_KERNELS = 32
 _ALIGNMENT = 4096  # bytes: size of a page
-
-GROUP = 64
-"""Work-items of a work-group on a GPU: two warps, or a wavefront."""
+_GROUP = 64  # work-items of a work-group on a GPU: two warps, or a wavefront
 
 
 class DeviceError(RuntimeError):
@@ -459,7 +457,7 @@ class Device:
         if local is None and self.info.width > 1:
             local = (1,) * len(size)
         elif local is None and self.info.kind == "gpu":
-            local = (math.gcd(size[0], GROUP), *[1] * (len(size) - 1))
+            local = (math.gcd(size[0], _GROUP), *[1] * (len(size) - 1))
         ordered = kernel.ordered(arguments)
         with self._lock:
             event = kernel.compiled(self.queue, size, local, *ordered, wait_for=wait_for)
@@ -469,7 +467,7 @@ class Device:
 
     def in_whole_groups(self, items: int) -> int:
         """Return a number of work-items, rounded up to whole work-groups on a GPU."""
-        return -(-items // GROUP) * GROUP if self.info.kind == "gpu" else items
+        return -(-items // _GROUP) * _GROUP if self.info.kind == "gpu" else items
 
     @contextlib.contextmanager
     def profile(self) -> Iterator[dict[str, KernelTimes]]:
