@@ -28,7 +28,7 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.forming import form, scene_of_plan
 from clsas.engine.imaging import plan
-from clsas.engine.signal.readout import Readout
+from clsas.engine.signal.interpolation import Readout
 from clsas.engine.water.refraction import homogeneous
 from clsas.navigation.autofocus_result import Autofocus
 from clsas.navigation.checks import (

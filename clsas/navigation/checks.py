@@ -10,7 +10,7 @@ from clsas.engine.data import banks, validate
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.pings import Transmissions
 from clsas.engine.data.wavelengths import band_wavelength_m, is_about_zero
-from clsas.engine.signal.readout import Readout
+from clsas.engine.signal.interpolation import Readout
 
 _MOST_OVERSAMPLING = 64.0  # limits the range resolution of lines that are almost constant
 _REMEDY = "lines.without_still_pings() drops them"

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from clsas.engine.data.conditioning import are_dead
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.wavelengths import cycles_per_m_at
-from clsas.engine.signal.readout import Readout
+from clsas.engine.signal.interpolation import Readout
 from clsas.navigation.directions import Alignment, alignment
 from clsas.navigation.echoes import Window, independent_echoes, strongest, without_highlights
 from clsas.navigation.overlap import Overlap

@@ -19,7 +19,7 @@ import scipy.fft
 import scipy.linalg
 from numpy.typing import NDArray
 
-from clsas.engine.signal.phasors import phasors
+from clsas.engine.signal.interpolation import phasors
 from clsas.navigation.peaks import parabola_peak
 from clsas.navigation.responses import Contributions, Passage
 

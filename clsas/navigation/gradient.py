@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from clsas.engine.signal.phasors import phasors
+from clsas.engine.signal.interpolation import phasors
 from clsas.navigation.responses import Contributions, Passage
 
 _PASSES = 3  # alternations between steps of the track and slopes of the responses

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.track import Track
-from clsas.engine.signal.readout import Readout
+from clsas.engine.signal.interpolation import Readout
 from clsas.navigation.calibration_result import UNITS, Calibration
 from clsas.navigation.checks import checked_unknowns
 from clsas.navigation.range_fit import MOST_CONDITION, Ambiguity, Fit, fitted

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from clsas.engine.data.wavelengths import cycles_per_m_at
-from clsas.engine.signal.readout import Readout
+from clsas.engine.signal.interpolation import Readout
 from clsas.navigation.checks import range_cell_m
 
 LEAST_SNR = 10.0

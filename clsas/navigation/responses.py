@@ -19,8 +19,7 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.threads import in_threads
 from clsas.engine.data.visibility import sines
 from clsas.engine.data.wavelengths import wavelength_m
-from clsas.engine.signal.phasors import phasors
-from clsas.engine.signal.readout import Readout
+from clsas.engine.signal.interpolation import Readout, phasors
 
 READ_DB = -40.0
 """Accuracy with which the lines are read."""

@@ -18,7 +18,7 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.visibility import sines
 from clsas.engine.data.wavelengths import wavelength_m
 from clsas.engine.exact.decide import Decision
-from clsas.engine.signal.readout import interpolated
+from clsas.engine.signal.interpolation import interpolated
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.engine.water.ray_delays import delays_s
 

@@ -42,6 +42,7 @@ FIXED = {
     "STACK HELD CHUNK GUARD PHASES _GROUP _FINE VECTOR_ROOM": "layouts that kernels share",
     "_FAR _LARGEST_HALF _LEAST_HALF _MOST_EXPONENT _SINGULAR": "limits of number formats",
     "BEST_TOLERANCE_DB WORST_TOLERANCE_DB BEST_ACCURACY_DB": "limits of input",
+    "_READOUT_BYTES _READOUT_LINES": "memory of lines read on the host, outside of images",
     "ACCURACY_DB TOLERANCE_DB NEAREST_UPSAMPLING": "defaults of the interface",
 }
 """Modules and constants that are not varied, and why."""

@@ -10,7 +10,7 @@ from factorizing import EXACT_IS_SLOW
 
 import clsas
 from clsas import Grid, SoundSpeed
-from clsas.engine.signal.readout import Readout
+from clsas.engine.signal.interpolation import Readout
 from clsas.engine.water.ray_delays import delays_s
 from clsas.engine.water.refraction import homogeneous
 from clsas.trials import oracle

@@ -10,7 +10,7 @@ from tiers import also, few
 
 import clsas
 from clsas.engine.data.validate import ClsasWarning
-from clsas.engine.signal.readout import Readout
+from clsas.engine.signal.interpolation import Readout
 from clsas.navigation.autofocus import autofocus
 from clsas.navigation.checks import mean_wavelength_m
 from clsas.navigation.halts import halt

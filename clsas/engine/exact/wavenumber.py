@@ -29,7 +29,7 @@ from clsas.engine.data.threads import in_threads
 from clsas.engine.data.wavelengths import cycles_per_m_at, wavelength_m
 from clsas.engine.scene import check_numbers
 from clsas.engine.signal.doubts import warn_before_imaging
-from clsas.engine.signal.phasors import phasors
+from clsas.engine.signal.interpolation import phasors
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.engine.water.refraction import homogeneous
 

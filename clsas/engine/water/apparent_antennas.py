@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.sound_speed import SoundSpeed
-from clsas.engine.signal.readout import Readout
+from clsas.engine.signal.interpolation import Readout
 from clsas.engine.water.ray_delays import FLIGHT_STEPS, RaySample, at_speed, straight_m, times_s
 from clsas.engine.water.rays import Rays, rays, shadow
 

@@ -1,12 +1,12 @@
-"""Interpolation of range lines between their samples."""
+"""Reading range lines between their samples, and turning what was read."""
 
 import numpy as np
 import pytest
 from cases import lines_over
 
 from clsas.engine.data.grid import Grid
-from clsas.engine.signal import readout
-from clsas.engine.signal.readout import Readout
+from clsas.engine.signal import interpolation
+from clsas.engine.signal.interpolation import Readout, phasors
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def test_upsampled_lines_are_kept_only_where_they_are_small(lines, monkeypatch):
     kept = Readout.of(lines)
     read = kept.read(np.arange(lines.channels), range_m)
     assert kept._upsampled is not None
-    monkeypatch.setattr(readout, "_MOST_KEPT", 0)
+    monkeypatch.setattr(interpolation, "_READOUT_BYTES", 0)
     anew = Readout.of(lines)
     np.testing.assert_allclose(anew.read(np.arange(lines.channels), range_m), read, rtol=1e-5)
     assert anew._upsampled is None
@@ -40,3 +40,11 @@ def test_nothing_lies_beyond_the_ends(lines):
     read = Readout.of(lines).read(np.array([0]), np.array([[last_m - 0.5, last_m + 1e-3, -5.0]]))
     assert read[0, 0] != 0
     assert not read[0, 1:].any()
+
+
+def test_phasors_are_complex_exponentials():
+    phase_rad = np.linspace(-50, 50, 1001, dtype=np.float32).reshape(7, 143)
+    expected = np.exp(1j * phase_rad.astype(np.float64))
+    found = phasors(phase_rad)
+    assert found.dtype == np.complex64
+    assert np.abs(found - expected).max() < 2e-7
