@@ -126,7 +126,7 @@ def measure_spectrum(
     there, and a warning is issued if the band cannot be told from its complement. `energy` is the
     `line_energy` of the lines, if it is known.
     """
-    frequency, power, faded = _mean_power(*_sampled_lines(lines, MEASURED_CHANNELS, energy))
+    frequency, power, faded = _mean_power(lines, MEASURED_CHANNELS, energy)
     centre, width, left_out, gap = _occupied_band(frequency, faded)
     if grid is not None and gap:
         validate.warn(
@@ -149,19 +149,46 @@ def measure_spectrum(
     )
 
 
-def middle_cycles_per_m(lines: RangeLines) -> float:
-    """Return the two-way phase per metre of range in the middle of the occupied band, cycles."""
-    return float(cycles_per_m_at(lines, measure_spectrum(lines).centre))
+def _mean_power(
+    lines: RangeLines, most_channels: int, energy: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return frequencies, cycles per sample, and power shares of the lines and of faded lines.
 
-
-def power_spectrum(lines: RangeLines) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return frequencies, cycles per sample, ascending in [-0.5, 0.5), and their power shares.
-
-    Lines are faded towards both ends, which removes the leakage of cut lines.
+    Lines that are faded towards both ends show the band without the leakage of cut lines. Those of
+    up to `most_channels` representative channels are used.
     """
-    frequency, _, power = _mean_power(*_sampled_lines(lines, MEASURED_CHANNELS))
-    order = np.argsort(frequency)
-    return frequency[order], power[order]
+    index, factor = representative_channels(lines, most_channels, energy)
+    samples = lines.samples if len(index) == lines.channels else lines.samples[index]
+    largest = _largest_part(samples) or samples.real.dtype.type(1)
+    padding = 1 if samples.shape[1] >= _RESOLVED else 2
+    length = scipy.fft.next_fast_len(max(padding * samples.shape[1], 4))
+    power, faded = np.zeros(length), np.zeros(length)
+    parts = samples.view(samples.real.dtype)
+    blocks = -(-len(parts) // _LINES_TOGETHER)
+    for block, scale in zip(
+        np.array_split(parts, blocks), np.array_split(factor, blocks), strict=True
+    ):
+        amplitude = scipy.fft.fft((block / largest * scale[:, None]).view(samples.dtype), length)
+        # Apply a Hann window over the part of the FFT in which the lines lie.
+        ends = amplitude[:, -padding:], amplitude[:, :padding]
+        around = np.concatenate([ends[0], amplitude, ends[1]], axis=1)
+        windowed = (around[:, : -2 * padding] + around[:, 2 * padding :]) * np.float32(-0.5)
+        windowed += amplitude
+        power += _column_power(amplitude)
+        faded += _column_power(windowed)
+    frequency = scipy.fft.fftfreq(length)
+    if not power.any():
+        power[:] = 1.0
+    if not faded.any():
+        faded = power
+    return frequency, power / power.sum(), faded / faded.sum()
+
+
+def _column_power(amplitude: NDArray[np.complexfloating]) -> NDArray[np.float64]:
+    """Return the power of every column; the amplitudes are overwritten."""
+    parts = amplitude.view(amplitude.real.dtype)
+    squares = np.multiply(parts, parts, out=parts).sum(axis=0)
+    return squares.astype(np.float64).reshape(-1, 2).sum(axis=1)
 
 
 def _occupied_band(
@@ -207,25 +234,9 @@ def _occupied_band(
     return float((middle + 0.5) % 1.0 - 0.5), float(bins[first] / count), max(left_out, 0.0), gap
 
 
-def shares_of_bins(
-    position: NDArray[np.float64], share: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the shares in the bins -n, ..., n, [2 n + 1].
-
-    A share that lies between two bins is divided between them.
-
-    Parameters
-    ----------
-    position, share : float64 [...]
-        Positions in bins, which may be fractions, and the share at each.
-    """
-    most = int(np.ceil(np.abs(position).max()))
-    from_first = position.ravel() + most
-    lower = np.minimum(from_first.astype(np.int64), max(2 * most - 1, 0))
-    above = share.ravel() * (from_first - lower)
-    count = 2 * most + 1
-    found: Any = np.bincount(lower, share.ravel() - above, count)
-    return (found + np.bincount(lower + 1, above, count + 1)[:count]) / share.sum()
+def _distance(frequency: NDArray[np.float64], centre: float) -> NDArray[np.float64]:
+    """Return the distance of frequencies from a centre, cycles per sample, 0 to 0.5."""
+    return np.abs((frequency - centre + 0.5) % 1.0 - 0.5)
 
 
 def _histogram(distance: NDArray[np.float64], power: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -240,114 +251,6 @@ def _histogram(distance: NDArray[np.float64], power: NDArray[np.float64]) -> NDA
     # NumPy's type stubs do not know that weights make the result float64.
     found: Any = np.bincount(lower, power - above, _FREQUENCIES)
     return found + np.bincount(lower + 1, above, _FREQUENCIES)
-
-
-def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: float) -> float:
-    """Return the error power due to aliasing of the power opposite the centre, in a full band.
-
-    Aliased power is missing on one side and wrong on the other, so it counts twice. With a guard
-    band there is only noise, equal on both sides.
-    """
-    if width <= 1 / NEEDED_OVERSAMPLING:
-        return 0.0
-    closing = max(_CLOSING, 1.5 / len(power))
-    return 2 * float(power[distance > 0.5 - closing].sum())
-
-
-def occupied_band(spectrum: Spectrum, outside: float) -> tuple[float, float]:
-    """Return centre and half width of the band that contains all but a share of the power."""
-    bins = np.searchsorted(np.cumsum(spectrum.share), 1 - outside)
-    return spectrum.centre, float(min((bins + 1) / (2 * len(spectrum.power)), 0.5))
-
-
-def power_outside(lines: RangeLines, centre: float, half_width: float, most_channels: int) -> float:
-    """Return the share of the power of sampled lines outside a band, given in cycles per sample."""
-    frequency, power, _ = _mean_power(*_sampled_lines(lines, most_channels))
-    return float(power[_distance(frequency, centre) > half_width].sum())
-
-
-def _distance(frequency: NDArray[np.float64], centre: float) -> NDArray[np.float64]:
-    """Return the distance of frequencies from a centre, cycles per sample, 0 to 0.5."""
-    return np.abs((frequency - centre + 0.5) % 1.0 - 0.5)
-
-
-def representative_channels(
-    lines: RangeLines, most: int, energy: NDArray[np.float64] | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return up to `most` evenly spread channels and the loudest ones, and a factor for each.
-
-    Multiplied by these factors, the channels have the power of all. `energy` is the `line_energy`
-    of the lines, if it is known.
-    """
-    some = some_channels(lines.channels, most)
-    if len(some) == lines.channels:
-        return some, np.ones(lines.channels, np.float32)
-    energy = line_energy(lines.samples) if energy is None else energy
-    loudest = np.argpartition(energy, -_LOUDEST)[-_LOUDEST:]
-    even = np.setdiff1d(some, loudest)
-    rest, held = energy.sum() - energy[loudest].sum(), energy[even].sum()
-    weight = np.sqrt(max(rest, 0.0) / held) if held > 0 else 0.0
-    factor = np.append(np.full(len(even), weight), np.ones(len(loudest))).astype(np.float32)
-    return np.append(even, loudest), factor
-
-
-def _sampled_lines(
-    lines: RangeLines, most_channels: int, energy: NDArray[np.float64] | None = None
-) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
-    """Return the lines of representative channels, and a factor for each."""
-    index, factor = representative_channels(lines, most_channels, energy)
-    return lines.samples if len(index) == lines.channels else lines.samples[index], factor
-
-
-def line_energy(samples: NDArray[np.complex64]) -> NDArray[np.float64]:
-    """Return the energy of every line, scaled if squares would leave the range of float32."""
-    parts = samples.view(np.float32)
-    with np.errstate(over="ignore"):
-        energy = np.einsum("ij,ij->i", parts, parts)
-    if not _SUMMABLE[0] < energy.max() < _SUMMABLE[1]:
-        parts = parts / (_largest_part(samples) or 1.0)
-        energy = np.einsum("ij,ij->i", parts, parts)
-    return energy.astype(np.float64)
-
-
-def _mean_power(
-    samples: NDArray[np.complex64], factor: NDArray[np.float32]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return frequencies, cycles per sample, and power shares of the lines and of faded lines.
-
-    Lines that are faded towards both ends show the band without the leakage of cut lines. Every
-    line is multiplied by its `factor`.
-    """
-    largest = _largest_part(samples) or samples.real.dtype.type(1)
-    padding = 1 if samples.shape[1] >= _RESOLVED else 2
-    length = scipy.fft.next_fast_len(max(padding * samples.shape[1], 4))
-    power, faded = np.zeros(length), np.zeros(length)
-    parts = samples.view(samples.real.dtype)
-    blocks = -(-len(parts) // _LINES_TOGETHER)
-    for block, scale in zip(
-        np.array_split(parts, blocks), np.array_split(factor, blocks), strict=True
-    ):
-        amplitude = scipy.fft.fft((block / largest * scale[:, None]).view(samples.dtype), length)
-        # Apply a Hann window over the part of the FFT in which the lines lie.
-        ends = amplitude[:, -padding:], amplitude[:, :padding]
-        around = np.concatenate([ends[0], amplitude, ends[1]], axis=1)
-        windowed = (around[:, : -2 * padding] + around[:, 2 * padding :]) * np.float32(-0.5)
-        windowed += amplitude
-        power += _column_power(amplitude)
-        faded += _column_power(windowed)
-    frequency = scipy.fft.fftfreq(length)
-    if not power.any():
-        power[:] = 1.0
-    if not faded.any():
-        faded = power
-    return frequency, power / power.sum(), faded / faded.sum()
-
-
-def _column_power(amplitude: NDArray[np.complexfloating]) -> NDArray[np.float64]:
-    """Return the power of every column; the amplitudes are overwritten."""
-    parts = amplitude.view(amplitude.real.dtype)
-    squares = np.multiply(parts, parts, out=parts).sum(axis=0)
-    return squares.astype(np.float64).reshape(-1, 2).sum(axis=1)
 
 
 def _image_power(
@@ -394,6 +297,97 @@ def _image_power(
     found = power.copy()
     found[coherent] *= np.maximum(gain, 0.0)
     return found / found.sum()
+
+
+def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: float) -> float:
+    """Return the error power due to aliasing of the power opposite the centre, in a full band.
+
+    Aliased power is missing on one side and wrong on the other, so it counts twice. With a guard
+    band there is only noise, equal on both sides.
+    """
+    if width <= 1 / NEEDED_OVERSAMPLING:
+        return 0.0
+    closing = max(_CLOSING, 1.5 / len(power))
+    return 2 * float(power[distance > 0.5 - closing].sum())
+
+
+def middle_cycles_per_m(lines: RangeLines) -> float:
+    """Return the two-way phase per metre of range in the middle of the occupied band, cycles."""
+    return float(cycles_per_m_at(lines, measure_spectrum(lines).centre))
+
+
+def power_spectrum(lines: RangeLines) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return frequencies, cycles per sample, ascending in [-0.5, 0.5), and their power shares.
+
+    Lines are faded towards both ends, which removes the leakage of cut lines.
+    """
+    frequency, _, power = _mean_power(lines, MEASURED_CHANNELS)
+    order = np.argsort(frequency)
+    return frequency[order], power[order]
+
+
+def occupied_band(spectrum: Spectrum, outside: float) -> tuple[float, float]:
+    """Return centre and half width of the band that contains all but a share of the power."""
+    bins = np.searchsorted(np.cumsum(spectrum.share), 1 - outside)
+    return spectrum.centre, float(min((bins + 1) / (2 * len(spectrum.power)), 0.5))
+
+
+def power_outside(lines: RangeLines, centre: float, half_width: float, most_channels: int) -> float:
+    """Return the share of the power of sampled lines outside a band, given in cycles per sample."""
+    frequency, power, _ = _mean_power(lines, most_channels)
+    return float(power[_distance(frequency, centre) > half_width].sum())
+
+
+def shares_of_bins(
+    position: NDArray[np.float64], share: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the shares in the bins -n, ..., n, [2 n + 1].
+
+    A share that lies between two bins is divided between them.
+
+    Parameters
+    ----------
+    position, share : float64 [...]
+        Positions in bins, which may be fractions, and the share at each.
+    """
+    most = int(np.ceil(np.abs(position).max()))
+    from_first = position.ravel() + most
+    lower = np.minimum(from_first.astype(np.int64), max(2 * most - 1, 0))
+    above = share.ravel() * (from_first - lower)
+    count = 2 * most + 1
+    found: Any = np.bincount(lower, share.ravel() - above, count)
+    return (found + np.bincount(lower + 1, above, count + 1)[:count]) / share.sum()
+
+
+def representative_channels(
+    lines: RangeLines, most: int, energy: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return up to `most` evenly spread channels and the loudest ones, and a factor for each.
+
+    Multiplied by these factors, the channels have the power of all. `energy` is the `line_energy`
+    of the lines, if it is known.
+    """
+    some = some_channels(lines.channels, most)
+    if len(some) == lines.channels:
+        return some, np.ones(lines.channels, np.float32)
+    energy = line_energy(lines.samples) if energy is None else energy
+    loudest = np.argpartition(energy, -_LOUDEST)[-_LOUDEST:]
+    even = np.setdiff1d(some, loudest)
+    rest, held = energy.sum() - energy[loudest].sum(), energy[even].sum()
+    weight = np.sqrt(max(rest, 0.0) / held) if held > 0 else 0.0
+    factor = np.append(np.full(len(even), weight), np.ones(len(loudest))).astype(np.float32)
+    return np.append(even, loudest), factor
+
+
+def line_energy(samples: NDArray[np.complex64]) -> NDArray[np.float64]:
+    """Return the energy of every line, scaled if squares would leave the range of float32."""
+    parts = samples.view(np.float32)
+    with np.errstate(over="ignore"):
+        energy = np.einsum("ij,ij->i", parts, parts)
+    if not _SUMMABLE[0] < energy.max() < _SUMMABLE[1]:
+        parts = parts / (_largest_part(samples) or 1.0)
+        energy = np.einsum("ij,ij->i", parts, parts)
+    return energy.astype(np.float64)
 
 
 def _largest_part(samples: NDArray[np.complex64]) -> np.float32:
