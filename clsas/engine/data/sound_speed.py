@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
-from clsas.engine.data.extras import needed
 
 SLOWEST_M_S, FASTEST_M_S = 1300.0, 1800.0
 """Slowest and fastest sound in water: fresh water near freezing has 1402 m/s, hot brines of the
@@ -204,8 +203,8 @@ class SoundSpeed:
         .. [1] McDougall, Barker, "Getting started with TEOS-10 and the Gibbs Seawater (GSW)
            Oceanographic Toolbox", SCOR/IAPSO WG127, 2011.
         """
-        with needed("SoundSpeed.from_teos10"):
-            import gsw
+        import clsas.simulation
+
         depth, temperature, salinity = _measured(depth_m, temperature_c, salinity)
         for name, values, unit, least, most in (
             ("depth_m", depth, "m", 0.0, _DEEPEST_M),
@@ -218,9 +217,8 @@ class SoundSpeed:
             "longitude_deg", longitude_deg, "degrees", least=-180.0, most=360.0
         )
         latitude = validate.number("latitude_deg", latitude_deg, "degrees", least=-90.0, most=90.0)
-        pressure = gsw.p_from_z(-depth, latitude)
-        absolute = gsw.SA_from_SP(salinity, pressure, longitude, latitude)
-        speed = gsw.sound_speed_t_exact(absolute, temperature, pressure)
+        place = longitude, latitude
+        speed = clsas.simulation.teos10_speed_m_s(depth, temperature, salinity, *place)
         return cls(depth, speed, surface_z_m)
 
     @property
