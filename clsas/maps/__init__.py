@@ -1,1 +1,13 @@
-"""Images on maps: GeoTIFF, netCDF, and pictures with world files, for other programs."""
+"""Images on maps: GeoTIFF, netCDF, and pictures with world files, for other programs.
+
+The functions below do what methods of `Georeference` and `Track` promise.
+"""
+
+from clsas.maps.georeferencing import convergence_deg as convergence_deg
+from clsas.maps.georeferencing import from_geographic as from_geographic
+from clsas.maps.georeferencing import geographic_poses as geographic_poses
+from clsas.maps.georeferencing import map_crs as map_crs
+from clsas.maps.georeferencing import name_of_crs as name_of_crs
+from clsas.maps.georeferencing import to_geographic as to_geographic
+from clsas.maps.map_grids import affine as affine
+from clsas.maps.map_grids import north_up as north_up

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from clsas.engine.data import map_grids, validate
+from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
@@ -17,7 +17,7 @@ from clsas.engine.data.version import __version__
 from clsas.engine.factorized.plan import Plan
 from clsas.files.sidecars import remove_sidecars
 from clsas.interferometry.result import Heights
-from clsas.maps import geotiff, netcdf, sicd, viewer, world_files
+from clsas.maps import geotiff, map_grids, netcdf, sicd, viewer, world_files
 from clsas.maps.collection import check_lines
 from clsas.maps.export_options import HEIGHT_SUFFIXES, SUFFIXES, ExportOptions
 from clsas.maps.geotiff import Progress

@@ -10,7 +10,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.map_grids import completed_steps
+from clsas.maps.map_grids import completed_steps
 
 _LEVEL = 0.5  # cosine between the normal of a plane and the vertical above which it is a map
 _DEGREE = 5  # of polynomials for latitudes and longitudes

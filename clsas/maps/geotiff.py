@@ -25,7 +25,6 @@ from clsas.engine.data.atomic import assembling
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.extras import needed
 from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.map_grids import Affine
 from clsas.maps.agreement import LEAST_AGREEMENT, agreement
 from clsas.maps.bands import Band, bands_of
 from clsas.maps.carrier import Carrier
@@ -33,6 +32,7 @@ from clsas.maps.collection import Collection
 from clsas.maps.encoding import Encoding, colour_table
 from clsas.maps.geotiff_checks import check_space, check_whole, raise_cause
 from clsas.maps.interpolation import InexactError, Interpolation
+from clsas.maps.map_grids import Affine
 from clsas.maps.orientation import Orientation
 from clsas.maps.resampling import Resampling, north_up, steps_m
 from clsas.maps.sources import Source, windows_of

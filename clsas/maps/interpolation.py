@@ -22,8 +22,8 @@ from scipy.sparse import csr_array
 
 from clsas.engine.data.fourier import gridding, gridding_gain, taps_for
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.map_grids import Affine
 from clsas.maps.carrier import Carrier
+from clsas.maps.map_grids import Affine
 from clsas.maps.resampling import averaged, lattice, steps_m
 
 MOST_ERROR_DB = -40.0

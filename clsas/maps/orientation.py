@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.map_grids import Affine
+from clsas.maps.map_grids import Affine
 
 _SAME = 1e-9  # smallest gain for which a raster is turned, far above rounding
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from clsas.engine.data.map_grids import Affine, cover
 from clsas.maps.bands import Band
+from clsas.maps.map_grids import Affine, cover
 
 _CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
 _MOST_AVERAGED = 16  # samples per pixel and axis; coarser pixels are refused

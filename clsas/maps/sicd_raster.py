@@ -11,8 +11,9 @@ import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
-from clsas.engine.data.georeference import Georeference, geographic
+from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
+from clsas.maps.georeferencing import geographic
 from clsas.maps.orientation import Orientation
 
 _OVERHEAD = 1e-3  # radians from the vertical within which there is no direction of range

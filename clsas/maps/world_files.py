@@ -10,7 +10,7 @@ import numpy as np
 
 from clsas.engine.data.atomic import replacing
 from clsas.engine.data.image import Image
-from clsas.engine.data.map_grids import Affine, is_vertical, warn_of_place
+from clsas.maps.map_grids import Affine, is_vertical, warn_of_place
 from clsas.plot import image_db
 from clsas.plot.canvas import PADDING_IN, PNG_DPI, length_unit, save
 

@@ -1,7 +1,7 @@
 """Georeferences: where the coordinates of lines, grids and images lie on Earth.
 
-pyproj is imported only when coordinates are converted or a coordinate reference system is checked,
-so that georeferenced files can be read without it.
+A georeference is a tag that NumPy suffices for. `clsas.maps` looks up coordinate reference systems
+and converts coordinates; methods import it when they are called.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.engine.data import projections, reprs, validate
+from clsas.engine.data import reprs, validate
 
 if TYPE_CHECKING:
     import pyproj
 
-    from clsas.engine.data.grid import Grid
+    from clsas import Grid
 
 _LOCAL = ("latitude_deg", "longitude_deg", "height_m", "heading_deg")
 _MOST_HEIGHT_M = 1e5
@@ -104,7 +104,7 @@ class Georeference:
         for name in _LOCAL:
             if getattr(self, name) is None:
                 raise ValueError(f"{name} must be given unless crs is")
-        latitude, longitude = projections.checked(self.latitude_deg, self.longitude_deg, ())
+        latitude, longitude = checked_degrees(self.latitude_deg, self.longitude_deg, ())
         put("latitude_deg", float(latitude))
         put("longitude_deg", float(longitude))
         put("height_m", _height("height_m", self.height_m))
@@ -157,9 +157,9 @@ class Georeference:
         >>> clsas.Georeference.projected("epsg:32632")
         Georeference(EPSG:32632)
         """
-        found = projections.known(_words("crs", crs))
-        authority = found.to_authority(min_confidence=100)
-        name = crs if authority is None else ":".join(authority)
+        import clsas.maps
+
+        name = clsas.maps.name_of_crs(_words("crs", crs))
         return cls(crs=name, vertical_datum=vertical_datum)
 
     @classmethod
@@ -231,12 +231,9 @@ class Georeference:
         ValueError, ImportError
             As for `wkt`.
         """
-        if self.crs is not None:
-            return projections.known(self.crs)
-        assert self.latitude_deg is not None
-        assert self.longitude_deg is not None
-        assert self.height_m is not None
-        return projections.centred_on(self.latitude_deg, self.longitude_deg, self.height_m)
+        import clsas.maps
+
+        return clsas.maps.map_crs(self)
 
     def to_map(self, positions_m: ArrayLike) -> NDArray[np.float64]:
         """Return easting, northing and height of positions x, y, z, float64 [..., 3], metres.
@@ -286,9 +283,9 @@ class Georeference:
         ClsasWarning
             If PROJ lacks the grid of a datum shift that would be more accurate there.
         """
-        found = geographic(self, positions_m)
-        self._warn_of_missing_grid(found)
-        return found
+        import clsas.maps
+
+        return clsas.maps.to_geographic(self, positions_m)
 
     def from_geographic(
         self, latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike
@@ -322,15 +319,9 @@ class Georeference:
         >>> place.from_geographic(60.39, 5.32, 10.0)
         array([ 0.,  0., 10.])
         """
-        latitude, longitude = projections.checked(latitude_deg, longitude_deg)
-        height = validate.array("height_m", height_m, np.float64, None)
-        latitude, longitude, height = projections.alike(latitude, longitude, height)
-        easting_m, northing_m = projections.to_map(self.map_crs()).transform(longitude, latitude)
-        place_m = np.stack([easting_m, northing_m, height], axis=-1)
-        if not np.isfinite(place_m).all():
-            raise ValueError(f"latitude_deg and longitude_deg must lie within the map of {self}")
-        self._warn_of_missing_grid(np.stack([latitude, longitude], axis=-1))
-        return self.from_map(place_m)
+        import clsas.maps
+
+        return clsas.maps.from_geographic(self, latitude_deg, longitude_deg, height_m)
 
     def convergence_deg(
         self, latitude_deg: ArrayLike, longitude_deg: ArrayLike
@@ -344,12 +335,9 @@ class Georeference:
         TypeError, ValueError, ImportError
             As for `from_geographic`.
         """
-        latitude, longitude = projections.alike(*projections.checked(latitude_deg, longitude_deg))
-        crs = self.map_crs()  # raises if pyproj is missing
-        import pyproj
+        import clsas.maps
 
-        factors = pyproj.Proj(crs).get_factors(longitude, latitude)
-        return np.asarray(factors.meridian_convergence, np.float64)
+        return clsas.maps.convergence_deg(self, latitude_deg, longitude_deg)
 
     def affine(self, grid: Grid) -> tuple[float, float, float, float, float, float]:
         """Return the transform from columns and rows of a grid to easting and northing.
@@ -378,9 +366,9 @@ class Georeference:
         >>> place.affine(clsas.Grid.plane((500_000, 500_100, 101), (6_700_000, 6_700_050, 101)))
         (1.0, 0.0, 499999.5, 0.0, 0.5, 6699999.75)
         """
-        from clsas.engine.data import map_grids  # imports Grid, which imports this module
+        import clsas.maps
 
-        return map_grids.affine(self, grid)
+        return clsas.maps.affine(self, grid)
 
     def north_up(self, grid: Grid, pixel_m: float | None = None) -> Grid:
         """Return the smallest horizontal grid along the axes of the map that covers another one.
@@ -412,9 +400,9 @@ class Georeference:
         >>> place.affine(north_up)[1], place.affine(north_up)[3]
         (0.0, 0.0)
         """
-        from clsas.engine.data import map_grids
+        import clsas.maps
 
-        return map_grids.north_up(self, grid, pixel_m)
+        return clsas.maps.north_up(self, grid, pixel_m)
 
     @property
     def axes(self) -> NDArray[np.float64]:
@@ -426,25 +414,6 @@ class Georeference:
         for _ in range(int(quarter)):
             sine, cosine = cosine, -sine
         return np.array([[sine, cosine], [-cosine, sine]])
-
-    def _warn_of_missing_grid(self, geographic_deg: NDArray[np.float64]) -> None:
-        """Warn if PROJ lacks a better datum shift at the first of latitudes and longitudes."""
-        if self.is_projected and geographic_deg.size:
-            latitude, longitude = geographic_deg.reshape(-1, geographic_deg.shape[-1])[0, :2]
-            projections.warn_of_missing_grid(self.map_crs(), str(self), latitude, longitude)
-
-
-def geographic(place: Georeference, positions_m: ArrayLike) -> NDArray[np.float64]:
-    """Return what `Georeference.to_geographic` does, and leave out its warning."""
-    place_m = place.to_map(positions_m)
-    easting_m, northing_m = place_m[..., 0], place_m[..., 1]
-    longitude, latitude = projections.to_map(place.map_crs()).transform(
-        easting_m, northing_m, direction="INVERSE"
-    )
-    found = np.stack([latitude, longitude, place_m[..., 2]], axis=-1)
-    if not np.isfinite(found).all():
-        raise ValueError(f"positions_m must lie within the map of {place}")
-    return found
 
 
 class Recorded(Protocol):
@@ -471,6 +440,42 @@ def placed(lines: Recorded, grid: Grid) -> Grid:
         f"grid must have the georeference of the lines ({lines.georeference}), "
         f"got {grid.georeference}"
     )
+
+
+def checked_degrees(
+    latitude_deg: Any, longitude_deg: Any, shape: tuple[int | None, ...] | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return latitudes and longitudes, checked; longitudes are from -180 up to 180 degrees.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is outside its limits; the message says so if both are probably swapped.
+    """
+    if shape == ():
+        latitude = np.array(validate.number("latitude_deg", latitude_deg, "degrees"))
+        longitude = np.array(validate.number("longitude_deg", longitude_deg, "degrees"))
+    else:
+        latitude = validate.array("latitude_deg", latitude_deg, np.float64, shape)
+        longitude = validate.array("longitude_deg", longitude_deg, np.float64, shape)
+    farthest = np.abs(latitude).max(initial=0.0)
+    if farthest > 90:
+        hint = ""
+        if farthest <= 360 and np.abs(longitude).max(initial=0.0) <= 90:
+            hint = "; latitude_deg and longitude_deg are probably swapped"
+        raise ValueError(
+            f"latitude_deg must be from -90 to 90 degrees, got {_worst(latitude):.10g}{hint}"
+        )
+    if longitude.size and (longitude.min() < -180 or longitude.max() > 360):
+        raise ValueError(
+            f"longitude_deg must be from -180 to 360 degrees, got {_worst(longitude):.10g}"
+        )
+    return latitude, np.where(longitude >= 180, longitude - 360, longitude)
+
+
+def _worst(values: NDArray[np.float64]) -> float:
+    """Return the value that is farthest from 0."""
+    return float(values.reshape(-1)[np.abs(values).argmax()])
 
 
 def _words(name: str, value: object) -> str:

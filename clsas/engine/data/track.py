@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from clsas.engine.data import geographic_track, reprs, validate
+from clsas.engine.data import reprs, validate
 from clsas.engine.data.findings import warn_of
 from clsas.engine.data.fixes import doubts_of_track
 from clsas.engine.data.georeference import Georeference
@@ -252,7 +252,9 @@ class Track:
         ... ).georeference
         Georeference(latitude 60.39005 deg, longitude 5.32 deg, height -20 m, heading 0 deg)
         """
-        positions, yaw_rad, frame = geographic_track.poses(
+        import clsas.maps
+
+        positions, yaw_rad, frame = clsas.maps.geographic_poses(
             latitude_deg, longitude_deg, height_m, heading_deg, georeference
         )
         pings = len(positions)

@@ -6,13 +6,18 @@ These functions are methods of `Georeference`, which documents them.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.engine.data import projections, validate
-from clsas.engine.data.georeference import Georeference, geographic
+from clsas.engine.data import validate
+from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
+from clsas.maps.georeferencing import geographic
+
+if TYPE_CHECKING:
+    import pyproj
 
 Affine = tuple[float, float, float, float, float, float]
 """Transform from columns and rows to easting and northing: see `Georeference.affine`."""
@@ -21,6 +26,7 @@ _ROUNDING = 1e-12  # part of a step that may come from rounding: 1e-7 pixels ove
 # Distance outside the area of use that is no mistake: zones of UTM are used as far beyond their
 # edges, such as zone 32 in western Norway. Places near x = 0 are farther away.
 _OUTSIDE_KM = 150.0
+_DEGREE_KM = 111.3  # of latitude, to 1 %
 _SCALE = 0.01  # difference of the scale from 1 that is probably a mistake: 0.001 within UTM zones
 _PARALLEL = 1e-6  # sine of the least angle between rows and columns, seen from above
 
@@ -123,8 +129,8 @@ def warn_of_place(grid: Grid) -> None:
     except ValueError:
         validate.warn(f"the middle of the grid is outside the map of {place}{hint}")
         return
-    outside_km = projections.outside_km(crs, latitude, longitude)
-    scale = projections.scale_of(crs, latitude, longitude)
+    outside_km = _outside_km(crs, latitude, longitude)
+    scale = _scale_of(crs, latitude, longitude)
     is_outside = outside_km > _OUTSIDE_KM
     if is_outside or not abs(scale - 1) <= _SCALE:
         area = f"{outside_km:.0f} km outside the area of use of {place}, " if is_outside else ""
@@ -132,6 +138,31 @@ def warn_of_place(grid: Grid) -> None:
             f"the middle of the grid is at latitude {latitude:.4f}, longitude {longitude:.4f}, "
             f"{area}where distances on the map are {scale:.4g} times true ones{hint}"
         )
+
+
+def _outside_km(crs: pyproj.CRS, latitude_deg: float, longitude_deg: float) -> float:
+    """Return about how far a place lies outside the area of use of a map; 0 if none is known."""
+    area = crs.area_of_use
+    if area is None and crs.sub_crs_list:  # a compound one, with heights
+        area = crs.sub_crs_list[0].area_of_use
+    if area is None:
+        return 0.0
+    north = max(area.south - latitude_deg, latitude_deg - area.north, 0.0)
+    east = 0.0
+    if area.east - area.west < 360:
+        # An area across the antimeridian has its western edge east of the eastern one.
+        width = (area.east - area.west) % 360
+        past = (longitude_deg - area.west) % 360
+        east = 0.0 if past <= width else min(past - width, 360 - past)
+    return math.hypot(north, east * math.cos(math.radians(latitude_deg))) * _DEGREE_KM
+
+
+def _scale_of(crs: pyproj.CRS, latitude_deg: float, longitude_deg: float) -> float:
+    """Return the point scale of a map: the one along a meridian or parallel farther from 1."""
+    import pyproj
+
+    factors = pyproj.Proj(crs).get_factors(longitude_deg, latitude_deg)
+    return max(factors.meridional_scale, factors.parallel_scale, key=lambda scale: abs(scale - 1))
 
 
 def cover(
