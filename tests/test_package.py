@@ -37,6 +37,35 @@ def test_help_and_version_import_nothing_slow(option):
     assert imported(f"from clsas.cli import main\n{command}") == set()
 
 
+def imports_of(source):
+    """The absolute imports of a program: name, whether a function makes it, whether types do."""
+
+    def within(node, called, typed):
+        if isinstance(node, ast.Import):
+            yield from ((name.name, called, typed) for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield node.module, called, typed
+        called |= isinstance(node, ast.FunctionDef)
+        typed |= isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        for child in ast.iter_child_nodes(node):
+            yield from within(child, called, typed)
+
+    return within(ast.parse(source), False, False)
+
+
+ENGINE = sorted((ROOT / "clsas" / "engine").rglob("*.py"))
+
+
+@pytest.mark.parametrize("module", ENGINE, ids=lambda path: path.stem)
+def test_the_engine_imports_numpy_scipy_and_pyopencl_alone(module):
+    """Methods may import what else there is of clsas, and annotations any type."""
+    known = {"numpy", "scipy", "pyopencl", *sys.stdlib_module_names}
+    for name, called, typed in imports_of(module.read_text()):
+        package = name.partition(".")[0]
+        is_inside = package in known or name.startswith("clsas.engine")
+        assert is_inside or typed or (called and package == "clsas"), name
+
+
 @pytest.mark.slow
 def test_the_imagers_do_without_slow_packages():
     used = imported("import clsas; clsas.backproject, clsas.plan, clsas.Plan, clsas.compress")

@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 IMAGING = """
+from dataclasses import replace
 import numpy as np
 import clsas
 from clsas.engine.factorized.costs import Costs
@@ -145,6 +146,15 @@ print({sorted(optional)}, [n for n in {sorted(optional)} if importlib.util.find_
 def test_echoes_and_images_need_numpy_scipy_and_pyopencl_alone():
     program = """
 assert clsas.relative_error_db(clsas.wavenumber(lines, grid), exact) < -40
+place = clsas.Georeference.local(60.39, 5.32, heading_deg=217)
+assert clsas.backproject(replace(lines, georeference=place), grid).georeference == place
+history = np.exp(-4j * np.pi * (4e4 + 20 * np.arange(128)) * (20.6 - 20) / 1500)
+found = clsas.from_phase_history(
+    [history], first_frequency_hz=4e4, frequency_step_hz=20, reference_range_m=20,
+    tx_m=[0, 0, 0], rx_m=[0, 0, 0], sound_speed_m_s=1500,
+)
+peak_m = found.first_range_m[0] + found.range_step_m * np.abs(found.samples[0]).argmax()
+assert abs(peak_m - 20.6) < found.range_step_m
 sonar = clsas.Sonar(clsas.Pulse(100e3, 20e3, 1e-3), rx_m=[[0, 0, 0]])
 track = clsas.Track.straight((0, 0, 0), (1, 0, 0), pings=2, ping_interval_s=0.1)
 compressed = clsas.compress(clsas.simulate(sonar, track, clsas.PointTargets([[0, 20, 0]])))
@@ -182,10 +192,17 @@ for name in clsas.__all__:
 
 @pytest.mark.slow
 def test_calls_say_what_to_install():
+    needed, maps = "is not installed, and is needed for", "coordinate reference systems: "
+    teos10, sea = "clsas.SoundSpeed.from_teos10", "SoundSpeed.from_teos10: "
     calls = {
         "clsas.to_xarray(grid)": "xarray is not installed, and is needed for to_xarray: ",
         "image.plot()": "matplotlib is not installed, and is needed for pictures: ",
         "clsas.plot.image_db(image)": "matplotlib is not installed, and is needed for pictures: ",
+        "clsas.Georeference.projected('EPSG:32632')": f"pyproj {needed} {maps}",
+        "place.wkt()": f"pyproj {needed} {maps}",
+        "place.to_geographic([0, 1, 2])": f"pyproj {needed} {maps}",
+        "clsas.Track.from_geographic([1, 1], [2, 3], 0, 90, [0, 1])": f"pyproj {needed} {maps}",
+        f"{teos10}([0, 9], 5, 35, longitude_deg=1, latitude_deg=2)": f"gsw {needed} {sea}",
     }
     program = f"""
 import numpy as np
@@ -194,6 +211,7 @@ track = np.zeros((8, 3))
 grid = clsas.Grid.plane(x=(0, 1, 4), y=(9, 10, 4))
 image = clsas.Image(np.ones((4, 4), complex), grid)
 lines = clsas.RangeLines(np.ones((8, 50), complex), 7.0, 0.1, track, track, 0, 1500)
+place = clsas.Georeference.local(60.39, 5.32, heading_deg=217)
 for call in {list(calls)}:
     try:
         eval(call)
