@@ -1,6 +1,6 @@
 """Images on maps: GeoTIFF, netCDF, and pictures with world files, for other programs.
 
-The functions below do what methods of `Georeference` and `Track` promise.
+The functions below implement methods of `Georeference` and `Track`.
 """
 
 from clsas.maps.georeferencing import convergence_deg as convergence_deg

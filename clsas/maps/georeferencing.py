@@ -1,7 +1,7 @@
-"""Where positions lie on Earth: latitudes and longitudes, map projections and tracks.
+"""Conversions of positions and tracks to maps, and to and from latitudes and longitudes.
 
 `Georeference` and `Track.from_geographic` document these functions. pyproj, which knows the
-projections, is imported only when one of them needs it.
+projections, is imported only when it is used.
 """
 
 from __future__ import annotations

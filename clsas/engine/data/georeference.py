@@ -1,7 +1,7 @@
 """Georeferences: where the coordinates of lines, grids and images lie on Earth.
 
-A georeference is a tag that NumPy suffices for. `clsas.maps` looks up coordinate reference systems
-and converts coordinates; methods import it when they are called.
+A georeference is a tag that lines and grids carry. `clsas.maps` looks up its coordinate reference
+system, converts to latitudes and longitudes, and places grids; methods import it when called.
 """
 
 from __future__ import annotations
