@@ -9,14 +9,12 @@ if TYPE_CHECKING:
     from clsas import plot
     from clsas.engine.data.beam import BeamWindow
     from clsas.engine.data.contrast import contrast, entropy
-    from clsas.engine.data.density import density_compensated, density_weights
     from clsas.engine.data.findings import Finding
     from clsas.engine.data.georeference import Georeference
     from clsas.engine.data.grid import Grid
     from clsas.engine.data.image import Image
     from clsas.engine.data.image_error import relative_error_db
     from clsas.engine.data.lines import RangeLines
-    from clsas.engine.data.sampling import check_sampling
     from clsas.engine.data.sound_speed import SoundSpeed
     from clsas.engine.data.system import Pulse, Sonar
     from clsas.engine.data.track import Pointing, Track, channels
@@ -42,6 +40,7 @@ if TYPE_CHECKING:
     from clsas.files.xarrays import to_xarray
     from clsas.inspection.inspection import inspect
     from clsas.inspection.result import Inspection, PhaseSign
+    from clsas.inspection.sampling import check_sampling
     from clsas.interferometry.heights import heights
     from clsas.interferometry.interferogram import Interferogram, interferogram
     from clsas.interferometry.pair_errors import PairErrors, pair_errors
@@ -50,6 +49,7 @@ if TYPE_CHECKING:
     from clsas.measures.assessment import assess, survey_lines
     from clsas.measures.assessment_result import Assessment, Effect
     from clsas.measures.certificate import Certificate, certify
+    from clsas.measures.density import density_compensated, density_weights
     from clsas.measures.limits_result import Limit, Limits
     from clsas.measures.looks import multilook
     from clsas.measures.quality import measure_point
@@ -210,8 +210,8 @@ _MODULES = {
     "simulation.scenes": "PointTargets Seabed",
     "simulation.simulator": "simulate simulate_lines",
     "engine.data.beam": "BeamWindow",
-    "engine.data.density": "density_compensated density_weights",
-    "engine.data.sampling": "check_sampling",
+    "measures.density": "density_compensated density_weights",
+    "inspection.sampling": "check_sampling",
     "engine.data.system": "Pulse Sonar",
     "engine.data.track": "Pointing Track channels",
 }

@@ -47,9 +47,8 @@ def test_the_seed_that_is_printed_repeats_the_order():
 
     def order(*options):
         command = [sys.executable, "-m", "pytest", "-vv", "-p", "no:cacheprovider"]
-        files = [
-            f"tests/engine/data/test_{name}.py" for name in ("image", "lines", "pings", "tables")
-        ]
+        names = ("image", "lines", "pings", "reprs")
+        files = [f"tests/engine/data/test_{name}.py" for name in names]
         done = subprocess.run(
             [*command, *options, *files], cwd=TESTS.parent, capture_output=True, text=True
         )

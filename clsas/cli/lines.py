@@ -18,10 +18,10 @@ from clsas.cli.parameters import HDF5, INPUT, Output
 from clsas.cli.wording import command
 from clsas.engine.data import validate
 from clsas.engine.data.conditioning import STATISTICS, high_passed, tapered_ends
-from clsas.engine.data.density import noise_penalty_db
 from clsas.engine.signal.compression import check_options
 from clsas.files.cphd_writing import SUFFIXES as CPHD
 from clsas.files.formats import SUFFIXES
+from clsas.measures.density import noise_penalty_db
 from clsas.simulation.simulator import check_size
 
 

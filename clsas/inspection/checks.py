@@ -20,7 +20,6 @@ from clsas.engine.data.lines import RangeLines, some_channels
 from clsas.engine.data.looking import behind
 from clsas.engine.data.pings import STILL
 from clsas.engine.data.reprs import measured
-from clsas.engine.data.sampling import check_sampling
 from clsas.engine.signal.ambiguity import end_powers
 from clsas.engine.signal.doubts import MOST_WAVELENGTHS, doubts
 from clsas.engine.signal.spectrum import NEEDED_OVERSAMPLING
@@ -33,6 +32,7 @@ from clsas.inspection.recording import (
     constant_share,
 )
 from clsas.inspection.result import runs
+from clsas.inspection.sampling import check_sampling
 from clsas.inspection.slips import POINTS, covered, likely_slip, ranges_m
 
 _GAP = 1.75

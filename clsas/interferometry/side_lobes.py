@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.signal import fftconvolve
 
-from clsas.engine.data.density import usual_spacing_m
 from clsas.engine.data.directions import track_directions
 from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.grid import Grid
@@ -34,6 +33,7 @@ from clsas.engine.data.wavelengths import wavelength_m
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.pair import Pair
+from clsas.measures.density import usual_spacing_m
 
 # Share of the power of a window from elsewhere above which a height is not valid. On the simulated
 # wreck 0.25 masks 2 % of the lit pixels that are right, 0.5 a quarter of a percent, and 1 leaves

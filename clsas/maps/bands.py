@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.means import block_sums
 from clsas.maps.sources import Source
+from clsas.mosaics.means import block_sums
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.engine.data.means import block_means
+from clsas.mosaics.means import block_means
 
 SIDE = 512
 """Pixels along a side of a tile. Half as many would make four times as many files; twice as many

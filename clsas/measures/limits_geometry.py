@@ -18,12 +18,12 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import some_channels
-from clsas.engine.data.sampling import corners_of, course, grating_lobe_m
 from clsas.engine.data.system import Sonar
 from clsas.engine.data.track import Pointing, Track, channels
 from clsas.engine.data.visibility import sines
 from clsas.engine.signal.compression import Window
 from clsas.engine.signal.compression import check_options as check_compression
+from clsas.inspection.sampling import corners_of, course, grating_lobe_m
 from clsas.measures.resolution import (
     View,
     azimuth_width_m,

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.engine.data.elevation import sight_along
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.system import Sonar
 from clsas.engine.data.track import Track, channels
+from clsas.measures.elevation import sight_along
 from clsas.measures.limits_common import NO_GRID, Result, result
 from clsas.measures.limits_geometry import Survey
 from clsas.measures.limits_result import shown

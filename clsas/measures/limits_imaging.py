@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from clsas.engine.data.sampling import SLACK
+from clsas.inspection.sampling import SLACK
 from clsas.measures.limits_common import (
     CURVED,
     NO_ELEMENT,

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from clsas.engine.data.sampling import (
+from clsas.inspection.sampling import (
     SLACK,
     corners_of,
     measure_spacing,

@@ -15,11 +15,11 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db
 from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.sampling import course
 from clsas.engine.data.system import Sonar, element_pattern
 from clsas.engine.data.track import Pointing, Track, channels
 from clsas.engine.data.visibility import sines
 from clsas.engine.signal.compression import Window, band_window
+from clsas.inspection.sampling import course
 
 _FREQUENCIES = 4001  # across the band; twice as many change widths by 1e-4 at most
 _PER_WIDTH = 4  # positions per -3 dB width at which the level of a grating lobe is computed

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
-from clsas.engine.data.means import block_means
+from clsas.mosaics.means import block_means
 
 _FINEST = 5  # pixels of a level along each side of an overview pixel, before a larger step is tried
 _LARGER = 4 / 3  # largest step over the smallest, so that a coarser level can be read

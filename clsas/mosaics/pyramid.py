@@ -22,8 +22,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.engine.data.means import block_means
 from clsas.mosaics.levels import IN_DB, PixelArray
+from clsas.mosaics.means import block_means
 
 Real = TypeVar("Real", np.float32, np.float64)
 

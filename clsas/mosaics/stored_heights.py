@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.grid import Grid, without_heights
 from clsas.engine.data.image import Image
-from clsas.engine.data.means import block_means
 from clsas.interferometry.refinement import filled
 from clsas.interferometry.result import Heights
 from clsas.mosaics.documents import read_document
 from clsas.mosaics.levels import LAYERS, WINDOW, level_shape
+from clsas.mosaics.means import block_means
 from clsas.mosaics.pyramid import coarser_layers
 
 if TYPE_CHECKING:

@@ -16,7 +16,6 @@ from clsas import plot
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.sampling import check_sampling
 from clsas.engine.data.system import Sonar
 from clsas.engine.data.track import Track
 from clsas.engine.device.device import Device, open_device
@@ -24,6 +23,7 @@ from clsas.engine.forming import form_exactly
 from clsas.engine.signal.compression import compress
 from clsas.files.hdf5 import save
 from clsas.files.scene_files import SceneFile, built_in_scene, read_scene
+from clsas.inspection.sampling import check_sampling
 from clsas.measures.quality import PointResponse, measure_point
 from clsas.measures.resolution import expected_resolution_m
 from clsas.simulation.scenes import PointTargets

@@ -40,7 +40,7 @@ def same_interpolator(
     """Return the image of a decision at some points, as the device forms it but in float64.
 
     The image of the device differs by rounding, by the expansion of the geometry, and by short
-    polynomials for sine and cosine (`clsas.engine.device.phases`).
+    polynomials for sine and cosine (`clsas.engine.device.kernels`).
 
     Parameters
     ----------

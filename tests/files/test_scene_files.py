@@ -9,13 +9,13 @@ from pydantic_core import PydanticUndefined
 
 import clsas
 from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.sampling import check_sampling
 from clsas.engine.data.system import BARKER_13
 from clsas.files import scene_files as config
 from clsas.files.mistakes import models_in
 from clsas.files.scene_tables import SceneTables
 from clsas.files.survey_tables import PRESETS
 from clsas.files.track_files import read_track
+from clsas.inspection.sampling import check_sampling
 from clsas.simulation.scenes import PointTargets, Seabed
 from clsas.simulation.seabeds import rocks
 

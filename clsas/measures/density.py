@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from clsas.engine.data import banks, decibels, reprs, validate
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.pings import STILL, Transmissions, means
-from clsas.engine.data.sampling import course
+from clsas.inspection.sampling import course
 
 _LOCAL = 11  # steps that are averaged to find the local course, as for turns of a track
 # Advance over `_LOCAL` steps, relative to the length of these steps, below which a track has no

@@ -7,13 +7,13 @@ import pytest
 from factorizing import EXACT_IS_SLOW
 
 import clsas
-from clsas.engine.data.density import (
+from clsas.engine.data.system import line_array
+from clsas.measures.density import (
     density_compensated,
     density_weights,
     noise_penalty_db,
     usual_spacing_m,
 )
-from clsas.engine.data.system import line_array
 
 CARRIER_HZ, SPEED_M_S = 100e3, 1500.0
 WAVELENGTH_M = SPEED_M_S / CARRIER_HZ

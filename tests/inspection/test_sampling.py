@@ -6,14 +6,14 @@ import pytest
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.sampling import (
+from clsas.engine.data.system import Pulse, Sonar, line_array
+from clsas.engine.data.track import Track, channels
+from clsas.inspection.sampling import (
     check_sampling,
     grating_lobe_m,
     phase_centres_m,
     receive_interval_s,
 )
-from clsas.engine.data.system import Pulse, Sonar, line_array
-from clsas.engine.data.track import Track, channels
 from clsas.measures.assessment import survey_lines
 
 GRID = Grid.plane(x=(0, 5, 64), y=(40, 45, 64))

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from clsas.engine.data.means import block_means
+from clsas.mosaics.means import block_means
 
 VALUES = np.arange(1.0, 16.0).reshape(3, 5)
 
