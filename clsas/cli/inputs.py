@@ -11,7 +11,8 @@ import click
 import clsas
 from clsas.cli.outputs import warn
 from clsas.cli.parameters import keep_apart, need_matplotlib, written_to
-from clsas.engine.data import banks, validate
+from clsas.engine.data import validate
+from clsas.engine.data.lines import first_two_banks
 from clsas.engine.factorized.planner import TOLERANCE_DB
 from clsas.files import scene_files as config
 from clsas.files.scene_files import SceneFile
@@ -71,7 +72,7 @@ def load_banks(
     """
     lines = load_lines(path, None, described)
     try:
-        return lines, banks.first_two(lines.bank_numbers)
+        return lines, first_two_banks(lines.bank_numbers)
     except ValueError as error:
         raise ValueError(f"{path} {error}" + (f": {remedy}" if remedy else "")) from None
 

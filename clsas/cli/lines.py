@@ -17,7 +17,7 @@ from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import HDF5, INPUT, Output
 from clsas.cli.wording import command
 from clsas.engine.data import validate
-from clsas.engine.data.conditioning import STATISTICS, high_passed, tapered_ends
+from clsas.engine.data.lines import STATISTICS
 from clsas.engine.signal.compression import check_options
 from clsas.files.cphd_writing import SUFFIXES as CPHD
 from clsas.files.formats import SUFFIXES
@@ -199,9 +199,9 @@ def convert(
     if without_background is not None:
         steps.append(lambda lines: lines.without_background(without_background))
     if high_pass_hz is not None:
-        steps.append(partial(high_passed, cutoff_hz=high_pass_hz, name="--high-pass-hz"))
+        steps.append(lambda lines: lines.high_passed(high_pass_hz))
     if taper_m is not None:
-        steps.append(partial(tapered_ends, length_m=taper_m, name="--taper-m"))
+        steps.append(lambda lines: lines.tapered_ends(taper_m))
     obj: Any
     if steps or compensate_density or bank is not None or output.suffix.lower() in CPHD:
         obj = load_lines(recording, bank)

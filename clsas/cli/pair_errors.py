@@ -14,9 +14,9 @@ from clsas.cli.inputs import load_banks, load_heights, read_beam
 from clsas.cli.outputs import printable, report
 from clsas.cli.parameters import HDF5_OR_STORE, INPUT, POSITION, keep_out
 from clsas.cli.wording import command
-from clsas.engine.data import banks, validate
+from clsas.engine.data import validate
 from clsas.files.scene_files import SceneFile
-from clsas.interferometry.pair_errors_result import UNKNOWNS
+from clsas.interferometry.pair_errors_result import UNKNOWNS, with_bank
 from clsas.mosaics.stored_heights import check_heights
 
 
@@ -113,7 +113,7 @@ def pair_errors(
         other=_measured(*other) if other else None, known_sd_m=known_sd_m,
         unknowns=unknowns or UNKNOWNS, tolerance_db=tolerance_db, beam=beam, device=device,
     )  # fmt: skip
-    clsas.save(output, banks.with_bank(lines, numbers[1], found.corrected(first, second)))
+    clsas.save(output, with_bank(lines, numbers[1], found.corrected(first, second)))
     described = found.describe().replace("\n", "\n  ")
     report(as_json, f"{printable(output)}: {described}", file=output, **found.figures)
 

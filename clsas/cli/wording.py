@@ -21,11 +21,13 @@ _RUNNING = "clsas.cli.running"  # key of the running command's context among tho
 # that the command has is used.
 _PARAMETERS = {
     "beam": ("scene_path",),
+    "cutoff_hz": ("high_pass_hz",),
     "follow_s": ("follow",),
     "georeference": ("crs",),
     "height_m": ("origin",),
     "images": ("source",),
     "latitude_deg": ("origin",),
+    "length_m": ("taper_m",),
     "lines": ("lines_path", "lines_file", "first_file", "recording"),
     "longitude_deg": ("origin",),
     "memory_bytes": ("memory_mib",),

@@ -13,10 +13,9 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.coverage import reaches, warn_unreached
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines, fastest
+from clsas.engine.data.lines import RangeLines, fastest, wavelength_m
 from clsas.engine.data.simplify import leave_out, simplify
 from clsas.engine.data.surface import Surface, surface_of
-from clsas.engine.data.wavelengths import wavelength_m
 from clsas.engine.signal.ambiguity import Ambiguity, ambiguity
 from clsas.engine.signal.doubts import warn_before_imaging
 from clsas.engine.signal.spectrum import Spectrum, line_energy, measure_spectrum

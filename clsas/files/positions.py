@@ -25,7 +25,7 @@ def checked_positions(path: str | os.PathLike, lines: RangeLines) -> RangeLines:
 
     Its pings are in the order of time, unlike those of lines in memory.
     """
-    pings = Transmissions.of(lines)
+    pings = Transmissions.of(lines.tx_m, lines.rx_m)
     if pings.count < 2:
         return lines
     if not pings.usual_step_m:

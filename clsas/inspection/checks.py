@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from clsas.engine.data import decibels
-from clsas.engine.data.conditioning import DEAD_DB, are_dead
 from clsas.engine.data.findings import Finding
 from clsas.engine.data.lines import RangeLines, some_channels
 from clsas.engine.data.looking import behind
@@ -34,6 +33,7 @@ from clsas.inspection.recording import (
 from clsas.inspection.result import runs
 from clsas.inspection.sampling import check_sampling
 from clsas.inspection.slips import POINTS, covered, likely_slip, ranges_m
+from clsas.navigation.correlation import DEAD_DB, are_dead
 
 _GAP = 1.75
 """Advance relative to that of the pings around, above which pings are missing. One missing ping

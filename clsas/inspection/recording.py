@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal.windows import hann
 
-from clsas.engine.data import banks, decibels
+from clsas.engine.data import decibels
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.lines import RangeLines, banks_of, some_channels, wavelength_between_m
 from clsas.engine.data.pings import Transmissions
-from clsas.engine.data.wavelengths import wavelength_between_m
 from clsas.engine.device.device import Device
 from clsas.engine.signal.echoes import Echoes
 from clsas.engine.signal.spectrum import Spectrum, measure_spectrum
@@ -66,7 +65,7 @@ class Recording:
     @cached_property
     def pings(self) -> Transmissions:
         """Pings of the lines."""
-        return Transmissions.of(self.lines)
+        return Transmissions.of(self.lines.tx_m, self.lines.rx_m)
 
     @cached_property
     def moving(self) -> RangeLines:
@@ -82,7 +81,11 @@ class Recording:
     @cached_property
     def moving_pings(self) -> Transmissions:
         """Pings of the moving lines."""
-        return self.pings if self.moving is self.lines else Transmissions.of(self.moving)
+        return (
+            self.pings
+            if self.moving is self.lines
+            else Transmissions.of(self.moving.tx_m, self.moving.rx_m)
+        )
 
     @property
     def receivers(self) -> int | None:
@@ -151,7 +154,7 @@ class Recording:
     def sign(self) -> tuple[PhaseSign | None, str]:
         """Comparison of both signs of the phase; see `phase_sign`."""
         # Of the first bank, since those of several may cancel in an image.
-        lines = self.moving.bank(banks.present(self.moving.bank_numbers)[0])
+        lines = self.moving.bank(banks_of(self.moving.bank_numbers)[0])
         if self.background > decibels.power(CONSTANT_DB):
             # It is equally bright in every ping, and would be taken for the brightest echoes.
             lines = lines.without_background("median", receivers=self.receivers_per_bank)

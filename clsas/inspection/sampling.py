@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.engine.data import banks, reprs, validate
+from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.findings import Finding
 from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.lines import RangeLines, banks_of
+from clsas.engine.data.lines import wavelength_m as carrier_wavelength_m
 from clsas.engine.data.system import Sonar
 from clsas.engine.data.track import Track, channels
-from clsas.engine.data.wavelengths import wavelength_m as carrier_wavelength_m
 
 SLACK = 0.01
 """Relative excess of a spacing that is tolerated: a sway of centimetres changes it a little."""
@@ -123,7 +123,7 @@ def check_sampling(
         }
         of_banks = [
             check_sampling(sonar.bank(number), track, grid, **options)
-            for number in banks.present(sonar.bank_numbers)
+            for number in banks_of(sonar.bank_numbers)
         ]
         return _worst(of_banks)
     corners = None

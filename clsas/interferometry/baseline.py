@@ -26,8 +26,7 @@ from scipy.interpolate import RegularGridInterpolator
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.directions import track_directions
 from clsas.engine.data.grid import Grid, without_heights
-from clsas.engine.data.lines import RangeLines, some_channels
-from clsas.engine.data.wavelengths import wavelength_m
+from clsas.engine.data.lines import RangeLines, some_channels, wavelength_m
 from clsas.measures.elevation import Sight, sight_along
 
 _POINTS_AT_ONCE = 64

@@ -22,8 +22,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.wavelengths import cycles_per_m_at
+from clsas.engine.data.lines import RangeLines, cycles_per_m_at
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.interferometry.baseline import Baseline, Lattice, sight_lattice

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from clsas.engine.data.lines import RangeLines, some_channels
-from clsas.engine.data.wavelengths import cycles_per_m_at
+from clsas.engine.data.lines import RangeLines, cycles_per_m_at, some_channels
 from clsas.engine.signal.band_parts import sub_bands
 from clsas.engine.signal.spectrum import measure_spectrum, middle_cycles_per_m
 from clsas.interferometry.coherence import UNIFORM_SD_RAD, Window

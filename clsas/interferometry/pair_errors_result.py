@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data import reprs
 from clsas.engine.data.directions import track_directions
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.lines import RangeLines, bank_members
 from clsas.interferometry.checks import check_pair
 
 UNKNOWNS = ("phase", "delay", "roll")
@@ -205,3 +205,17 @@ def turned(a: RangeLines, b: RangeLines, angle_rad: float) -> NDArray[np.float64
     across_m = arm_m - ahead_m
     moved_m = np.cos(angle_rad) * across_m + np.sin(angle_rad) * np.cross(along, arm_m)
     return a.rx_m + ahead_m + moved_m
+
+
+def with_bank(lines: RangeLines, number: int, bank: RangeLines) -> RangeLines:
+    """Return lines in which those of a bank have other samples, ranges and receivers."""
+    of_bank = bank_members(lines.bank_numbers, number)
+
+    def put(name: str) -> NDArray:
+        values = np.array(getattr(lines, name))
+        values[of_bank] = getattr(bank, name)
+        return values
+
+    return replace(
+        lines, samples=put("samples"), first_range_m=put("first_range_m"), rx_m=put("rx_m")
+    )

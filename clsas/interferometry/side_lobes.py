@@ -26,10 +26,9 @@ from scipy.signal import fftconvolve
 from clsas.engine.data.directions import track_directions
 from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines, antennas_of
+from clsas.engine.data.lines import RangeLines, antennas_of, wavelength_m
 from clsas.engine.data.pings import channels_per_ping
 from clsas.engine.data.system import element_pattern
-from clsas.engine.data.wavelengths import wavelength_m
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.pair import Pair

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.lines import RangeLines, cycles_per_m_at, wavelength_m
 from clsas.engine.data.visibility import sines
-from clsas.engine.data.wavelengths import cycles_per_m_at, wavelength_m
 from clsas.engine.signal.spectrum import measure_spectrum, power_spectrum
 
 

@@ -16,12 +16,11 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.lines import RangeLines, band_wavelength_m
 from clsas.engine.data.simplify import REFRACTION, RELIEF, SHARE, leave_out
 from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.data.system import Sonar
 from clsas.engine.data.track import Pointing, Track, channels
-from clsas.engine.data.wavelengths import band_wavelength_m
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.factorized.costs import Costs
 from clsas.engine.factorized.errors import half_precision_error

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.engine.data import banks, decibels, reprs, validate
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data import decibels, reprs, validate
+from clsas.engine.data.lines import RangeLines, banks_of
 from clsas.engine.data.pings import STILL, Transmissions, means
 from clsas.inspection.sampling import course
 
@@ -153,7 +153,7 @@ def density_weights(lines: RangeLines) -> NDArray[np.float64]:
     if lines.bank_numbers is None:
         return _of_bank(lines, "")
     weights = np.empty(lines.channels)
-    for number in banks.present(lines.bank_numbers):
+    for number in banks_of(lines.bank_numbers):
         weights[lines.bank_numbers == number] = _of_bank(lines.bank(number), f"bank {number}: ")
     return weights
 
@@ -165,7 +165,7 @@ def noise_penalty_db(weights: NDArray[np.float64]) -> float:
 
 def _of_bank(lines: RangeLines, prefix: str) -> NDArray[np.float64]:
     """Return the weights of one bank, [channels]; `prefix` is that of messages."""
-    pings = Transmissions.of(lines)
+    pings = Transmissions.of(lines.tx_m, lines.rx_m)
     try:
         along_m = _along_m(lines, pings)
     except ValueError as error:
@@ -271,7 +271,7 @@ def usual_spacing_m(lines: RangeLines) -> float:
     """
     centres_m = lines.phase_centres_m
     gaps_m = np.diff(np.sort(centres_m @ course(centres_m)))
-    return _usual(gaps_m, Transmissions.of(lines).usual_step_m)
+    return _usual(gaps_m, Transmissions.of(lines.tx_m, lines.rx_m).usual_step_m)
 
 
 def _usual(gaps_m: NDArray[np.float64], advance_m: float) -> float:

@@ -14,13 +14,18 @@ from clsas.engine.data.decibels import in_db
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.lines import (
+    RangeLines,
+    band_wavelength_m,
+    cycles_per_m_at,
+    some_channels,
+    wavelength_m,
+)
 from clsas.engine.data.simplify import APART, MOTION, REFRACTION, RELIEF
 from clsas.engine.data.surface import surface_of
 from clsas.engine.data.system import Sonar, element_pattern
 from clsas.engine.data.track import Pointing, Track
 from clsas.engine.data.visibility import sines
-from clsas.engine.data.wavelengths import band_wavelength_m, cycles_per_m_at, wavelength_m
 from clsas.engine.signal.ambiguity import ends_error
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.engine.water.refraction import Homogeneous

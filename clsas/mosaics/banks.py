@@ -8,9 +8,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.engine.data import banks
 from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.lines import RangeLines, bank_members
 from clsas.mosaics.survey import Survey
 from clsas.mosaics.visibility import SurveyVisibility
 
@@ -39,7 +38,7 @@ class Bank:
         geometry = survey.geometry
         chosen = np.arange(survey.channels)
         if number is not None:
-            chosen = chosen[banks.members(geometry.bank_numbers, number)]
+            chosen = chosen[bank_members(geometry.bank_numbers, number)]
             geometry = geometry.bank(number)
         begins = np.searchsorted(chosen, survey.begins)
         alone = replace(survey, geometry=geometry, begins=tuple(map(int, begins)))

@@ -19,12 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from clsas.engine.data import banks as numbers
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.lines import RangeLines, first_two_banks
 from clsas.engine.device.device import Device
 from clsas.interferometry import heights
 from clsas.interferometry.checks import check_grid, check_pair
@@ -277,7 +276,7 @@ def _banks(a: Lines, b: Lines | None, beam: BeamWindow | None) -> tuple[Bank, Ba
     source = _source("a", a)
     survey = open_survey(source if isinstance(source, RangeLines) else source.resolve())
     try:
-        both = numbers.first_two(survey.geometry.bank_numbers)
+        both = first_two_banks(survey.geometry.bank_numbers)
     except ValueError as error:
         raise ValueError(f"a {error}: give the other one as b") from None
     return Bank.of(survey, both[0], beam), Bank.of(survey, both[1], beam)

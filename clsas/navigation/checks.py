@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from clsas.engine.data import banks, validate
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data import validate
+from clsas.engine.data.lines import RangeLines, band_wavelength_m, banks_of, is_about_zero
 from clsas.engine.data.pings import Transmissions
-from clsas.engine.data.wavelengths import band_wavelength_m, is_about_zero
+from clsas.engine.data.lines import band_wavelength_m, is_about_zero
 from clsas.engine.signal.interpolation import Readout
 
 _MOST_OVERSAMPLING = 64.0  # limits the range resolution of lines that are almost constant
@@ -58,7 +58,7 @@ def first_bank(lines: RangeLines) -> RangeLines:
     ValueError
         If a ping has no channels of this bank.
     """
-    number = banks.present(lines.bank_numbers)[0]
+    number = banks_of(lines.bank_numbers)[0]
     bank = lines.bank(number)
     pings, of_bank = len(lines.ping_starts), len(bank.ping_starts)
     if of_bank != pings:
@@ -93,7 +93,7 @@ def check_navigation(lines: RangeLines, least_pings: int, purpose: str, *, may_s
     ClsasWarning
         If the track turns back between pings, or pings repeat the position of the ping before.
     """
-    pings = Transmissions.of(lines)
+    pings = Transmissions.of(lines.tx_m, lines.rx_m)
     positions = len(lines.ping_starts)
     if positions < least_pings:
         got = f"got {positions}"

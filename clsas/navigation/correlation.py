@@ -17,10 +17,11 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from clsas.engine.data.conditioning import are_dead
 from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.wavelengths import cycles_per_m_at
+from clsas.engine.data.lines import cycles_per_m_at
 from clsas.engine.signal.interpolation import Readout
+from clsas.engine.data import decibels
+from clsas.engine.data.lines import RangeLines, cycles_per_m_at
 from clsas.navigation.directions import Alignment, alignment
 from clsas.navigation.echoes import Window, independent_echoes, strongest, without_highlights
 from clsas.navigation.overlap import Overlap
@@ -29,6 +30,10 @@ from clsas.navigation.swath import Swath
 
 _FREQUENCIES = 9  # in either half of the band, each representing an equal share of the power
 _SPECKLE_LAGS = 64  # samples over which speckle may be correlated in range
+
+DEAD_DB = -20.0
+"""Power relative to the usual channel up to which a channel counts as dead. At -10 dB, channels at
+the ends of a track would also count as dead, because targets leave the beam there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,3 +229,8 @@ def _split(
     """Return the channels of both pings by window."""
     parts = np.split(first, ends, axis=1), np.split(second, ends, axis=1)
     return list(zip(*parts, strict=True))
+
+
+def are_dead(power: NDArray[np.float64], usual: NDArray[np.float64] | float) -> NDArray[np.bool_]:
+    """Return a mask of the channels without a signal, from their power and the usual power."""
+    return power <= usual * decibels.power(DEAD_DB)

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
-from clsas.engine.data.conditioning import DEAD_DB
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.track import Track
 from clsas.engine.signal.compression import compress
@@ -19,7 +18,7 @@ from clsas.engine.signal.echoes import Echoes
 from clsas.engine.water.ray_delays import at_speed
 from clsas.navigation.accuracy import Accuracy, check_plausible
 from clsas.navigation.checks import check_navigation, first_bank, mean_wavelength_m
-from clsas.navigation.correlation import Correlator
+from clsas.navigation.correlation import DEAD_DB, Correlator
 from clsas.navigation.overlap import Array, moved
 from clsas.navigation.passes import LEAST_ECHOES, Displacements, measured
 from clsas.navigation.smoother import Step, persistence, shape_deviation_m, smooth

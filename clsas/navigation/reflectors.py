@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from clsas.engine.data.wavelengths import cycles_per_m_at
+from clsas.engine.data.lines import cycles_per_m_at
 from clsas.engine.signal.interpolation import Readout
 from clsas.navigation.checks import range_cell_m
 

@@ -74,7 +74,7 @@ def _draw_lines(axes: Axes, found: Inspection) -> None:
         xlabel=f"Channel (of {found.pings} pings)", ylabel=f"Range ({unit})", aspect="auto",
         title="Levels of the lines",
     )  # fmt: skip
-    pings = Transmissions.of(lines)
+    pings = Transmissions.of(lines.tx_m, lines.rx_m)
     marks = (
         ("still_pings", "tab:red", "taken standing still"),
         ("dead_channels", "tab:cyan", "dead"),
@@ -151,7 +151,7 @@ def _draw_spectrum(axes: Axes, found: Inspection) -> None:
 
 
 def _draw_steps(axes: Axes, found: Inspection) -> None:
-    steps_m = Transmissions.of(found.lines).steps_m
+    steps_m = Transmissions.of(found.lines.tx_m, found.lines.rx_m).steps_m
     largest_m = float(steps_m.max(initial=0.0))
     scale, unit = length_unit(largest_m)
     number = np.arange(1, len(steps_m) + 1)
@@ -177,7 +177,7 @@ def _draw_steps(axes: Axes, found: Inspection) -> None:
 
 
 def _draw_track(axes: Axes, found: Inspection, grid: Grid | None) -> None:
-    pings = Transmissions.of(found.lines)
+    pings = Transmissions.of(found.lines.tx_m, found.lines.rx_m)
     shown = pings.centres_m[:, :2]
     outline = None if grid is None else outline_of(grid)
     ends_m = [shown] if outline is None else [shown, outline[0][:, :2]]

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from clsas import plot
-from clsas.engine.data import banks
 from clsas.engine.data.atomic import replacing, staging
 from clsas.engine.data.digests import digest
 from clsas.engine.data.extras import install_command, is_installed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.lines import RangeLines, banks_of, first_two_banks
 from clsas.engine.data.validate import warn
 from clsas.engine.device.device import Device
 from clsas.engine.factorized.planner import TOLERANCE_DB
@@ -27,6 +26,7 @@ from clsas.files.scene_tables import EXACT_KEYS
 from clsas.inspection.inspection import inspect
 from clsas.interferometry.heights import heights
 from clsas.interferometry.pair_errors import pair_errors
+from clsas.interferometry.pair_errors_result import with_bank
 from clsas.interferometry.result import Heights
 from clsas.mosaics.height_mosaic import mosaic_heights
 from clsas.mosaics.mosaic import Mosaic, mosaic
@@ -88,7 +88,7 @@ class Job:
         """Return the lines of the receiver bank that is imaged: the scene's, or else the first."""
         chosen = self.scene.process.get("bank")
         if chosen is None:
-            return lines.bank(banks.present(lines.bank_numbers)[0])
+            return lines.bank(banks_of(lines.bank_numbers)[0])
         try:
             return lines.bank(chosen)
         except ValueError as error:
@@ -250,8 +250,8 @@ def paired(job: Job) -> Outcome:
         first, second, found, beam=job.scene.image.get("beam"), **job.options("pair_errors"),
         **_given(job.options("heights"), "tolerance_db"), device=job.device,
     )  # fmt: skip
-    number = banks.first_two(job.lines.bank_numbers)[1]
-    corrected = banks.with_bank(job.lines, number, errors.corrected(first, second))
+    number = first_two_banks(job.lines.bank_numbers)[1]
+    corrected = with_bank(job.lines, number, errors.corrected(first, second))
     return Outcome(errors.figures, lines=corrected)
 
 
@@ -299,9 +299,10 @@ def _given(options: dict[str, Any], *names: str) -> dict[str, Any]:
 def check_banks(lines: RangeLines) -> tuple[RangeLines, RangeLines]:
     """Return the two banks for heights; raise ValueError for a recording of one bank."""
     try:
-        return banks.pair(lines)
+        first, second = first_two_banks(lines.bank_numbers)
     except ValueError as error:
         raise ValueError(f"the recording {error}") from None
+    return lines.bank(first), lines.bank(second)
 
 
 def joined(job: Job) -> Outcome:

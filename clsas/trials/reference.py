@@ -14,9 +14,8 @@ from clsas.engine.data.fourier import fourier_series
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.image import Image
 from clsas.engine.data.image_error import relative_error_db
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.lines import RangeLines, wavelength_m
 from clsas.engine.data.visibility import sines
-from clsas.engine.data.wavelengths import wavelength_m
 from clsas.engine.exact.decide import Decision
 from clsas.engine.signal.interpolation import interpolated
 from clsas.engine.signal.spectrum import measure_spectrum

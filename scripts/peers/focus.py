@@ -23,7 +23,7 @@ from peers.workers import worker
 from studies import focusing, navigating, tables
 
 import clsas
-from clsas.engine.data.wavelengths import wavelength_m
+from clsas.engine.data.lines import wavelength_m
 
 COLUMNS = (
     "scene",

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.lines import RangeLines, wavelength_m
 from clsas.engine.data.system import Pulse, Sonar
 from clsas.engine.data.track import Track
-from clsas.engine.data.wavelengths import wavelength_m
 from clsas.engine.device.device import Device
 from clsas.engine.forming import form_exactly
 from clsas.engine.imaging import factorize

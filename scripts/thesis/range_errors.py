@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 import clsas
 from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.lines import band_wavelength_m
 from clsas.engine.data.surface import surface_of
-from clsas.engine.data.wavelengths import band_wavelength_m
 from clsas.engine.factorized.track import mean_track
 from clsas.engine.factorized.tree import Tree
 from clsas.engine.factorized.virtual_channels import NearestBeams

@@ -654,7 +654,7 @@ def test_arrays_moving_receivers_and_carriers(lines):
     assert found.speed_m_s == 2.0
     assert clsas.inspect(replace(lines, rx_m=lines.rx_m + [0.2, 0, 0])).geometry == "bistatic"
     halt = array.select(np.r_[0:60, np.tile([60, 61], 30), 60:PINGS])
-    assert Transmissions.of(halt).count == 130
+    assert Transmissions.of(halt.tx_m, halt.rx_m).count == 130
     assert halt.without_still_pings().channels == PINGS
 
 

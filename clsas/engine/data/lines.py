@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import fft
 
-from clsas.engine.data import banks, conditioning, pings, reprs, validate
+from clsas.engine.data import pings, reprs, validate
+from clsas.engine.data.fourier import EDGE_PRODUCT, smooth_edge
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.sound_speed import SoundSpeed, check_reaches
 
@@ -23,7 +26,16 @@ _PER_CHANNEL = (
 GOLDEN = (np.sqrt(5) - 1) / 2
 """Golden ratio minus 1. Modulo 1, its multiples fill [0, 1) evenly, but never in regular steps."""
 
+STATISTICS = ("mean", "median")
+"""Estimates of the background that all pings have in common."""
+
 _UNIT = 1e-12  # error of a unit vector's length, far above rounding
+_FILTERED = 1 << 22  # complex128 samples of the channels that are filtered together
+# Steps by which the first ranges of pings may differ. The resulting error is -50 dB.
+_EQUAL_RANGE = 1e-3
+_MOST_BANKS = 1000  # far more than any sonar has: a plain choice
+_LEAST_CYCLES = 0.02  # per sample, at the middle of a band that shows the carrier
+_Number = TypeVar("_Number", float, NDArray[np.float64])
 
 SAMPLED_CHANNELS = 128
 """Number of channels that represent all in estimates of geometry and coverage. Half or twice as
@@ -188,7 +200,7 @@ class RangeLines:
     @property
     def banks(self) -> int:
         """Number of receiver banks that the channels belong to."""
-        return len(banks.present(self.bank_numbers))
+        return len(banks_of(self.bank_numbers))
 
     @property
     def phase_centres_m(self) -> NDArray[np.float64]:
@@ -281,7 +293,7 @@ class RangeLines:
         >>> upper.channels, float(upper.rx_m[:, 2].min())
         (6, 10.3)
         """
-        index = banks.members(self.bank_numbers, number)
+        index = bank_members(self.bank_numbers, number)
         return self if self.bank_numbers is None else self._selected(index, bank_numbers=None)
 
     def _selected(self, index: slice | NDArray[np.int64], **changes: Any) -> RangeLines:
@@ -331,7 +343,36 @@ class RangeLines:
             If the cutoff is not a number, is outside the sampled band (carrier_hz plus or minus
             half the sample rate), or is below one cycle per line.
         """
-        return conditioning.high_passed(self, cutoff_hz)
+        rate = self.sound_speed_m_s / (2 * self.range_step_m)
+        lowest = max(0.0, self.carrier_hz - rate / 2)
+        cutoff = validate.positive("cutoff_hz", cutoff_hz, "Hz")
+        if cutoff <= lowest:
+            raise ValueError(
+                f"cutoff_hz must be finite and > {lowest:g} and < {lowest + rate:g} Hz, got "
+                f"{cutoff:g}: lines on a carrier of {self.carrier_hz:g} Hz contain nothing below "
+                f"{lowest:g} Hz"
+            )
+        validate.number("cutoff_hz", cutoff, "Hz", above=lowest, below=lowest + rate)
+        if cutoff * self.length < rate:
+            raise ValueError(
+                f"cutoff_hz must be at least one cycle per line, {rate / self.length:g} Hz, "
+                f"got {cutoff:g} Hz"
+            )
+        # The edge begins at half the cutoff, or at the lowest frequency of the band if that is
+        # higher.
+        width = min(cutoff / 2, cutoff - lowest)
+        padded = fft.next_fast_len(self.length + int(np.ceil(EDGE_PRODUCT * rate / width)))
+        validate.memory("the padding for cutoff_hz", 16 * padded)
+        frequency = np.abs(self.carrier_hz + fft.fftfreq(padded, 1 / rate))
+        response = smooth_edge((cutoff - frequency) / width)
+        samples = np.empty_like(self.samples)
+        rows = max(1, _FILTERED // padded)
+        for first in range(0, self.channels, rows):
+            block = slice(first, first + rows)
+            spectrum = fft.fft(self.samples[block].astype(np.complex128), padded, workers=-1)
+            filtered = fft.ifft(spectrum * response, workers=-1, overwrite_x=True)
+            samples[block] = filtered[:, : self.length]
+        return replace(self, samples=samples)
 
     def tapered_ends(self, length_m: float) -> RangeLines:
         """Return the lines with both ends faded to zero.
@@ -350,7 +391,12 @@ class RangeLines:
         TypeError, ValueError
             If the length is not a number, or is outside its limits.
         """
-        return conditioning.tapered_ends(self, length_m)
+        half_m = (self.length - 1) * self.range_step_m / 2
+        length_m = validate.number("length_m", length_m, "m", above=0.0, most=half_m)
+        from_end_m = np.arange(self.length) * self.range_step_m
+        from_end_m = np.minimum(from_end_m, from_end_m[::-1])
+        taper = np.sin(np.pi / 2 * np.minimum(from_end_m / length_m, 1)) ** 2
+        return replace(self, samples=self.samples * taper.astype(np.float32))
 
     def without_background(
         self, statistic: str = "mean", *, receivers: int | None = None
@@ -376,7 +422,38 @@ class RangeLines:
             If there are fewer than 2 pings, pings have different numbers of channels, or the lines
             of a receiver do not begin at the same range in all pings.
         """
-        return conditioning.without_background(self, statistic, receivers)
+        statistic = validate.one_of("statistic", statistic, STATISTICS)
+        if receivers is None:
+            counts = pings.channels_per_ping(self.ping_starts, self.channels)
+            if np.ptp(counts):
+                raise ValueError(
+                    "receivers must be given, because pings (consecutive channels with one tx "
+                    f"position) have from {counts.min()} to {counts.max()} channels"
+                )
+            receivers = int(counts[0])
+        receivers = validate.count("receivers", receivers)
+        number, rest = divmod(self.channels, receivers)
+        if rest or number < 2:
+            raise ValueError(
+                "receivers must divide the channels into at least 2 pings, "
+                f"got {receivers} receivers and {self.channels} channels"
+            )
+        first_m = self.first_range_m.reshape(number, receivers)
+        spread_m = float(np.ptp(first_m, axis=0).max())
+        if spread_m > _EQUAL_RANGE * self.range_step_m:
+            raise ValueError(
+                "first_range_m of a receiver must be the same in all pings, because a background "
+                f"lies at one delay; it differs by up to {spread_m:g} m"
+            )
+        samples = np.array(self.samples).reshape(number, receivers, self.length)
+        for receiver in range(receivers):
+            own = samples[:, receiver]
+            if statistic == "mean":
+                background = own.mean(axis=0, dtype=np.complex128)
+            else:
+                background = np.median(own.real, axis=0) + 1j * np.median(own.imag, axis=0)
+            own -= background.astype(np.complex64)
+        return replace(self, samples=samples.reshape(self.samples.shape))
 
     def without_still_pings(self, least_advance_m: float | None = None) -> RangeLines:
         """Return the lines without pings taken standing still.
@@ -398,7 +475,22 @@ class RangeLines:
         TypeError, ValueError
             If the distance is not a positive number, or only one of several pings would be kept.
         """
-        return pings.without_still_pings(self, least_advance_m)
+        if least_advance_m is not None:
+            least_advance_m = validate.positive("least_advance_m", least_advance_m, "m")
+        found = pings.Transmissions.of(self.tx_m, self.rx_m)
+        kept = found.advancing(least_advance_m)
+        if kept.sum() < min(2, found.count):
+            near = (
+                "are at one position"
+                if least_advance_m is None
+                else f"lie within least_advance_m = {least_advance_m:g} m"
+            )
+            raise ValueError(
+                f"lines must come from a platform that moves: of {found.count} pings "
+                f"({self.channels} lines) only the first would stay, because all {near}. Check "
+                "the positions"
+            )
+        return self if kept.all() else self.select(found.channels(kept))
 
     def weighted(self, weights: ArrayLike) -> RangeLines:
         """Return the lines, each multiplied by a weight.
@@ -414,7 +506,16 @@ class RangeLines:
             If the weights are not finite numbers, one per channel, or weighted samples exceed
             float32.
         """
-        return conditioning.weighted(self, weights)
+        factors = validate.real_or_complex("weights", weights, np.complex64, (self.channels,))
+        with np.errstate(over="ignore", invalid="ignore"):
+            samples = self.samples * factors[:, None]
+        if not np.isfinite(samples).all():
+            largest = float(np.abs(factors).max())
+            raise ValueError(
+                f"weights must keep the samples within float32, up to "
+                f"{np.finfo(np.float32).max:.2g}, got weights up to {largest:.3g}"
+            )
+        return replace(self, samples=samples)
 
     def without_samples(self) -> RangeLines:
         """Return the geometry of these lines, with a single sample of zero per channel."""
@@ -455,7 +556,7 @@ def checked_channels(received: Any, start: str) -> dict[str, Any]:
         fastest_m_s = float(np.linalg.norm(checked["rx_velocity_m_s"], axis=1).max())
         validate.number("the speed of rx_velocity_m_s", fastest_m_s, "m/s", below=speed_m_s)
     if received.bank_numbers is not None:
-        checked["bank_numbers"] = banks.checked_numbers(received.bank_numbers, channels, "channels")
+        checked["bank_numbers"] = checked_bank_numbers(received.bank_numbers, channels, "channels")
     if "look_direction" in checked:
         checked["look_direction"] = _unit_vectors("look_direction", checked["look_direction"])
     if received.sound_speed is not None:
@@ -476,6 +577,80 @@ def _unit_vectors(name: str, vectors: NDArray[np.float64]) -> NDArray[np.float64
     scaled /= length
     scaled.flags.writeable = False
     return scaled
+
+
+def checked_bank_numbers(value: ArrayLike, count: int, of: str) -> NDArray[np.int64]:
+    """Return bank numbers as a read-only array [count]; `of` says what has one each.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If they are not whole numbers from 0, or not one for each.
+    """
+    numbers = validate.indices("bank_numbers", value, _MOST_BANKS)
+    if numbers.shape != (count,):
+        raise ValueError(
+            f"bank_numbers must be one number for each of {count} {of}, got shape {numbers.shape}"
+        )
+    numbers = numbers.view()
+    numbers.flags.writeable = False
+    return numbers
+
+
+def banks_of(numbers: NDArray[np.int64] | None) -> list[int]:
+    """Return the numbers of the banks that occur, ascending."""
+    return [0] if numbers is None else [int(each) for each in np.unique(numbers)]
+
+
+def bank_members(numbers: NDArray[np.int64] | None, number: int) -> slice | NDArray[np.int64]:
+    """Return which receivers or channels belong to a bank, as indices.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If `number` is not that of a bank.
+    """
+    number = validate.count("number", number, least=0)
+    known = banks_of(numbers)
+    if number not in known:
+        names = f"one of the banks {', '.join(map(str, known))}"
+        if len(known) == 1:
+            names = f"{known[0]}, since there is one bank"
+        raise ValueError(f"number must be {names}, got {number}")
+    return slice(None) if numbers is None else np.flatnonzero(numbers == number)
+
+
+def first_two_banks(numbers: NDArray[np.int64] | None) -> tuple[int, int]:
+    """Return the banks from which heights are measured: the first two.
+
+    Parameters
+    ----------
+    numbers : int64 [channels] or None
+        Bank of each channel.
+
+    Raises
+    ------
+    ValueError
+        If there is only one bank.
+
+    Warns
+    -----
+    ClsasWarning
+        If there are more than two banks, with the two that are used.
+    """
+    first, *others = banks_of(numbers)
+    if not others:
+        raise ValueError("must have at least 2 receiver banks (bank_numbers), got 1")
+    second, *unused = others
+    if unused:
+        words = f"bank {unused[0]} is"
+        if len(unused) > 1:
+            words = f"banks {', '.join(map(str, unused[:-1]))} and {unused[-1]} are"
+        validate.warn(
+            f"heights are measured from banks {first} and {second}; {words} not used. "
+            "To choose others, give lines.bank(n) of both"
+        )
+    return first, second
 
 
 def some_channels(count: int, most: int = SAMPLED_CHANNELS) -> NDArray[np.int64]:
@@ -515,3 +690,66 @@ def fastest(lines: RangeLines) -> float:
     if lines.rx_velocity_m_s is None:
         return 0.0
     return float(np.linalg.norm(lines.rx_velocity_m_s, axis=1).max()) / lines.sound_speed_m_s
+
+
+def wavelength_m(lines: RangeLines) -> float:
+    """Return the wavelength of the carrier, metres; infinite for lines without a carrier.
+
+    Element patterns, and beams that correct for them, use this wavelength. Lengths such as a track
+    error or the spacing of channels are compared with `band_wavelength_m`, which does not depend on
+    what was mixed out.
+    """
+    return lines.sound_speed_m_s / lines.carrier_hz if lines.carrier_hz else math.inf
+
+
+def band_wavelength_m(lines: RangeLines, centre: float) -> float:
+    """Return the wavelength in the middle of the band that lines occupy, metres.
+
+    Lines whose band lies about 0 Hz do not show their carrier. Their wavelength is that of the
+    highest frequency sampled.
+
+    Parameters
+    ----------
+    lines : RangeLines
+    centre : float
+        Middle of the band, cycles per sample: `Spectrum.centre`, or that of a plan's lines.
+    """
+    if is_about_zero(lines, centre):
+        return 4 * lines.range_step_m
+    return 2 / abs(cycles_per_m_at(lines, centre))
+
+
+def wavelength_between_m(lines: RangeLines, low_hz: float, high_hz: float) -> float:
+    """Return the wavelength at the mean frequency of a band, metres.
+
+    All frequencies count as positive. The mean is that of the ends, unless the band reaches below
+    0 Hz: the middle of such a band is arbitrary, and the wavelength there could be infinite.
+
+    Parameters
+    ----------
+    lines : RangeLines
+    low_hz, high_hz : float
+        Ends of the band in the recorded signal, before `carrier_hz` was mixed out.
+    """
+    if low_hz * high_hz >= 0:
+        mean_hz = abs(low_hz + high_hz) / 2
+    else:
+        mean_hz = (low_hz**2 + high_hz**2) / (2 * (high_hz - low_hz))
+    return lines.sound_speed_m_s / mean_hz
+
+
+def is_about_zero(lines: RangeLines, centre: float) -> bool:
+    """Return whether a band lies so close to 0 Hz that it does not show the lines' carrier."""
+    return abs(cycles_per_m_at(lines, centre)) * lines.range_step_m <= _LEAST_CYCLES
+
+
+def cycles_per_m_at(lines: RangeLines, frequency: _Number) -> _Number:
+    """Return the two-way phase per metre of range, cycles.
+
+    Parameters
+    ----------
+    lines : RangeLines
+    frequency : float or float64 array
+        Frequency in the samples, cycles per sample.
+    """
+    return lines.carrier_cycles_per_m + frequency / lines.range_step_m

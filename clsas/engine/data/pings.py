@@ -11,15 +11,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-
-from clsas.engine.data import validate
-
-if TYPE_CHECKING:
-    from clsas.engine.data.lines import RangeLines
 
 STILL = 0.1
 """Share of the usual advance within which a platform counts as standing still."""
@@ -86,12 +80,13 @@ class Transmissions:
     places_m: NDArray[np.float64]
 
     @classmethod
-    def of(cls, lines: RangeLines) -> Transmissions:
-        """Return the transmissions of range lines."""
-        starts = transmission_starts(lines.tx_m, lines.rx_m)
-        centres_m = means(lines.phase_centres_m, starts)
-        places_m = _more_even(centres_m, means(lines.rx_m, starts))
-        return cls(np.append(starts, lines.channels), centres_m, places_m)
+    def of(cls, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> Transmissions:
+        """Return the transmissions of lines from the positions of antennas, [channels, 3]."""
+        starts = transmission_starts(tx_m, rx_m)
+        centres_m, mean_rx_m = means((tx_m + rx_m) / 2, starts), means(rx_m, starts)
+        alternating = _unevenness(centres_m) > _UNEVEN and _unevenness(mean_rx_m) < _UNEVEN / 2
+        places_m = mean_rx_m if alternating else centres_m
+        return cls(np.append(starts, len(tx_m)), centres_m, places_m)
 
     @property
     def count(self) -> int:
@@ -174,35 +169,10 @@ class Transmissions:
         return np.flatnonzero(np.repeat(some, self.receivers))
 
 
-def without_still_pings(lines: RangeLines, least_advance_m: float | None) -> RangeLines:
-    """Return lines without pings taken standing still; see `RangeLines.without_still_pings`."""
-    if least_advance_m is not None:
-        least_advance_m = validate.positive("least_advance_m", least_advance_m, "m")
-    found = Transmissions.of(lines)
-    kept = found.advancing(least_advance_m)
-    if kept.sum() < min(2, found.count):
-        near = (
-            "are at one position"
-            if least_advance_m is None
-            else f"lie within least_advance_m = {least_advance_m:g} m"
-        )
-        raise ValueError(
-            f"lines must come from a platform that moves: of {found.count} pings ({lines.channels} "
-            f"lines) only the first would stay, because all {near}. Check the positions"
-        )
-    return lines if kept.all() else lines.select(found.channels(kept))
-
-
 def means(values: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the mean over every ping of vectors [channels, 3], given the pings' first channels."""
     counts = channels_per_ping(starts, len(values))
     return np.add.reduceat(values, starts, axis=0) / counts[:, None]
-
-
-def _more_even(centres_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the phase centres, or the receivers' means if only the latter advance evenly."""
-    uneven, of_rx = _unevenness(centres_m), _unevenness(rx_m)
-    return rx_m if uneven > _UNEVEN and of_rx < _UNEVEN / 2 else centres_m
 
 
 def _unevenness(places_m: NDArray[np.float64]) -> float:

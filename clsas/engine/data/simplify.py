@@ -22,9 +22,8 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import power
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.lines import RangeLines, some_channels, wavelength_m
 from clsas.engine.data.visibility import sines
-from clsas.engine.data.wavelengths import wavelength_m
 
 MOTION = "motion during flight"
 APART = "transmitter and receiver apart"

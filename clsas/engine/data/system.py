@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsas.engine.data import banks, reprs, validate
+from clsas.engine.data import reprs, validate
 from clsas.engine.data.fourier import fourier_integral
+from clsas.engine.data.lines import bank_members, banks_of, checked_bank_numbers
 
 BARKER_13 = (1, 1, 1, 1, 1, -1, -1, 1, 1, -1, 1, -1, 1)
 
@@ -304,7 +305,7 @@ class Sonar:
     @property
     def banks(self) -> int:
         """Number of receiver banks."""
-        return len(banks.present(self.bank_numbers))
+        return len(banks_of(self.bank_numbers))
 
     def bank(self, number: int) -> Sonar:
         """Return the sonar with the receivers of one bank only, whose `bank_numbers` are None.
@@ -325,7 +326,7 @@ class Sonar:
         >>> clsas.Sonar.hisas_1030().bank(1).receivers
         32
         """
-        index = banks.members(self.bank_numbers, number)
+        index = bank_members(self.bank_numbers, number)
         if self.bank_numbers is None:
             return self
         return replace(self, rx_m=self.rx_m[index], bank_numbers=None)
@@ -429,11 +430,11 @@ class Sonar:
 
 def _checked_banks(value: ArrayLike, receivers: int) -> NDArray[np.int64]:
     """Return the bank of every receiver, [receivers]; raises TypeError or ValueError."""
-    numbers = banks.checked_numbers(value, receivers, "receivers")
+    numbers = checked_bank_numbers(value, receivers, "receivers")
     counts = np.bincount(numbers)
     if not counts.all():
         raise ValueError(
-            f"bank_numbers must count banks from 0 without a gap, got {banks.present(numbers)}"
+            f"bank_numbers must count banks from 0 without a gap, got {banks_of(numbers)}"
         )
     if np.ptp(counts):
         raise ValueError(

@@ -24,9 +24,8 @@ from clsas.engine.data.geometry import bistatic_range_m, pairwise_range_m
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.lines import RangeLines, cycles_per_m_at, wavelength_m
 from clsas.engine.data.threads import in_threads
-from clsas.engine.data.wavelengths import cycles_per_m_at, wavelength_m
 from clsas.engine.scene import check_numbers
 from clsas.engine.signal.doubts import warn_before_imaging
 from clsas.engine.signal.interpolation import phasors

@@ -21,8 +21,9 @@ from scipy.spatial.distance import cdist
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.lines import wavelength_m
 from clsas.engine.data.visibility import sines
-from clsas.engine.data.wavelengths import wavelength_m
+from clsas.engine.data.lines import wavelength_m
 from clsas.engine.device import kernels
 from clsas.engine.device.device import Device
 from clsas.engine.exact.decide import ROUNDING

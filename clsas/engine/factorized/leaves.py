@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from clsas.engine.data.beam import INTERVALS, normalising
 from clsas.engine.data.decibels import power
 from clsas.engine.data.geometry import bistatic_range_m
+from clsas.engine.data.lines import wavelength_m
 from clsas.engine.data.visibility import sines
-from clsas.engine.data.wavelengths import wavelength_m
 from clsas.engine.device.buffers import (
     VECTOR_ROOM,
     Slot,

@@ -19,9 +19,8 @@ from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.digests import grid_digest, lines_digest
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.lines import RangeLines, some_channels, wavelength_m
 from clsas.engine.data.visibility import sines
-from clsas.engine.data.wavelengths import wavelength_m
 from clsas.engine.device.device import Device
 from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.engine.factorized import measured_costs

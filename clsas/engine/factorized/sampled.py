@@ -17,10 +17,16 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from clsas.engine.data.geometry import pairwise_range_m
-from clsas.engine.data.lines import SAMPLED_CHANNELS, antennas_of, some_channels, steepest
+from clsas.engine.data.lines import (
+    SAMPLED_CHANNELS,
+    antennas_of,
+    band_wavelength_m,
+    cycles_per_m_at,
+    some_channels,
+    steepest,
+)
 from clsas.engine.data.surface import LEAST_SIDE, Surface, within_roots
 from clsas.engine.data.visibility import Visibility
-from clsas.engine.data.wavelengths import band_wavelength_m, cycles_per_m_at
 from clsas.engine.exact.layout import item_pixels
 from clsas.engine.factorized.phase_rates import (
     BeamDirections,

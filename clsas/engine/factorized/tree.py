@@ -20,10 +20,9 @@ from scipy.spatial.distance import cdist
 
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.geometry import pairwise_range_m
-from clsas.engine.data.lines import RangeLines, antennas_of
+from clsas.engine.data.lines import RangeLines, antennas_of, band_wavelength_m
 from clsas.engine.data.surface import Surface
 from clsas.engine.data.visibility import BeamTrack, Boxes
-from clsas.engine.data.wavelengths import band_wavelength_m
 from clsas.engine.device.buffers import MARGIN
 from clsas.engine.factorized.phase_rates import (
     BeamDirections,

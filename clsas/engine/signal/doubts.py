@@ -14,13 +14,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.engine.data.banks import warn_of_banks
+from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.findings import Finding, warn_of
 from clsas.engine.data.fixes import LEAST_FIXES, doubts_of_fixes
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.lines import RangeLines, banks_of, some_channels
 from clsas.engine.data.looking import behind
 from clsas.engine.data.reprs import measured
 from clsas.engine.data.visibility import sines
@@ -70,7 +70,16 @@ def warn_before_imaging(
     last_range_m : float64 [channels], optional
         Range of each channel's last sample, for lines that are geometry without samples.
     """
-    warn_of_banks(lines)
+    if lines.bank_numbers is not None and lines.banks > 1:
+        of_bank = [lines.rx_m[lines.bank_numbers == n] for n in banks_of(lines.bank_numbers)]
+        heights_m = [float(rx_m[:, 2].mean()) for rx_m in of_bank]
+        apart_m = max(heights_m) - min(heights_m)
+        validate.warn(
+            f"lines have {lines.banks} banks, {measured(apart_m, 'm', 3)} apart in height. In one "
+            "image of all, their echoes cancel wherever the seabed is not at the height of the "
+            "grid. lines.bank(0) has the lines of the first bank; dataclasses.replace(lines, "
+            "bank_numbers=None) declares all channels to be one array"
+        )
     found = behind(lines, grid, last_range_m)
     warn_of([] if found is None else [found])
     warn_of(doubts(lines, grid, beam, last_range_m))

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, toeplitz
 
 from clsas.engine.data import reprs, validate
-from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.wavelengths import cycles_per_m_at
+from clsas.engine.data.lines import RangeLines, cycles_per_m_at
 from clsas.engine.signal.spectrum import Spectrum, measure_spectrum
 
 _Complex = TypeVar("_Complex", np.complex64, np.complex128)

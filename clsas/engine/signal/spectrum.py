@@ -13,8 +13,7 @@ from scipy.ndimage import uniform_filter1d
 from clsas.engine.data import validate
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines, some_channels
-from clsas.engine.data.wavelengths import cycles_per_m_at
+from clsas.engine.data.lines import RangeLines, cycles_per_m_at, some_channels
 
 MEASURED_CHANNELS = 256
 """Channels sampled for a spectrum. Half or twice as many change predicted errors by less than

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.wavelengths import wavelength_m
+from clsas.engine.data.lines import RangeLines, wavelength_m
 from clsas.engine.water.ray_delays import RaySample
 from clsas.engine.water.rays import rays
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import clsas
-from clsas.engine.data.banks import first_two, together
 from clsas.engine.data.digests import lines_digest
+from clsas.engine.data.lines import first_two_banks
 from clsas.engine.data.system import line_array, stacked
 from clsas.mosaics.survey import open_survey
 
@@ -36,13 +36,13 @@ def test_a_bank_is_the_sonar_with_its_receivers():
 
 
 def test_the_two_banks_of_heights_are_the_first_and_others_are_named():
-    assert first_two(np.array([3, 1, 1])) == (1, 3)  # warnings are errors
+    assert first_two_banks(np.array([3, 1, 1])) == (1, 3)  # warnings are errors
     with pytest.warns(
         clsas.ClsasWarning, match="from banks 0 and 1; bank 2 is not used. To choose"
     ):
-        assert first_two(np.array([0, 1, 2])) == (0, 1)
+        assert first_two_banks(np.array([0, 1, 2])) == (0, 1)
     with pytest.warns(clsas.ClsasWarning, match="banks 1 and 4; banks 5, 6 and 9 are not used"):
-        assert first_two(np.array([9, 6, 5, 4, 1])) == (1, 4)
+        assert first_two_banks(np.array([9, 6, 5, 4, 1])) == (1, 4)
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,6 @@ def test_two_banks_cancel_in_one_image_off_the_grid():
         levels.append(np.abs(both.pixels).max() / np.abs(one.pixels).max())
     assert levels[0] == pytest.approx(2, rel=0.01)
     assert levels[1] < 0.3
-    assert together(lines) is not None
 
 
 def test_assessments_are_of_one_bank(lines):

@@ -15,6 +15,10 @@ def lines_at(x, receivers=1):
     return RangeLines(samples, 1.0, 0.1, tx_m, rx_m, 1e5, 1500.0)
 
 
+def antennas(lines):
+    return lines.tx_m, lines.rx_m
+
+
 def kept(lines, **options):
     return lines.without_still_pings(**options).samples[:, 0].real.astype(int).tolist()
 
@@ -23,7 +27,7 @@ def kept(lines, **options):
 def test_a_halt_leaves_its_first_ping(receivers):
     x = np.array([0, 1, 2, 2, 2, 2, 3, 4, 5.0])
     lines = lines_at(x, receivers)
-    pings = Transmissions.of(lines)
+    pings = Transmissions.of(lines.tx_m, lines.rx_m)
     assert pings.count == 9
     np.testing.assert_array_equal(pings.receivers, receivers)
     expected = [0, 1, 2, 6, 7, 8]
@@ -41,7 +45,7 @@ def test_the_usual_advance_is_that_of_the_pings_that_move():
     x = np.concatenate([np.full(355, 0.0), 0.01 * np.arange(1, 254)])
     x[500:] += 3.0
     x[:355] += 1e-5 * np.random.default_rng(0).standard_normal(355)
-    pings = Transmissions.of(lines_at(x))
+    pings = Transmissions.of(*antennas(lines_at(x)))
     assert pings.usual_step_m == pytest.approx(0.01, rel=1e-6)
     assert pings.advancing().sum() == 254
 
@@ -65,16 +69,16 @@ def test_a_platform_that_never_moves_and_a_single_ping():
         ):
             lines.without_still_pings(**options)
     assert kept(lines_at(np.zeros(1))) == [0]
-    assert Transmissions.of(lines_at(np.zeros(1))).turns.size == 0
+    assert Transmissions.of(*antennas(lines_at(np.zeros(1)))).turns.size == 0
 
 
 def test_turns_are_found_on_any_course():
     x = np.arange(40.0)
-    assert Transmissions.of(lines_at(x[::-1])).turns.size == 0
+    assert Transmissions.of(*antennas(lines_at(x[::-1]))).turns.size == 0
     x[[20, 24]] = x[[24, 20]]
-    np.testing.assert_array_equal(Transmissions.of(lines_at(x)).turns, [20, 23])
+    np.testing.assert_array_equal(Transmissions.of(*antennas(lines_at(x))).turns, [20, 23])
     angle = np.linspace(0, 2 * np.pi, 90)
     circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     lines = lines_at(np.arange(90.0))
     lines = RangeLines(lines.samples, 1.0, 0.1, circle, circle, 1e5, 1500.0)
-    assert Transmissions.of(lines).turns.size == 0
+    assert Transmissions.of(lines.tx_m, lines.rx_m).turns.size == 0

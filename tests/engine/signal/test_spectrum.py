@@ -5,8 +5,7 @@ import pytest
 from cases import noise
 
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.wavelengths import band_wavelength_m
+from clsas.engine.data.lines import RangeLines, band_wavelength_m
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.trials.reference import ideal
 
