@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from clsas.engine.data import decibels
+from clsas.engine.data.coverage import behind
 from clsas.engine.data.findings import Finding
 from clsas.engine.data.lines import RangeLines, some_channels
-from clsas.engine.data.looking import behind
 from clsas.engine.data.pings import STILL
 from clsas.engine.data.reprs import measured
 from clsas.engine.signal.ambiguity import end_powers

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.coverage import side_of
 from clsas.engine.data.findings import Finding
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.looking import side_of
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.signal.compression import compress
 from clsas.engine.signal.echoes import Echoes

@@ -12,7 +12,7 @@ import numpy as np
 from clsas.engine.data import reprs
 from clsas.engine.data.findings import Finding
 from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.tables import Report, Table
+from clsas.engine.data.reprs import Report, Table
 
 _MOST_RUNS = 12  # runs of indices that are written out
 

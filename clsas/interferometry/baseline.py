@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.directions import track_directions
+from clsas.engine.data.beam import BeamWindow, track_directions
 from clsas.engine.data.grid import Grid, without_heights
 from clsas.engine.data.lines import RangeLines, some_channels, wavelength_m
 from clsas.measures.elevation import Sight, sight_along

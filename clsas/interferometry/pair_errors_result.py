@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import reprs
-from clsas.engine.data.directions import track_directions
+from clsas.engine.data.beam import track_directions
 from clsas.engine.data.lines import RangeLines, bank_members
 from clsas.interferometry.checks import check_pair
 

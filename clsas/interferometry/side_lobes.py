@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.signal import fftconvolve
 
-from clsas.engine.data.directions import track_directions
+from clsas.engine.data.beam import track_directions
 from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, antennas_of, wavelength_m

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from clsas.engine.data import reprs
-from clsas.engine.data.tables import Report, Table
+from clsas.engine.data.reprs import Report, Table
 from clsas.measures.effects import ENDS, KEYS
 
 NONE_DB = -250.0

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import groupby
 
 from clsas.engine.data import reprs
-from clsas.engine.data.tables import Report, Table
+from clsas.engine.data.reprs import Report, Table
 
 _INDENT = "    "
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.atomic import replacing
-from clsas.engine.data.tables import Report, Table
+from clsas.engine.data.reprs import Report, Table
 
 _FIGURES = ("resolution_m", "pslr_db", "islr_db")
 _HEADER = (

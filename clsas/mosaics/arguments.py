@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from clsas.engine.data import validate
-from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.directions import MOST_TRACK_PINGS
+from clsas.engine.data.beam import MOST_TRACK_PINGS, BeamWindow
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.simplify import shift_error
 from clsas.engine.exact.decide import BEST_ACCURACY_DB

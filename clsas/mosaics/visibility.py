@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import validate
-from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.directions import MOST_TRACK_PINGS
+from clsas.engine.data.beam import MOST_TRACK_PINGS, BeamWindow
 from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.visibility import BeamTrack, Boxes

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.spatial.distance import cdist
 
-from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.directions import track_directions
+from clsas.engine.data.beam import BeamWindow, track_directions
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clsas
-from clsas.engine.data import looking
+from clsas.engine.data import coverage
 from clsas.navigation.overlap import Array, moved
 
 LOOK = np.array([0.0, np.cos(0.3), -np.sin(0.3)])
@@ -26,7 +26,7 @@ def check(corrected, lines):
     """The corrected lines warn of the same side, and still look the same way."""
     np.testing.assert_array_equal(corrected.look_direction, lines.look_direction)
     grid = clsas.Grid.plane((1, 2, 9), (-9, -8, 9))
-    found = looking.behind(corrected, grid)
+    found = coverage.behind(corrected, grid)
     assert found.value == 1
     assert found.remedy.endswith("--y=8:9:9")
 

@@ -2,9 +2,8 @@
 
 Range lines have positions but no times, so pings follow from the positions. Consecutive channels
 with one transmitter position are a ping (`ping_starts`). A platform that stands still transmits
-several times from one position. Where that matters, `transmission_starts` also begins a ping where
-the first receiver's position comes again, and `Transmissions` describes the pings found in this
-way. Both agree for a platform that never stands still.
+several times from one position. `Transmissions` are pings where that matters: a ping also begins
+where the first receiver's position comes again. Both agree for a platform that never stands still.
 """
 
 from __future__ import annotations
@@ -37,17 +36,6 @@ def ping_starts(tx_m: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.flatnonzero(np.append(True, (np.diff(tx_m, axis=0) != 0).any(axis=1)))
 
 
-def transmission_starts(tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the first channel of every transmission, also of several from one position.
-
-    Among the channels with one transmitter position, a transmission begins wherever the position of
-    the first receiver comes again. `tx_m` and `rx_m` are [channels, 3].
-    """
-    starts = ping_starts(tx_m)
-    first_rx_m = rx_m[starts][ping_numbers(starts, len(tx_m))]
-    return np.flatnonzero((rx_m == first_rx_m).all(axis=1))
-
-
 def channels_per_ping(starts: NDArray[np.int64], channels: int) -> NDArray[np.int64]:
     """Return the number of channels of every ping, given the first channels and their number."""
     return np.diff(np.append(starts, channels))
@@ -61,8 +49,6 @@ def ping_numbers(starts: NDArray[np.int64], channels: int) -> NDArray[np.int64]:
 @dataclass(frozen=True, eq=False)
 class Transmissions:
     """Pings of range lines, where several may have been transmitted from one position.
-
-    See `transmission_starts` for where each begins.
 
     Attributes
     ----------
@@ -81,8 +67,14 @@ class Transmissions:
 
     @classmethod
     def of(cls, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> Transmissions:
-        """Return the transmissions of lines from the positions of antennas, [channels, 3]."""
-        starts = transmission_starts(tx_m, rx_m)
+        """Return the transmissions, from the positions of the channels' antennas, [channels, 3].
+
+        Among the channels with one transmitter position, a transmission begins wherever the
+        position of the first receiver comes again.
+        """
+        of_position = ping_starts(tx_m)
+        first_rx_m = rx_m[of_position][ping_numbers(of_position, len(tx_m))]
+        starts = np.flatnonzero((rx_m == first_rx_m).all(axis=1))
         centres_m, mean_rx_m = means((tx_m + rx_m) / 2, starts), means(rx_m, starts)
         alternating = _unevenness(centres_m) > _UNEVEN and _unevenness(mean_rx_m) < _UNEVEN / 2
         places_m = mean_rx_m if alternating else centres_m

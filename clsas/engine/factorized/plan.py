@@ -26,8 +26,8 @@ from clsas.engine.data.digests import DIGEST, grid_digest, is_intact, lines_dige
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.reading import parse_json
+from clsas.engine.data.reprs import Report, Table
 from clsas.engine.data.simplify import EFFECTS
-from clsas.engine.data.tables import Report, Table
 from clsas.engine.device.kernels import PHASE_TERMS
 from clsas.engine.factorized.track import Shape
 from clsas.engine.factorized.virtual_channels import InterpolatedAperture, NearestBeams

@@ -24,7 +24,7 @@ from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import GOLDEN, RangeLines, antennas_of, some_channels
 from clsas.engine.data.visibility import sines
-from clsas.engine.data.wavelengths import cycles_per_m_at, wavelength_m
+from clsas.engine.data.lines import cycles_per_m_at, wavelength_m
 from clsas.engine.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum, representative_channels
 
 BEST_DB = -85.0

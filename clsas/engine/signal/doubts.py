@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.coverage import behind
 from clsas.engine.data.findings import Finding, warn_of
 from clsas.engine.data.fixes import LEAST_FIXES, doubts_of_fixes
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, banks_of, some_channels
-from clsas.engine.data.looking import behind
 from clsas.engine.data.reprs import measured
 from clsas.engine.data.visibility import sines
 

@@ -3,8 +3,7 @@ import pytest
 from cases import along_x, track_lines
 from scipy.signal import savgol_filter
 
-from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.directions import _tangents, track_directions
+from clsas.engine.data.beam import BeamWindow, _tangents, track_directions
 from clsas.engine.data.lines import RangeLines
 
 X = (1.0, 0, 0)

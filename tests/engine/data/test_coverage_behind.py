@@ -10,7 +10,7 @@ import pytest
 from cases import along_x
 
 import clsas
-from clsas.engine.data import looking
+from clsas.engine.data import coverage
 from clsas.engine.data.validate import ClsasWarning
 from clsas.engine.signal.doubts import warn_before_imaging
 
@@ -118,7 +118,7 @@ def test_a_sonar_that_looks_to_starboard_warns_of_port():
 
 def test_the_mirrored_grid_follows_from_the_track_and_keeps_height_and_step():
     track_m = along_x(50, 0.05) + [0, 3.0, 0]
-    found = looking.behind(
+    found = coverage.behind(
         geometry(track_m, [0, 1, 0]), clsas.Grid.plane((1, 2, 5), (-14, -34, 101), -7.5)
     )
     assert found.value == 1
@@ -128,14 +128,14 @@ def test_the_mirrored_grid_follows_from_the_track_and_keeps_height_and_step():
 def test_the_mirrored_grid_is_rounded_to_the_sway_of_the_track():
     sway_m = 0.03 * np.sin(np.arange(50))[:, None] * [0, 1.0, 0]
     track_m = along_x(50, 0.05) + sway_m + [0, 2.012, 0]
-    found = looking.behind(geometry(track_m, [0, 1, 0]), STARBOARD)
+    found = coverage.behind(geometry(track_m, [0, 1, 0]), STARBOARD)
     assert found.remedy.endswith("use the mirrored grid, --x=-0.5:0.5:41 --y=23.5:24.5:41")
 
 
 def test_along_y_the_columns_are_mirrored():
     track_m = along_x(50, 0.05)[:, [1, 0, 2]] + [100, 0, 0]
     lines = geometry(track_m, [-1, 0, 0])  # heads along y, and port is -x
-    found = looking.behind(lines, clsas.Grid.plane((120, 130, 11), (0, 2, 3)))
+    found = coverage.behind(lines, clsas.Grid.plane((120, 130, 11), (0, 2, 3)))
     assert "to starboard of the track, but the elements look to port" in found.message
     assert found.remedy.endswith("use the mirrored grid, --x=70:80:11 --y=0:2:3")
 
@@ -145,11 +145,11 @@ def test_across_the_axes_the_mirrored_plane_is_given_by_its_steps():
     track_m = np.outer(np.linspace(-1, 1, 41), [np.cos(angle), np.sin(angle), 0])
     port = np.array([-np.sin(angle), np.cos(angle), 0])
     there = clsas.Grid.plane((10, 12, 21), (-30, -28, 21))
-    found = looking.behind(geometry(track_m, port), there)
+    found = coverage.behind(geometry(track_m, port), there)
     assert found.remedy.endswith("shape = [21, 21]")
     _, table = found.remedy.split("use the mirrored grid, ")  # in the notation of a scene file
     grid = clsas.Grid.oriented(**tomllib.loads(f"grid = {{{table}}}")["grid"])
-    assert looking.behind(geometry(track_m, port), grid) is None
+    assert coverage.behind(geometry(track_m, port), grid) is None
     distance_m = [each.positions_m() @ port for each in (grid, there)]
     np.testing.assert_allclose(distance_m[0], -distance_m[1], atol=1e-5)
 
@@ -159,7 +159,7 @@ def test_other_grids_are_mirrored_in_words(lines, kind):
     grid = STARBOARD.with_height(np.zeros(STARBOARD.shape))
     if kind == "points":
         grid = clsas.Grid.points(STARBOARD.positions_m().reshape(-1, 3))
-    found = looking.behind(lines, grid)
+    found = coverage.behind(lines, grid)
     assert found.value == 1
     plane = r"the vertical plane through \(\S+ 0\) m with the normal \(-?0, 1\)$"
     assert re.search(f"^mirror the grid about {plane}", found.remedy)
@@ -168,7 +168,7 @@ def test_other_grids_are_mirrored_in_words(lines, kind):
 @pytest.mark.parametrize(("low_m", "percent"), [(-0.1, None), (-5, 17), (-25, 50), (-50, 67)])
 def test_a_part_of_the_grid_is_reported_by_its_share(low_m, percent):
     lines = geometry(along_x(50, 0.05), [0, 1, 0])
-    found = looking.behind(lines, clsas.Grid.plane((0, 1, 50), (low_m, 25, 1000)))
+    found = coverage.behind(lines, clsas.Grid.plane((0, 1, 50), (low_m, 25, 1000)))
     if percent is None:  # less than is reported
         assert found is None
         return
@@ -217,14 +217,14 @@ SILENT = {
 
 @pytest.mark.parametrize("case", SILENT)
 def test_nothing_is_said(case):
-    assert looking.behind(*SILENT[case]()) is None
+    assert coverage.behind(*SILENT[case]()) is None
 
 
 def test_a_leg_counts_only_where_its_lines_reach():
     """The second leg looks towards the grid, but ends before it."""
     lines = opposite_legs()
     near = replace(lines, samples=lines.samples[:, :1000])  # 50 m
-    found = looking.behind(near, clsas.Grid.plane((-1, 1, 9), (-60, -55, 9)))
+    found = coverage.behind(near, clsas.Grid.plane((-1, 1, 9), (-60, -55, 9)))
     assert found.value == 1
 
 
@@ -234,21 +234,21 @@ def test_one_ping_of_an_array_has_no_track_but_sides():
     lines = clsas.RangeLines(
         samples, 0, 0.05, [0, 0, 0], array_m, 100e3, 1500.0, look_direction=[0, 1, 0]
     )
-    found = looking.behind(lines, STARBOARD)
+    found = coverage.behind(lines, STARBOARD)
     assert found.message.startswith("the whole grid lies behind the elements")
     assert found.remedy.endswith("--y=19.5:20.5:41")
     single = lines.select([0])
-    assert looking.behind(single, STARBOARD).value == 1
-    assert looking.side_of(single, single.look_direction) == ""
+    assert coverage.behind(single, STARBOARD).value == 1
+    assert coverage.side_of(single, single.look_direction) == ""
 
 
 def test_large_coordinates_lose_nothing():
     utm_m = np.array([597_300.0, 6_643_100.0, -20.0])
     lines = geometry(along_x(50, 0.05) + utm_m, [0, 1, 0])
     here = clsas.Grid.plane((597_300, 597_301, 11), (6_643_120, 6_643_121, 11), -30)
-    assert looking.behind(lines, here) is None
+    assert coverage.behind(lines, here) is None
     there = clsas.Grid.plane((597_300, 597_301, 11), (6_643_079, 6_643_080, 11), -30)
-    assert looking.behind(lines, there).remedy.endswith(
+    assert coverage.behind(lines, there).remedy.endswith(
         "--x=597300:597301:11 --y=6643120:6643121:11 --z=-30"
     )
 
@@ -264,24 +264,24 @@ SIDES = {
 @pytest.mark.parametrize("side", SIDES)
 def test_sides_follow_from_the_heading(side):
     lines = geometry(along_x(50, 0.05), SIDES[side])
-    assert looking.side_of(lines, lines.look_direction) == side
+    assert coverage.side_of(lines, lines.look_direction) == side
     other = {"port": "starboard", "starboard": "port"}.get(side, side)
     back = lines.select(slice(None, None, -1))
-    assert looking.side_of(back, back.look_direction) == other
+    assert coverage.side_of(back, back.look_direction) == other
 
 
 def test_receivers_of_a_ping_may_look_to_both_sides():
-    assert looking.side_of(both_sides(), both_sides().look_direction) == "both sides"
+    assert coverage.side_of(both_sides(), both_sides().look_direction) == "both sides"
 
 
 def test_noise_of_the_positions_does_not_change_the_side():
     noise_m = np.random.default_rng(1).normal(0, 0.01, (1000, 3))
     lines = geometry(along_x(1000, 0.01) + noise_m, [0, 1, 0])
-    assert looking.side_of(lines, lines.look_direction) == "port"
+    assert coverage.side_of(lines, lines.look_direction) == "port"
 
 
 def test_a_circle_has_a_side_too():
-    assert looking.side_of(ring(), ring().look_direction) == "port"
+    assert coverage.side_of(ring(), ring().look_direction) == "port"
 
 
 @pytest.mark.parametrize(
@@ -310,7 +310,7 @@ def test_echoes_and_lines_look_where_the_pointing_does(pointing, look):
 def test_on_another_heading_the_elements_look_elsewhere():
     lines = recorded(velocity_m_s=(0, -0.02, 0), start_m=(-20, 21, 0))
     np.testing.assert_allclose(lines.look_direction, np.tile([1.0, 0, 0], (101, 1)), atol=1e-12)
-    assert looking.side_of(lines, lines.look_direction) == "port"
+    assert coverage.side_of(lines, lines.look_direction) == "port"
 
 
 @pytest.mark.exhaustive
@@ -322,6 +322,6 @@ def test_pixels_are_sampled_however_many_there_are(shape):
     else:
         size = int(np.prod(shape))
         grid = clsas.Grid.points(np.arange(3.0 * size).reshape(*shape, 3))
-    assert 30 < len(looking._sampled(grid)) <= 1024
+    assert 30 < len(coverage._sampled(grid)) <= 1024
     middle_m = np.mean(grid.bounds_m, axis=0)
-    np.testing.assert_allclose(looking._sampled(grid).mean(axis=0), middle_m, rtol=0.06, atol=1)
+    np.testing.assert_allclose(coverage._sampled(grid).mean(axis=0), middle_m, rtol=0.06, atol=1)
