@@ -10,9 +10,8 @@ import numpy as np
 
 from clsas.engine.data import validate
 from clsas.engine.data.findings import warn_of
-from clsas.engine.data.fixes import doubts_of_track
 from clsas.engine.data.georeference import Georeference
-from clsas.engine.data.track import Track
+from clsas.engine.data.track import Track, doubts_of_track
 from clsas.files.csv_columns import read_columns
 from clsas.files.mistakes import suggestion
 from clsas.files.tables import located

@@ -1,8 +1,11 @@
-"""Tracks: poses of the platform, positions of the channels, and directions of the beam."""
+"""Tracks: poses of the platform, positions of the channels, and directions of the beam.
+
+At the end are the checks of a track's fixes: what cannot be right in them is reported as findings.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -11,10 +14,24 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from clsas.engine.data import reprs, validate
-from clsas.engine.data.findings import warn_of
-from clsas.engine.data.fixes import doubts_of_track
+from clsas.engine.data.findings import Finding, warn_of
 from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.reprs import measured
 from clsas.engine.data.system import Sonar
+
+LEAST_FIXES = 16
+"""Fewest positions that show what is usual: a plain choice."""
+
+MOST_HELD = 0.2
+"""Share of pings at a position that occurred before, above which fixes are held. Closed tracks
+repeat one position, and fixes held over two pings half of all. A halt of one ping in five raises
+what it sees by 2 dB."""
+
+# Speed between two fixes over the usual one. Noise that hides the motion entirely reaches 7, since
+# the median distance is then that of the noise. Wrong fixes reach thousands.
+_FASTER = 10.0
+_WHOLE = 1e-6  # by which multiples of a step may differ from whole numbers
+_REGULAR = 0.9  # share of equal steps, above which a track is one of equal steps with lost pings
 
 Motion = float | ArrayLike | Callable[[NDArray[np.float64]], ArrayLike]
 
@@ -459,3 +476,94 @@ def _rate(
     if len(time) == 1:
         return np.zeros(1)
     return np.gradient(_at(name, motion, time), interval)
+
+
+def doubts_of_track(
+    positions_m: NDArray[np.float64],
+    time_s: NDArray[np.float64],
+    degrees: NDArray[np.float64] | None = None,
+) -> Iterator[Finding]:
+    """Yield what cannot be right in a track, from one fix per ping, in the order of time.
+
+    `degrees` are the latitudes and longitudes of which the positions were made, [pings, 2].
+    """
+    count = len(positions_m)
+    if count < LEAST_FIXES:
+        return
+    steps_m = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
+    speed_m_s, moves = steps_m / np.diff(time_s), steps_m > 0
+    if moves.any():
+        usual_m_s = float(np.median(speed_m_s[moves]))
+        fast = np.flatnonzero(speed_m_s > _FASTER * usual_m_s)
+        if fast.size:
+            worst = int(np.argmax(speed_m_s))
+            cause = "probably wrong fixes"
+            if degrees is not None and (zero := np.flatnonzero(~degrees.any(axis=1))).size:
+                cause = (
+                    f"ping {zero[0]} is at latitude 0, longitude 0, as receivers report without a "
+                    "fix. It also moves the origin of the track, the mean position"
+                )
+            yield Finding(
+                "jumps",
+                f"the track jumps at {fast.size} of {count - 1} steps, by up to "
+                f"{measured(steps_m[worst], 'm')} after ping {worst}: a "
+                f"speed of {speed_m_s[worst]:.4g} m/s, where {usual_m_s:.3g} m/s is usual; {cause}",
+                float(speed_m_s[worst]),
+                _FASTER * usual_m_s,
+                "leave these fixes out, and interpolate the navigation over them",
+                tuple(fast.tolist()),
+            )
+    held = int(np.count_nonzero(~moves))
+    if held > MOST_HELD * count and moves.any():
+        yield held_fixes(f"{held} of {count} pings", held / count)
+    if degrees is not None and (degrees == degrees.astype(np.float32)).all():
+        step, how = max(rounded_to(each, 1e-6) for each in degrees.T)
+        if step:
+            yield Finding(
+                "coarse_fixes",
+                f"latitudes and longitudes are rounded to {step:.2g} degrees, "
+                f"{measured(111e3 * step, 'm', 2)} on the ground{how}",
+                step,
+                1e-6,
+                "keep latitudes and longitudes in float64",
+            )
+
+
+def held_fixes(count: str, share: float) -> Finding:
+    """Return that a share of pings or channels, counted in words, repeat a position."""
+    return Finding(
+        "held_fixes",
+        f"{count} have exactly the position of another one: either the navigation has fewer fixes "
+        "than there are pings, and each was held over several, or the platform stood still",
+        share,
+        MOST_HELD,
+        "interpolate the navigation at the times of the pings, or leave out pings taken standing "
+        "still with lines.without_still_pings()",
+    )
+
+
+def rounded_to(
+    values: NDArray[np.float64], least: float, decimals: tuple[float, ...] = ()
+) -> tuple[float, str]:
+    """Return the step above `least` to which coordinates were rounded, and how; 0 if there is none.
+
+    Equal steps are no rounding, even where pings were lost: a rail or a simulation has them.
+    """
+    unique, counts = np.unique(values, return_counts=True)
+    if len(unique) < LEAST_FIXES or 4 * len(unique) * counts.min() < len(values):
+        return 0.0, ""  # a coordinate that hardly changes
+    single = float(np.spacing(np.float32(np.abs(values).max())))
+    for step in (single, *decimals):
+        numbers = (unique - unique[0]) / step  # also multiples if a lever arm was added
+        if step <= least or np.abs(numbers - np.rint(numbers)).max() > _WHOLE:
+            continue
+        steps = np.diff(np.rint(numbers))
+        kinds, of_kind = np.unique(steps.astype(np.int64), return_counts=True)
+        if np.gcd.reduce(kinds) > 1 and not np.ptp(counts):
+            return 0.0, ""  # equal steps, some of which are lost
+        if step == single:
+            if len(kinds) > 1 or np.ptp(counts):
+                return single, ", as single precision (float32) does with numbers of this size"
+        elif of_kind.max() < _REGULAR * len(steps):
+            return step, ""
+    return 0.0, ""

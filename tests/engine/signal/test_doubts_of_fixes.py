@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clsas
-from clsas.engine.data.fixes import doubts_of_fixes
+from clsas.engine.signal.doubts import doubts_of_fixes
 
 PINGS = np.arange(120)
 UTM_M = np.array([597_300.0, 6_643_100.0, -8.0])
