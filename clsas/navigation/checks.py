@@ -9,7 +9,6 @@ import numpy as np
 from clsas.engine.data import validate
 from clsas.engine.data.lines import RangeLines, band_wavelength_m, banks_of, is_about_zero
 from clsas.engine.data.pings import Transmissions
-from clsas.engine.data.lines import band_wavelength_m, is_about_zero
 from clsas.engine.signal.interpolation import Readout
 
 _MOST_OVERSAMPLING = 64.0  # limits the range resolution of lines that are almost constant

@@ -17,11 +17,9 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.lines import cycles_per_m_at
-from clsas.engine.signal.interpolation import Readout
 from clsas.engine.data import decibels
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at
+from clsas.engine.signal.interpolation import Readout
 from clsas.navigation.directions import Alignment, alignment
 from clsas.navigation.echoes import Window, independent_echoes, strongest, without_highlights
 from clsas.navigation.overlap import Overlap

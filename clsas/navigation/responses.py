@@ -17,10 +17,7 @@ from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines, wavelength_m
 from clsas.engine.data.threads import in_threads
 from clsas.engine.data.visibility import sines
-from clsas.engine.data.lines import wavelength_m
 from clsas.engine.signal.interpolation import Readout, phasors
-from clsas.engine.signal.interpolation import phasors
-from clsas.engine.signal.interpolation import Readout
 
 READ_DB = -40.0
 """Accuracy with which the lines are read."""

@@ -14,7 +14,6 @@ from numpy.typing import DTypeLike, NDArray
 from clsas.engine.data.beam import INTERVALS, BeamWindow
 from clsas.engine.data.lines import RangeLines, wavelength_m
 from clsas.engine.data.threads import in_threads
-from clsas.engine.data.lines import wavelength_m
 from clsas.engine.device.device import Device, aligned
 from clsas.engine.device.kernels import PRECISE_PHASE_TERMS, Kernel, sine_and_cosine
 from clsas.engine.signal.interpolation import PHASES, Gain, Resampling, Upsampler

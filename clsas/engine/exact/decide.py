@@ -19,7 +19,6 @@ from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import cycles_per_m_at, fastest, some_channels, wavelength_m
 from clsas.engine.data.visibility import sines
-from clsas.engine.data.lines import cycles_per_m_at, wavelength_m
 from clsas.engine.device import kernels
 from clsas.engine.device.device import Device
 from clsas.engine.exact.layout import (

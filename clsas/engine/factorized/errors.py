@@ -23,7 +23,6 @@ from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.lines import wavelength_m
 from clsas.engine.data.visibility import sines
-from clsas.engine.data.lines import wavelength_m
 from clsas.engine.device import kernels
 from clsas.engine.device.device import Device
 from clsas.engine.exact.decide import ROUNDING

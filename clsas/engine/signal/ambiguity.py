@@ -22,9 +22,15 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import GOLDEN, RangeLines, antennas_of, some_channels
+from clsas.engine.data.lines import (
+    GOLDEN,
+    RangeLines,
+    antennas_of,
+    cycles_per_m_at,
+    some_channels,
+    wavelength_m,
+)
 from clsas.engine.data.visibility import sines
-from clsas.engine.data.lines import cycles_per_m_at, wavelength_m
 from clsas.engine.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum, representative_channels
 
 BEST_DB = -85.0

@@ -8,7 +8,6 @@ from tiers import also
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.lines import wavelength_m
 from clsas.engine.data.visibility import sines
-from clsas.engine.data.lines import wavelength_m
 from clsas.engine.signal.ambiguity import brightness
 from clsas.engine.signal.spectrum import measure_spectrum
 
