@@ -238,17 +238,16 @@ def _exactly(
         scene, how, device, warned=chosen is not None and not scene.is_reached, keep=False
     )
     assert imager.decision is not None
-    interpolator, ratio = imager.decision.interpolator, imager.decision.resampling.ratio
     return _Formed(
         imager.form(lines, progress),
-        f"{why}{interpolator.taps} taps on lines upsampled {ratio:.3g} times",
+        why + imager.decision.describe(),
         imager.decision.error_db(scene),
         scene.left_out,
         {
             "method": "exact",
-            "taps": interpolator.taps,
-            "upsampling": ratio,
-            "interpolation_error_db": interpolator.error_db,
+            "taps": imager.decision.interpolator.taps,
+            "upsampling": imager.decision.resampling.ratio,
+            "interpolation_error_db": imager.decision.interpolator.error_db,
         },
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -233,7 +234,8 @@ def _part(
     if near is None:
         return image
     rows, columns = window_around(image.grid, near, extent_m)
-    return clsas.Image(image.pixels[rows, columns], image.grid.window(rows, columns))
+    grid = image.grid.window(rows, columns)
+    return replace(image, pixels=image.pixels[rows, columns], grid=grid)
 
 
 def _of_points(image: clsas.Image, near: tuple[float, ...] | None, how: dict[str, Any]) -> Figure:

@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
+from clsas.engine.data import reprs
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.digests import samples_digest
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.image import Image, holds_any
+from clsas.engine.data.image import Formed, Image, holds_any
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.version import __version__
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.exact.decide import ACCURACY_DB, Decision, decide
 from clsas.engine.exact.run import ExactImager
@@ -58,7 +62,7 @@ class SceneImager:
         decision: Decision | None = None,
     ) -> None:
         self.scene, self.device, self._warned = scene, device, warned
-        self.decision = decision
+        self._plan, self.decision = plan, decision
         method = plan.method if isinstance(plan, Plan) else plan
         if isinstance(method, ExactImage):
             self.decision = decision or decide(
@@ -80,6 +84,7 @@ class SceneImager:
             Called as progress(done, total).
         """
         scene, largest = self.scene, self.scene.largest_sample
+        digest = samples_digest(lines)
         if lines is not scene.given_lines:
             lines = scene.with_samples(lines)
             largest = check_numbers(lines, scene.beam)
@@ -97,7 +102,35 @@ class SceneImager:
         if not self._warned and not holds_any(pixels):
             self._warned = True
             scene.warn_unreached(lines)
-        return Image(pixels.reshape(scene.given_grid.shape), scene.given_grid)
+        pixels = pixels.reshape(scene.given_grid.shape)
+        return Image(pixels, scene.given_grid, formed=self._formed(pixels, digest))
+
+    def _formed(self, pixels: NDArray[np.complex64], digest: str) -> Formed:
+        """Return how pixels were formed; `digest` is that of their lines."""
+        plan, scene = self._plan, self.scene
+        if isinstance(plan, Plan):
+            tolerance_db = plan.tolerance_db
+        else:
+            is_fixed = plan.taps is not None and plan.upsampling is not None
+            tolerance_db = None if is_fixed else plan.accuracy_db
+        if self.decision is not None:
+            words, error_db = self.decision.describe(), self.decision.error_db(scene)
+        else:
+            assert isinstance(plan, Plan)
+            sides = ", ".join(map(reprs.by, plan.sides))
+            words = f"subimages of {sides} pixels, {plan.factorization.describe()}"
+            error_db = plan.predicted_error_db
+        return Formed(
+            method="factorized" if self.decision is None else "exact",
+            tolerance_db=tolerance_db,
+            plan=words,
+            predicted_error_db=error_db if holds_any(pixels) else None,
+            beam=scene.given_beam,
+            left_out=scene.left_out,
+            device=self.device.info.label,
+            version=__version__,
+            lines_digest=digest,
+        )
 
 
 def form(

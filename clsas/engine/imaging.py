@@ -213,7 +213,7 @@ def factorize(
         See `clsas.engine.device.device.choose`.
     accumulate : Image, optional
         Image on the same grid to which this one is added, so that data may arrive in pieces. The
-        tolerance applies to the new image alone.
+        tolerance applies to the new image alone, and `Image.formed` of the sum is None.
     progress : callable, optional
         Called as progress(done, total).
 
@@ -343,6 +343,7 @@ def backproject(
         Without a beam every channel has the weight 1 everywhere.
     accumulate : Image, optional
         Image on the same grid to which this one is added, so that data may arrive in pieces.
+        `Image.formed` of the sum is None.
     progress : callable, optional
         Called as progress(done, total), counted in pairs of a part of the image and a channel.
 
@@ -585,6 +586,7 @@ class Imager:
         lines : RangeLines
         accumulate : Image, optional
             Image on the same grid to which this one is added, so that data may arrive in pieces.
+            `Image.formed` of the sum is None.
         progress : callable, optional
             Called as progress(done, total).
 

@@ -20,9 +20,10 @@ import numpy as np
 
 from clsas.engine.data import reading, validate
 from clsas.engine.data.atomic import replacing
+from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.image import Image
+from clsas.engine.data.image import Formed, Image
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.data.system import Pulse
@@ -36,6 +37,8 @@ _KINDS = {
     "grid": Grid,
     "range_lines": RangeLines,
     "image": Image,
+    "formed": Formed,
+    "beam": BeamWindow,
     "echoes": Echoes,
     "pulse": Pulse,
     "georeference": Georeference,
@@ -326,13 +329,19 @@ def too_large() -> Iterator[None]:
 
 def _set(group: h5py.Group, name: str, value: Any) -> None:
     # HDF5's checksums cover strings of fixed length, but not those of variable length.
-    group.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
+    if isinstance(value, str):
+        value = np.bytes_(value.encode())
+    elif isinstance(value, tuple) and value and all(isinstance(each, str) for each in value):
+        value = np.array([each.encode() for each in value], np.bytes_)
+    group.attrs[name] = value
 
 
 def _attribute(group: h5py.Group, name: str) -> Any:
     """Return an attribute as a Python number, string or list, or None if it is missing."""
     value = group.attrs.get(name)
     value = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+    if isinstance(value, list):
+        return [each.decode() if isinstance(each, bytes) else each for each in value]
     return value.decode() if isinstance(value, bytes) else value
 
 

@@ -380,7 +380,7 @@ def _placed(source: Image | Store, georeference: Georeference | None) -> Image:
     shown = source.overview() if isinstance(source, Store) else source
     if shown.georeference == found.grid.georeference:
         return shown
-    return Image(shown.pixels, replace(shown.grid, georeference=found.grid.georeference))
+    return replace(shown, grid=replace(shown.grid, georeference=found.grid.georeference))
 
 
 def _placed_heights(source: Image | Store | Heights, georeference: Georeference | None) -> Heights:

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.image import Image
+from clsas.engine.data.image import Formed, Image
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.system import Pulse
 from clsas.engine.signal.echoes import Echoes
@@ -50,6 +51,19 @@ def objects():
         "projected": Image(complex_noise(random, 3, 5), replace(PLANE, georeference=UTM)),
         "placed lines": RangeLines(samples, 1, 0.1, tx_m, rx_m, 0, 1500, georeference=LOCAL),
         "image": Image(complex_noise(random, 3, 5), PLANE),
+        "formed image": Image(
+            complex_noise(random, 3, 5),
+            PLANE,
+            Formed("factorized", -40 / 3, "4 taps", -20 / 3, None, ("relief", "µ"), "GPU", "1", "a"),
+        ),
+        "image of a beam": Image(
+            complex_noise(random, 3, 5),
+            PLANE,
+            Formed(
+                *("exact", None, "", None, BeamWindow(10 / 3, "tukey", 1, 1 / 3, along=[[0, 1, 0]])),
+                *((), "host", "1", "b"),
+            ),
+        ),
         "image of points": Image(complex_noise(random, 7), Grid.points(noise(7, 3))),
         "interferogram": Interferogram(*np.abs(noise(4, 3, 5)), PLANE, 0.1),
         "heights": Heights(

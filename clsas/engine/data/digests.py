@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -26,6 +27,10 @@ NOT_IN_IMAGES: Without = MappingProxyType(
     }
 )
 """Fields on which neither plans nor the positions of pixels depend."""
+
+# Most samples that enter a digest. From 8 million or more it takes 0.25 ms, and 4 ms with 16 times
+# as many; an image of 1000 pixels from 64 lines takes 1.5 ms, of which the digest is 0.05 ms.
+_SAMPLES = 1 << 12
 
 DIGEST = "digest"
 """Key of a record's digest, which is that of all its other entries."""
@@ -56,6 +61,14 @@ def digest(value: Any, without: Without = MappingProxyType({})) -> str:
 def lines_digest(lines: RangeLines) -> str:
     """Return a digest of everything in range lines from which images of any samples follow."""
     return digest([lines, lines.samples.shape], NOT_IN_IMAGES)
+
+
+def samples_digest(lines: RangeLines) -> str:
+    """Return a digest of `lines_digest` and of samples that are spread over all lines."""
+    step = math.ceil(lines.samples.size / _SAMPLES)
+    while math.gcd(step, lines.length) > 1:  # else all samples would lie at the same few ranges
+        step += 1
+    return digest([lines_digest(lines), lines.samples.reshape(-1)[::step]])
 
 
 def grid_digest(grid: Grid) -> str:

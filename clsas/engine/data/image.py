@@ -1,4 +1,4 @@
-"""Complex images on grids."""
+"""Complex images on grids, and how they were formed."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import level_db
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
@@ -18,6 +19,77 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _AT_ONCE = 1 << 16  # pixels that are tested together
+_METHODS = ("exact", "factorized", "wavenumber", "mosaic")
+
+
+@dataclass(frozen=True, eq=False)
+class Formed:
+    """How an image was formed: `Image.formed`.
+
+    Parameters
+    ----------
+    method : {"exact", "factorized", "wavenumber", "mosaic"}
+        Method; "mosaic" for a window of several patches, each of which has a plan of its own.
+    tolerance_db : float or None
+        Requested relative rms error, dB; None if none was requested.
+    plan : str
+        How the method formed the image, in words; "" for a mosaic.
+    predicted_error_db : float or None
+        Predicted relative rms error, dB: of a factorized image against the exact one, of an exact
+        image against the ideal sum; None if unknown.
+    beam : BeamWindow or None
+        Weights of the channels; None without weights.
+    left_out : sequence of str
+        Effects that the image neglects, because their error is far below the tolerance.
+    device : str
+        Device and driver that formed the image.
+    version : str
+        Version of clsas.
+    lines_digest : str
+        Digest of the range lines: of all positions and ranges, and of up to 4096 samples, which are
+        spread over all lines. Images of the same lines have the same digest.
+    """
+
+    method: str
+    tolerance_db: float | None
+    plan: str
+    predicted_error_db: float | None
+    beam: BeamWindow | None
+    left_out: tuple[str, ...]
+    device: str
+    version: str
+    lines_digest: str
+
+    def __post_init__(self) -> None:
+        """Check every field and convert it."""
+        validate.one_of("method", self.method, _METHODS)
+        for name in ("tolerance_db", "predicted_error_db"):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, validate.number(name, value, "dB"))
+        validate.instance("beam", self.beam, BeamWindow, type(None))
+        effects = validate.entries("left_out", self.left_out, "names of effects")
+        effects = [validate.text("every entry of left_out", each) for each in effects]
+        object.__setattr__(self, "left_out", tuple(effects))
+        for name in ("plan", "device", "version", "lines_digest"):
+            validate.text(name, getattr(self, name))
+
+    def describe(self) -> str:
+        """Return everything but the digest as one line of text."""
+        parts = [self.method]
+        if self.tolerance_db is not None:
+            parts.append(f"tolerance {reprs.quantity(self.tolerance_db, 'dB')}")
+        if self.predicted_error_db is not None:
+            parts.append(f"predicted error {self.predicted_error_db:.1f} dB")
+        parts += [self.plan] if self.plan else []
+        if self.beam is not None:
+            parts.append(repr(self.beam))
+        if self.left_out:
+            parts.append(f"without {' and '.join(self.left_out)}")
+        return f"{', '.join(parts)}; on {self.device}, clsas {self.version}"
+
+    def __repr__(self) -> str:
+        """Return the description."""
+        return f"Formed({self.describe()})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +105,14 @@ class Image:
         each pixel's range has been restored.
     grid : Grid
         Positions of the pixels.
+    formed : Formed, optional
+        How the image was formed. Imagers state it, and windows and files of an image keep it. It is
+        None for sums of images, for pixels that were changed, and for images from elsewhere.
 
     Raises
     ------
     TypeError
-        If the pixels are not complex or `grid` is not a Grid.
+        If the pixels are not complex, `grid` is not a Grid or `formed` is not a Formed.
     ValueError
         If the pixels do not have the grid's shape, a pixel is NaN or infinite, or the largest
         complex128 pixel is too large or too small for complex64.
@@ -61,6 +136,7 @@ class Image:
 
     pixels: NDArray[np.complex64]
     grid: Grid
+    formed: Formed | None = None
 
     if TYPE_CHECKING:  # the constructor converts array_like arguments
 
@@ -68,11 +144,13 @@ class Image:
             self,
             pixels: ArrayLike,
             grid: Grid,
+            formed: Formed | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""
         validate.instance("grid", self.grid, Grid)
+        validate.instance("formed", self.formed, Formed, type(None))
         pixels = validate.array("pixels", self.pixels, np.complex64, self.grid.shape)
         object.__setattr__(self, "pixels", pixels)
 

@@ -89,6 +89,11 @@ class Decision:
     phase_terms: int
     one_cubic: bool
 
+    def describe(self) -> str:
+        """Return the interpolation in words."""
+        taps, ratio = self.interpolator.taps, self.resampling.ratio
+        return f"{taps} taps on lines upsampled {ratio:.3g} times"
+
     def error_db(self, scene: Scene) -> float:
         """Return the relative rms error of the image, of the lines and of what is left out, dB."""
         of_passed = power(self.interpolator.error_db) / scene.ambiguity.least_brightness

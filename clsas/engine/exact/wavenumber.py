@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.coverage import reaches, warn_unreached
+from clsas.engine.data.digests import samples_digest
 from clsas.engine.data.fourier import (
     gridding,
     gridding_gain,
@@ -23,9 +24,10 @@ from clsas.engine.data.fourier import (
 from clsas.engine.data.geometry import bistatic_range_m, pairwise_range_m
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.image import Image
+from clsas.engine.data.image import Formed, Image
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at, wavelength_m
 from clsas.engine.data.threads import in_threads
+from clsas.engine.data.version import __version__
 from clsas.engine.scene import check_numbers
 from clsas.engine.signal.doubts import warn_before_imaging
 from clsas.engine.signal.interpolation import phasors
@@ -152,6 +154,17 @@ def wavenumber(
         kind = "heights" if grid.points_m is None else "points"
         raise ValueError(f"grid must be a plane with rows along the track, got {kind}")
     check_numbers(lines, beam)
+    formed = Formed(
+        method="wavenumber",
+        tolerance_db=None,
+        plan="with motion compensation" if motion_compensation else "",
+        predicted_error_db=None,
+        beam=beam,
+        left_out=(),
+        device="host",
+        version=__version__,
+        lines_digest=samples_digest(lines),
+    )
     if beam is not None and beam.normalise:
         raise ValueError("beam must not normalise here; use clsas.backproject for that")
     if lines.sound_speed is not None:
@@ -169,12 +182,12 @@ def wavenumber(
     if aspects is None or not visible.any() or not reaches(lines, grid, None, None):
         along = None if beam is None else beam.directions(lines)
         warn_unreached(lines, grid, beam, along)
-        return Image(np.zeros(grid.shape, np.complex64), grid)
+        return Image(np.zeros(grid.shape, np.complex64), grid, formed=formed)
     warn_before_imaging(lines, grid, beam)
     _warn_bent(lines, grid, track, aspects, band, motion_compensation)
     on_line = replace(track, along_m=track.along_m[visible], shift_m=track.shift_m[visible])
     pixels = migrate(lines.select(visible), on_line, aspects, band, ACCURACY_DB, workers)
-    return Image(pixels, grid)
+    return Image(pixels, grid, formed=formed)
 
 
 @dataclass(frozen=True, eq=False)

@@ -379,6 +379,13 @@ class Factorization:
 
     __repr__ = reprs.of_fields
 
+    def describe(self) -> str:
+        """Return the filters in words."""
+        return (
+            f"{self.align.taps} taps in range at {self.resampling.ratio:.2f} x the lines' rate, "
+            f"{self.aperture.describe()}, {self.final.taps} taps at the end"
+        )
+
     @property
     def band(self) -> tuple[float, float] | None:
         """Centre and half width of the band for which filters were designed; None for any band."""
@@ -910,11 +917,7 @@ def _report(plan: Plan) -> Report:
         because = "" if plan.tolerance_db is None else f": {reason}"
         parts.append(f"Plain backprojection{because}.")
     else:
-        parts += [
-            f"{method.align.taps} taps in range at {method.resampling.ratio:.2f} x the lines' "
-            f"rate, {method.aperture.describe()}, {method.final.taps} taps at the end",
-            _table(prediction.stages),
-        ]
+        parts += [method.describe(), _table(prediction.stages)]
     parts += ["Error by cause, with its margin; powers add up:", *prediction.errors.describe()]
     origin = costs_in_words(prediction.cost_source, prediction.costs_measured)
     parts.append(f"Times follow from {origin}")
