@@ -113,9 +113,14 @@ def show(
     figure, words = _drawn(shown, near, extent_m, percentile, title, levels)
     plot.save(figure, output)
     kind = "mosaic" if isinstance(shown, clsas.Store) else type(shown).__name__
+    formed = shown.formed if isinstance(shown, clsas.Image) else None
+    text = f"{printable(output)}: {printable(words)}"
+    if formed is not None:
+        text += f"\n  {printable(formed.describe())}"
     report(
-        as_json, f"{printable(output)}: {printable(words)}", file=file, picture=output, kind=kind
-    )
+        as_json, text, file=file, picture=output, kind=kind,
+        **({} if formed is None else {"formed": formed.describe()}),
+    )  # fmt: skip
 
 
 def _beside(file: Path) -> Path:

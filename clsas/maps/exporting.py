@@ -99,8 +99,9 @@ def export(
     georeference : Georeference, optional
         Where the image lies on Earth, if it has no georeference of its own.
     plan : Plan, optional
-        Plan of the image. Its tolerance, predicted error and stages become tags of the file. A
-        mosaic knows its own.
+        Plan of the image, if it has none in `Image.formed`. Tolerance, predicted error and plan
+        become tags of the file, beside the method, beam and device of `Image.formed`. A mosaic
+        knows its own.
     lines : RangeLines, optional
         Range lines of the image. Their carrier and sound speed become tags of the file. SICD, and
         complex pixels with `north_up`, require them: track and band follow from them.
@@ -335,6 +336,7 @@ def _check_phase(grid: Grid, lines: RangeLines | None) -> None:
 def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
     """Return what is known of an image's origin, as tags of a file: texts and numbers."""
     lines, plan = options.lines, options.plan
+    formed = None if source.image is None else source.image.formed
     place, inputs = source.grid.georeference, source.inputs
     errors = [r.predicted_error_db for r in source.records.values() if r.has_pixels]
     known: dict[str, Any] = {
@@ -347,6 +349,18 @@ def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
         "PATCHES": len(source.records) or None,
         "WINDOW_M": source.window_m,
     }
+    if formed is not None:
+        known |= {
+            "METHOD": formed.method,
+            "TOLERANCE_DB": formed.tolerance_db,
+            "PREDICTED_ERROR_DB": formed.predicted_error_db,
+            "PLAN": formed.plan or None,
+            "BEAM": None if formed.beam is None else repr(formed.beam),
+            "LEFT_OUT": ", ".join(formed.left_out) or None,
+            "DEVICE": formed.device,
+            "LINES_DIGEST": formed.lines_digest,
+            "FORMED_BY": f"clsas {formed.version}",
+        }
     if lines is not None:
         known |= {"CARRIER_HZ": lines.carrier_hz, "SOUND_SPEED_M_S": lines.sound_speed_m_s}
     if plan is not None:

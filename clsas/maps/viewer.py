@@ -120,7 +120,9 @@ def write(
     report = _Progress(2 * sum(prod(reader.counts) for reader in readers), progress)
     reference = max(_largest(reader, report) for reader in readers) or 1.0
     quantization = Quantization(reference, max(STEP_DB, range_db / (BRIGHTEST - 1)))
-    scene = {"names": names, "range_db": range_db, "colours": tables}
+    formed = [None if reader.image is None else reader.image.formed for reader in readers]
+    described = ["" if each is None else each.describe() for each in formed]
+    scene = {"names": names, "formed": described, "range_db": range_db, "colours": tables}
     known = next((grid for grid in grids if grid.georeference is not None), grids[0])
     sides_m = tuple(float(np.linalg.norm(step)) for step in steps_of(known))
     factors = factors_of(readers[0].shape, (sides_m[0], sides_m[1]))

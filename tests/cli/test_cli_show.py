@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 import clsas
 from clsas.cli import main
+from clsas.engine.data.image import Formed
 from clsas.mosaics.stored_arrays import StoredArrays
 
 pytest.importorskip("matplotlib")
@@ -139,6 +140,16 @@ def test_an_image_of_zeros_is_drawn_at_every_percentile(folder):
     clsas.save("zero.h5", clsas.Image(np.zeros(PLANE.shape, np.complex64), PLANE))
     run("zero.h5", "--percentile", 99)
     assert Path("zero.png").exists()
+
+
+def test_how_an_image_was_formed_is_printed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    formed = Formed("exact", -40, "4 \x1b taps", -41.2, None, (), "GPU", "1", "a")
+    clsas.save("image.h5", clsas.Image(pixels((41, 81), (10, 60)), PLANE, formed))
+    printed = run("image.h5", "--near", "0.5,20.5")
+    assert "\n  exact, tolerance -40 dB, predicted error -41.2 dB" in printed
+    assert "\x1b" not in printed
+    assert json.loads(run("image.h5", "--json"))["formed"] == formed.describe()
 
 
 @pytest.mark.slow

@@ -54,15 +54,12 @@ def objects():
         "formed image": Image(
             complex_noise(random, 3, 5),
             PLANE,
-            Formed("factorized", -40 / 3, "4 taps", -20 / 3, None, ("relief", "µ"), "GPU", "1", "a"),
+            Formed("factorized", -40 / 3, "taps", -20 / 3, None, ("relief", "µ"), "GPU", "1", "a"),
         ),
         "image of a beam": Image(
             complex_noise(random, 3, 5),
             PLANE,
-            Formed(
-                *("exact", None, "", None, BeamWindow(10 / 3, "tukey", 1, 1 / 3, along=[[0, 1, 0]])),
-                *((), "host", "1", "b"),
-            ),
+            Formed("exact", None, "", None, BeamWindow(5, along=[[0, 1, 0]]), (), "", "1", "b"),
         ),
         "image of points": Image(complex_noise(random, 7), Grid.points(noise(7, 3))),
         "interferogram": Interferogram(*np.abs(noise(4, 3, 5)), PLANE, 0.1),

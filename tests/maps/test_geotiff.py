@@ -203,6 +203,24 @@ def test_tags_say_where_the_image_comes_from(tmp_path):
     assert float(tags["X_AXIS_HEADING_DEG"]) == 90
 
 
+def test_tags_say_how_the_image_was_formed(tmp_path):
+    beam = clsas.BeamWindow(40, "hann")
+    lines = replace(LINES, georeference=local(90.0))
+    image = clsas.backproject(lines, PLANE, accuracy_db=-40, beam=beam)
+    clsas.export(image, tmp_path / "a.tif")
+    with rasterio.open(tmp_path / "a.tif") as file:
+        tags = file.tags()
+    formed = image.formed
+    assert tags["METHOD"] == "exact"
+    assert float(tags["TOLERANCE_DB"]) == -40
+    assert float(tags["PREDICTED_ERROR_DB"]) == pytest.approx(formed.predicted_error_db)
+    assert tags["PLAN"] == formed.plan
+    assert tags["BEAM"] == repr(beam)
+    assert tags["DEVICE"] == formed.device
+    assert tags["LINES_DIGEST"] == formed.lines_digest
+    assert tags["FORMED_BY"] == f"clsas {clsas.__version__}"
+
+
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory):
     """A finished store with heights, of 2 x 3 patches."""

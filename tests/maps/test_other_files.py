@@ -38,6 +38,19 @@ def test_netcdf_has_a_history_and_is_reproducible(tmp_path, monkeypatch):
     assert path.read_bytes() == first
 
 
+def test_netcdf_says_how_the_image_was_formed(tmp_path):
+    track_m = np.outer(np.arange(64), [0.02, 0, 0])
+    point = clsas.PointTargets([[0.6, 20, 0]])
+    lines = clsas.simulate_lines(track_m, track_m, point, carrier_hz=1e5, bandwidth_hz=2e4)
+    image = clsas.wavenumber(lines, clsas.Grid.plane((0.4, 0.8, 16), (19.8, 20.2, 16)))
+    clsas.export(image, tmp_path / "a.nc")
+    with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as data:
+        assert data.attrs["method"] == "wavenumber"
+        assert data.attrs["plan"] == "with motion compensation"
+        assert data.attrs["lines_digest"] == image.formed.lines_digest
+        assert "tolerance_db" not in data.attrs  # none was requested
+
+
 @pytest.mark.parametrize("place", [UTM_NORTH, local(90.0), local(217.0), None], ids=str)
 def test_netcdf_restores_the_image_and_its_place(place, tmp_path):
     pytest.importorskip("rioxarray")

@@ -16,6 +16,7 @@ from stores import GRID, LINES, REQUEST
 import clsas
 from clsas.cli import main
 from clsas.engine.data import atomic
+from clsas.engine.data.image import Formed
 from clsas.maps import tiles, viewer
 from clsas.maps.frames import Frame, fitted_degrees
 from clsas.maps.tiles import Pyramid, Quantization, factors_of, shape_of
@@ -64,6 +65,12 @@ def levels_at(folder, shape, scale, image=0, steps_m=(1.0, 1.0)):
             names.remove(f"{name}.js")
     assert not names
     return found
+
+
+def test_the_page_says_how_an_image_was_formed(image, tmp_path):
+    formed = Formed("exact", -40, "4 taps", -41.2, None, (), "GPU", "1", "a")
+    viewer.write(replace(image, formed=formed), tmp_path / "web", against=image)
+    assert scene_of(tmp_path / "web")["formed"] == [formed.describe(), ""]
 
 
 def test_tiles_have_every_pixel_to_half_a_step(image, written):

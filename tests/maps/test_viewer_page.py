@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 from io import BytesIO
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from chromium import PROGRAM, Chromium
 
 import clsas
+from clsas.engine.data.image import Formed
 from clsas.maps import viewer
 
 pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no Chromium: apt-get install chromium")
@@ -32,10 +34,14 @@ def browser(tmp_path_factory):
         yield opened
 
 
+FORMED = Formed("factorized", -40, "<b>4 taps</b>", -41.2, None, (), "GPU", "1", "a")
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("viewer") / "web"
     images = [pixels_with(BACKGROUND_DB), pixels_with(BACKGROUND_DB - 15)]
+    images[1] = replace(images[1], formed=FORMED)
     names = ["exact </script><b>", "tolerance"]
     viewer.write(images[0], path, against=images[1], names=names, colour_map="gray")
     return path
@@ -93,6 +99,14 @@ def test_a_known_point_is_where_the_cursor_says(page):
     page.move(width // 2 + 6, height // 2)
     assert position(page)[0] == pytest.approx(BRIGHT[1][0] + 0.03, abs=0.011)
     assert float(page.text("#level")[:-3].replace("−", "-")) == pytest.approx(-30, abs=0.2)
+
+
+def test_the_panel_says_how_the_image_was_formed(page):
+    assert page.text("#formed") == ""
+    page.press("2")
+    assert page.text("#formed") == FORMED.describe()
+    page.press("s")
+    assert page.text("#formed") == FORMED.describe()
 
 
 def test_wheel_and_drag_move_what_is_under_the_pointer(page):

@@ -91,6 +91,8 @@ function showNames() {
   const swiping = state.mode === "swipe";
   $("name-0").textContent = scene.names[swiping ? 0 : state.shown];
   $("name-1").textContent = swiping ? scene.names[1] : "";
+  const shown = swiping ? scene.formed : [scene.formed[state.shown]];
+  $("formed").textContent = shown.filter((words) => words).join(" / ");
   $("divider").style.left = `${state.split * 100}%`;
   $("divider").style.height = `${size.height}px`;
   $("divider").setAttribute("aria-valuenow", String(Math.round(state.split * 100)));
