@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.grid import Grid
+from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.device.device import Device
 from clsas.engine.imaging import Imager
@@ -37,18 +38,15 @@ class Pair:
 
     def images(self, grid: Grid) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
         """Return the pixels of both banks' images."""
-        return self._image(self.a, grid), self._image(self.b, grid)
+        return self.image(self.a, grid).pixels, self.image(self.b, grid).pixels
 
-    def first_image(self, grid: Grid) -> NDArray[np.complex64]:
-        """Return the pixels of the first bank's image."""
-        return self._image(self.a, grid)
-
-    def _image(self, lines: RangeLines, grid: Grid) -> NDArray[np.complex64]:
+    def image(self, lines: RangeLines, grid: Grid) -> Image:
+        """Return the image of one of the banks."""
         imager = Imager(
             lines, grid, tolerance_db=self.tolerance_db, accuracy_db=self.accuracy_db,
             beam=self.beam, device=self.device,
         )  # fmt: skip
-        return imager(lines).pixels
+        return imager(lines)
 
     def within(self, tolerance_db: float) -> Pair:
         """Return the pair with a tolerance of at least so many decibels."""

@@ -119,7 +119,8 @@ def refine(
     slope_m = np.array(np.gradient(relief_m))
     for done in range(1, PASSES + 1):
         on_relief = grid.with_height(relief_m)
-        images = task.pair.images(on_relief)
+        image = task.pair.image(task.pair.a, on_relief)
+        images = image.pixels, task.pair.image(task.pair.b, on_relief).pixels
         rad_m, facing = sensitivity(grid, relief_m, slope_m, sights)
         planes = fit_planes(images, relief_m, -1 / rad_m, window)
         seen = looks_on_plane * np.maximum(facing, _LEAST_FORESHORTENING)
@@ -138,7 +139,6 @@ def refine(
         # The median is not affected by the few pixels beside steps of the relief.
         correction = float(np.median(change[valid])) / _MEDIAN if valid.any() else 0.0
         settled = valid & (change < _UNSETTLED)
-        image = Image(images[0], on_relief)
         whole_sd_m = np.hypot(sd_m, displacement_m(planes.bend_m, sd_m, settled, window))
         found = Refined(
             planes.height_m, whole_sd_m, coherence, seen, -1 / rad_m, settled, image, correction

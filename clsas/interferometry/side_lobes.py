@@ -90,7 +90,7 @@ def point_response(pair: Pair, grid: Grid) -> NDArray[np.float64]:
     point_m = grid.positions_m()[middle(grid.shape)]
     lines, beam = pair.a, pair.beam
     along = track_directions(lines) if beam is None else beam.directions(lines)
-    pixels = replace(pair, a=lines_of_point(lines, point_m, along)).first_image(grid)
+    pixels = pair.image(lines_of_point(lines, point_m, along), grid).pixels
     return pixels.real.astype(np.float64) ** 2 + pixels.imag.astype(np.float64) ** 2
 
 

@@ -195,7 +195,7 @@ def _image(
     if beam is not None and beam.normalise:
         # The beam was normalised by the number of channels of this patch instead of all channels.
         scale = np.float32(survey.channels / lines.channels)
-        image = Image(scale * image.pixels, grid) if scale != 1 else image
+        image = replace(image, pixels=scale * image.pixels) if scale != 1 else image
     known |= how | {
         "has_pixels": holds_any(image.pixels),
         "seconds": time.perf_counter() - start,

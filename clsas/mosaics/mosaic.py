@@ -21,10 +21,12 @@ from numpy.typing import NDArray
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.coverage import warn_unreached
+from clsas.engine.data.digests import digest
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.image import Image
+from clsas.engine.data.image import Formed, Image
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.version import __version__
 from clsas.engine.device.device import Device
 from clsas.engine.signal.doubts import warn_before_imaging
 from clsas.mosaics.arguments import (
@@ -202,7 +204,8 @@ class Mosaic:
         -------
         Image
             Image on all of `grid`. It takes 8 bytes of memory per pixel, in addition to the memory
-            of the patches that are being formed.
+            of the patches that are being formed. `Image.formed` is None if patches were read from
+            the store, whose `Record` says how each was formed.
 
         Raises
         ------
@@ -216,8 +219,11 @@ class Mosaic:
         validate.memory("the mosaic", 8 * self.grid.size)
         stored = [self._patch(index, record, None) for index, record in self.finished.items()]
         pixels: NDArray[np.complex64] | None = None
+        formed: dict[PatchIndex, Formed | None] = {}
         for patch in chain(stored, self):
             image = patch.image
+            if patch.record.has_pixels:
+                formed[patch.row, patch.column] = image.formed
             if image.pixels.shape == self.grid.shape:
                 whole = image  # copying the pixels can take as long as forming the image
             else:
@@ -226,7 +232,27 @@ class Mosaic:
                 pixels[patch.rows, patch.columns] = image.pixels
             if tell is not None:
                 tell(patch)
-        return whole if pixels is None else Image(pixels, self.grid)
+        if pixels is None:
+            return whole
+        known = [each for each in formed.values() if each is not None]
+        if not known or len(known) < len(formed):
+            return Image(pixels, self.grid)
+        return Image(pixels, self.grid, self._formed(known))
+
+    def _formed(self, patches: Sequence[Formed]) -> Formed:
+        """Return how the whole image was formed, from patches with pixels."""
+        errors_db = [each.predicted_error_db for each in patches]
+        return Formed(
+            method="mosaic",
+            tolerance_db=patches[0].tolerance_db,
+            plan=f"{reprs.by(self.shape)} patches of {reprs.by(self.patch_shape)} pixels",
+            predicted_error_db=max((e for e in errors_db if e is not None), default=None),
+            beam=self._run.job.beam,
+            left_out=tuple(dict.fromkeys(e for each in patches for e in each.left_out)),
+            device=", ".join(dict.fromkeys(each.device for each in patches)),
+            version=__version__,
+            lines_digest=digest(sorted(each.lines_digest for each in patches)),
+        )
 
     def _patch(self, index: PatchIndex, record: Record, formed: Image | None) -> Patch:
         grid, row, column, rows, columns = self._run.layout.window(index)

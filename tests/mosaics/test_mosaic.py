@@ -976,3 +976,17 @@ def test_workers_of_a_machine_take_a_device_each(tmp_path, monkeypatch):
     assert [device for device, _ in workers] == ["first", "second", "first", "second", "first"]
     os.close(workers[1][1])
     assert claim()[0] == "second"
+
+
+def test_a_mosaic_says_how_its_patches_were_formed(tmp_path):
+    request = REQUEST | {"beam": clsas.BeamWindow(40, "hann")}
+    patches = []
+    formed = clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **request).image(patches.append).formed
+    assert len(patches) > 1
+    assert (formed.method, formed.tolerance_db) == ("mosaic", patches[0].image.formed.tolerance_db)
+    assert formed.beam == request["beam"]
+    assert formed.predicted_error_db == max(p.image.formed.predicted_error_db for p in patches)
+    assert formed.device == patches[0].record.device
+    assert "patches of" in formed.plan
+    # Patches in a store may have been formed by another version.
+    assert clsas.mosaic(LINES, GRID, tmp_path / "a.zarr", **request).image().formed is None

@@ -29,14 +29,15 @@ class Formed:
     Parameters
     ----------
     method : {"exact", "factorized", "wavenumber", "mosaic"}
-        Method; "mosaic" for a window of several patches, each of which has a plan of its own.
+        Method; "mosaic" for several patches, each of which was formed by a plan of its own.
     tolerance_db : float or None
         Requested relative rms error, dB; None if none was requested.
     plan : str
-        How the method formed the image, in words; "" for a mosaic.
+        How the method formed the image, in words.
     predicted_error_db : float or None
         Predicted relative rms error, dB: of a factorized image against the exact one, of an exact
-        image against the ideal sum; None if unknown.
+        image against the ideal sum, of a mosaic that of its worst patch. None if it is unknown, or
+        the image is zero.
     beam : BeamWindow or None
         Weights of the channels; None without weights.
     left_out : sequence of str
@@ -47,7 +48,8 @@ class Formed:
         Version of clsas.
     lines_digest : str
         Digest of the range lines: of all positions and ranges, and of up to 4096 samples, which are
-        spread over all lines. Images of the same lines have the same digest.
+        spread over all lines. Images of the same lines have the same digest. That of a mosaic
+        depends on its patches, too.
     """
 
     method: str
