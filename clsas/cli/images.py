@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from clsas.cli.outputs import printable, progress_bar, report, say, warn
 from clsas.cli.parameters import HDF5
 from clsas.cli.wording import command
 from clsas.engine.data import validate
-from clsas.engine.data.image import holds_any
+from clsas.engine.data.image import Formed
 from clsas.engine.device.device import Device, KernelTimes, open_device
 from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.engine.factorized.plan import ExactImage
@@ -147,49 +147,36 @@ def image(
 
 @dataclass(frozen=True, eq=False)
 class _Formed:
-    """An image, and how it was formed.
-
-    Attributes
-    ----------
-    image : Image
-    how : str
-        The method in words.
-    predicted_error_db : float
-    left_out : tuple of str
-        Effects that the image does not model, since their error lies far below the tolerance.
-    figures : dict
-        Further results about the method, in types of JSON.
-    """
+    """An image, and the method in words and as results in types of JSON."""
 
     image: clsas.Image
     how: str
-    predicted_error_db: float
-    left_out: tuple[str, ...]
     figures: dict[str, Any]
 
-    @cached_property
-    def is_zero(self) -> bool:
-        """True if all pixels are zero; a relative error is then undefined."""
-        return not holds_any(self.image.pixels)
+    @property
+    def formed(self) -> Formed:
+        """How the image says that it was formed. A zero image has no predicted error."""
+        assert self.image.formed is not None
+        return self.image.formed
 
     @property
     def summary(self) -> str:
         """The method, the predicted error and what was left out, in a line."""
-        error = f"predicted error {self.predicted_error_db:.0f} dB"
-        parts = [self.how, "all pixels are zero" if self.is_zero else error]
-        if self.left_out:
-            parts.append(f"without {', '.join(self.left_out)}, far below the error allowed")
+        error_db, left_out = self.formed.predicted_error_db, self.formed.left_out
+        error = "all pixels are zero" if error_db is None else f"predicted error {error_db:.0f} dB"
+        parts = [self.how, error]
+        if left_out:
+            parts.append(f"without {', '.join(left_out)}, far below the error allowed")
         return "; ".join(parts)
 
     @property
     def results(self) -> dict[str, Any]:
         """The same in types of JSON."""
-        error_db = None if self.is_zero else self.predicted_error_db
         return {
             **self.figures,
-            "predicted_error_db": error_db,
-            "is_zero": self.is_zero,
-            "left_out": self.left_out,
+            "predicted_error_db": self.formed.predicted_error_db,
+            "is_zero": self.formed.predicted_error_db is None,
+            "left_out": self.formed.left_out,
         }
 
 
@@ -204,8 +191,6 @@ def _factorized(
     return _Formed(
         clsas.factorize(lines, grid, chosen, device=device, progress=progress),
         summary(chosen),
-        chosen.predicted_error_db,
-        chosen.left_out,
         {
             "method": "stages" if chosen.tolerance_db is None else "factorized",
             "predicted_seconds": chosen.predicted_seconds,
@@ -241,8 +226,6 @@ def _exactly(
     return _Formed(
         imager.form(lines, progress),
         why + imager.decision.describe(),
-        imager.decision.error_db(scene),
-        scene.left_out,
         {
             "method": "exact",
             "taps": imager.decision.interpolator.taps,
