@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from clsas.engine.data.sound_speed import SoundSpeed
     from clsas.engine.data.system import Pulse, Sonar
     from clsas.engine.data.track import Pointing, Track, channels
-    from clsas.engine.data.validate import ClsasWarning
+    from clsas.engine.data.validate import ArgumentError, ArgumentTypeError, ClsasWarning
     from clsas.engine.device.device import DeviceError, list_devices
     from clsas.engine.exact.wavenumber import wavenumber
     from clsas.engine.factorized.plan import Plan
@@ -69,6 +69,8 @@ if TYPE_CHECKING:
 from clsas.engine.data.version import __version__ as __version__
 
 __all__ = [
+    "ArgumentError",
+    "ArgumentTypeError",
     "Assessment",
     "Autofocus",
     "BeamWindow",
@@ -164,7 +166,7 @@ _MODULES = {
     "engine.data.image_error": "relative_error_db",
     "engine.data.lines": "RangeLines",
     "engine.data.sound_speed": "SoundSpeed",
-    "engine.data.validate": "ClsasWarning",
+    "engine.data.validate": "ArgumentError ArgumentTypeError ClsasWarning",
     "engine.exact.wavenumber": "wavenumber",
     "engine.factorized.plan": "Plan",
     "files.airsas": "read_airsas",

@@ -134,7 +134,7 @@ class _Commands(click.Group):
             except _errors() as error:
                 if ctx.params.get("traceback"):
                     raise
-                raise click.ClickException(_worded(_text(error))) from error
+                raise click.ClickException(_printable(_text(error))) from error
 
 
 def _errors() -> tuple[type[Exception], ...]:
@@ -203,8 +203,12 @@ def _worded(text: str) -> str:
 
 
 def _text(error: BaseException) -> str:
+    """Return the message of an exception in the words of the command line."""
+    from clsas.cli.wording import error_message
+
     if isinstance(error, OSError) and error.strerror:
         return f"{error.strerror}: {error.filename}" if error.filename else error.strerror
     if isinstance(error, MemoryError):
         return f"out of memory: {error}" if str(error) else "out of memory"
-    return str(error) or type(error).__name__
+    notes = "".join(f" ({note})" for note in getattr(error, "__notes__", []))
+    return (error_message(error) or type(error).__name__) + notes

@@ -14,6 +14,7 @@ from clsas.cli.parameters import AXIS, INPUT, PERCENTILES, RATIO, STAGES, Output
 from clsas.engine.data import validate
 from clsas.engine.data.beam import SHAPES
 from clsas.engine.data.coverage import UnreachedWarning
+from clsas.engine.data.validate import ArgumentError, described
 from clsas.engine.exact.decide import BEST_ACCURACY_DB
 from clsas.engine.factorized.planner import (
     BEST_TOLERANCE_DB,
@@ -34,12 +35,17 @@ def checked(check: Callable[[Any], object]) -> Callable:
                 if each is not None:
                     check(each)
         except (TypeError, ValueError) as error:
-            # click names the option, so the message does without the argument's name.
-            message = str(error).removeprefix(f"{param.name} ")
-            raise click.BadParameter(message, ctx, param) from error
+            raise click.BadParameter(unnamed(error), ctx, param) from error
         return value
 
     return callback
+
+
+def unnamed(error: Exception) -> str:
+    """Return the message of an exception without the argument's name, since click names it."""
+    if isinstance(error, ArgumentError):
+        return error.sentence("", described(error.given)).lstrip()
+    return str(error)
 
 
 def output(kind: str) -> Callable:

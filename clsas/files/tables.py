@@ -8,6 +8,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from clsas.engine.data.validate import ArgumentError
+
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
@@ -26,5 +28,7 @@ def located(where: str) -> Iterator[None]:
     """Put the table of the file, such as "[sonar]", in front of the library's messages."""
     try:
         yield
+    except ArgumentError as error:
+        raise error.within(where) from None
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where} {error}") from None

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,7 @@ from scipy.ndimage import correlate1d
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.system import element_pattern
+from clsas.engine.data.validate import ArgumentError, Choice, Count, Flag, Number
 
 SHAPES = ("rectangular", "hann", "hamming", "taylor", "tukey", "inverse")
 
@@ -109,49 +110,39 @@ class BeamWindow:
     '5.08 degrees'
     """
 
-    width_deg: float
-    shape: str = "rectangular"
-    squint_deg: float = 0.0
-    taper: float = 0.5
-    element_length_m: float | None = None
+    width_deg: Annotated[float, Number("degrees", least=_NARROWEST, most=180.0, help="Full width.")]
+    shape: Annotated[str, Choice(SHAPES, help="Shape. Images with 'hann' are the fastest.")] = (
+        "rectangular"
+    )
+    squint_deg: Annotated[float, Number("degrees", help="Squint, positive forward.")] = 0.0
+    taper: Annotated[float, Number(least=0.0, most=1.0, help="Share of a Tukey taper.")] = 0.5
+    element_length_m: Annotated[
+        float | None, Number("m", above=0.0, help="Length of the elements, for shape 'inverse'.")
+    ] = None
     along: NDArray[np.float64] | None = None
-    normalise: bool = False
-    track_pings: int | None = None
+    normalise: Annotated[bool, Flag(help="Divide by the sum of the weights.")] = False
+    track_pings: Annotated[
+        int | None, Count(5, help="Pings over which the track's direction is smoothed.")
+    ] = None
 
     __repr__ = reprs.of_fields
 
     def __post_init__(self) -> None:  # noqa: D105
-        width = validate.number(
-            "width_deg", self.width_deg, "degrees", least=_NARROWEST, most=180.0
-        )
-        room = 90 - width / 2
-        fields = {
-            "width_deg": width,
-            "shape": validate.one_of("shape", self.shape, SHAPES),
-            "squint_deg": validate.number(
-                "squint_deg", self.squint_deg, "degrees", least=-room, most=room
-            ),
-            "taper": validate.number("taper", self.taper, least=0.0, most=1.0),
-        }
-        if self.element_length_m is not None:
-            length = validate.positive("element_length_m", self.element_length_m, "m")
-            fields["element_length_m"] = length
-        elif self.shape == "inverse":
-            raise ValueError("element_length_m must be given for shape 'inverse'")
+        validate.check_fields(self)
+        room = 90 - self.width_deg / 2
+        validate.number("squint_deg", self.squint_deg, "degrees", least=-room, most=room)
+        if self.shape == "inverse" and self.element_length_m is None:
+            raise ArgumentError("element_length_m", "be given for shape 'inverse'")
         if self.along is not None:
             along = validate.array("along", self.along, np.float64, None)
             shape = (3,) if along.ndim == 1 else (None, 3)
             along = validate.array("along", along, np.float64, shape)
             largest = np.abs(along).max(axis=-1, keepdims=True)
             if not largest.all():
-                raise ValueError("along must not have a direction of length zero")
+                raise ArgumentError("along", "not have a direction of length zero")
             along = along / largest  # avoids overflow and underflow in the norm
-            fields["along"] = along / np.linalg.norm(along, axis=-1, keepdims=True)
-        if self.track_pings is not None:
-            fields["track_pings"] = validate.count("track_pings", self.track_pings, least=5)
-        fields["normalise"] = validate.flag("normalise", self.normalise)
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
+            along /= np.linalg.norm(along, axis=-1, keepdims=True)
+            object.__setattr__(self, "along", along)
 
     @classmethod
     def of_element(

@@ -6,7 +6,7 @@ Equations in brackets are those of the thesis (Ødegaard 2004).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.fourier import fourier_integral
 from clsas.engine.data.lines import bank_members, banks_of, checked_bank_numbers
+from clsas.engine.data.validate import ArgumentError, Number
 
 BARKER_13 = (1, 1, 1, 1, 1, -1, -1, 1, 1, -1, 1, -1, 1)
 
@@ -64,37 +65,29 @@ class Pulse:
     13000.0
     """
 
-    carrier_hz: float
-    bandwidth_hz: float
-    duration_s: float
+    carrier_hz: Annotated[float, Number("Hz", above=0.0, help="Centre frequency.")]
+    bandwidth_hz: Annotated[float, Number("Hz", above=0.0, help="Bandwidth, or chips/duration.")]
+    duration_s: Annotated[float, Number("s", above=0.0, help="Length of the pulse.")]
     code: str | tuple[int, ...] = "up"
-    taper: float = 0.0
+    taper: Annotated[float, Number(least=0.0, most=1.0, help="Share with a cosine taper.")] = 0.0
 
     __repr__ = reprs.of_fields
 
     def __post_init__(self) -> None:  # noqa: D105
-        carrier = validate.positive("carrier_hz", self.carrier_hz, "Hz")
-        duration = validate.positive("duration_s", self.duration_s, "s")
-        band = validate.number("bandwidth_hz", self.bandwidth_hz, "Hz", above=0.0, most=2 * carrier)
-        code: str | tuple[int, ...]
+        validate.check_fields(self)
+        band, duration = self.bandwidth_hz, self.duration_s
+        validate.number("bandwidth_hz", band, "Hz", most=2 * self.carrier_hz)
         if isinstance(self.code, str):
-            code = validate.one_of("code", self.code, ("up", "down"))
+            validate.one_of("code", self.code, ("up", "down"))
         else:
-            code = _chips("code", self.code)
-            if not np.isclose(band * duration, len(code)):
-                raise ValueError(
-                    f"bandwidth_hz of a phase code must be chips/duration = "
-                    f"{len(code) / duration:g} Hz, got {band:g} Hz"
+            chips = _chips("code", self.code)
+            object.__setattr__(self, "code", chips)
+            if not np.isclose(band * duration, len(chips)):
+                raise ArgumentError(
+                    "bandwidth_hz",
+                    f"be chips/duration = {len(chips) / duration:g} Hz for a phase code",
+                    f"{band:g} Hz",
                 )
-        fields = {
-            "carrier_hz": carrier,
-            "bandwidth_hz": band,
-            "duration_s": duration,
-            "code": code,
-            "taper": validate.number("taper", self.taper, least=0.0, most=1.0),
-        }
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
         if duration >= _LONG_S and band * duration > _MOST_PRODUCT:
             validate.warn(
                 f"duration_s is {duration:g} s, {band * duration:.3g} cycles of its band; pulses "

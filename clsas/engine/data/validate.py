@@ -1,6 +1,8 @@
 """Checks of user input at the point where it enters the library.
 
-A check that fails raises one exception, which names the argument, its value and what is allowed.
+A check that fails raises one `ArgumentError`, whose parts are the argument, what is allowed, what
+was given and what to do. Names of other arguments and code in messages stand in backticks, so that
+the command line can put its own words in their place.
 """
 
 from __future__ import annotations
@@ -13,10 +15,12 @@ import re
 import reprlib
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from functools import cache
 from numbers import Real
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -47,6 +51,55 @@ _MOST_CYCLES = 1e10  # of phase, which float64 still resolves to 1e-6 of a cycle
 _SMALL_BYTES = 1 << 20
 
 _T = TypeVar("_T")
+
+
+class ArgumentError(ValueError):
+    """An argument is not what it must be.
+
+    Parameters
+    ----------
+    argument : str
+        Name of the argument.
+    allowed : str
+        What it must do or be, such as "be finite and > 0 Hz" or "have shape (3,)".
+    given : str or object
+        What was given: words such as "3 of 4 channels", or a value, of which the message has a
+        short text.
+    hint : str
+        What to do about it.
+    where : str
+        What contains the argument: a file, a table of it, or both.
+    """
+
+    def __init__(
+        self, argument: str, allowed: str, given: object = "", hint: str = "", where: str = ""
+    ) -> None:
+        super().__init__(argument, allowed, given, hint, where)
+        self.argument = argument
+        self.allowed = allowed
+        self.given = given
+        self.hint = hint
+        self.where = where
+
+    def __str__(self) -> str:
+        """Return the message."""
+        return self.sentence(self.argument, described(self.given))
+
+    def sentence(self, argument: str, given: str) -> str:
+        """Return the message in other words for the argument and what was given."""
+        where = f"{self.where} " if self.where else ""
+        got = f", got {given}" if given else ""
+        hint = f": {self.hint}" if self.hint else ""
+        return f"{where}{argument} must {self.allowed}{got}{hint}"
+
+    def within(self, where: str) -> ArgumentError:
+        """Return the same error within a file, a table or a part of one."""
+        inside = f"{where} {self.where}" if self.where else where
+        return type(self)(self.argument, self.allowed, self.given, self.hint, inside)
+
+
+class ArgumentTypeError(ArgumentError, TypeError):
+    """An argument is of another type than it must be; a TypeError, too."""
 
 
 class ClsasWarning(UserWarning):
@@ -88,7 +141,7 @@ def number(
     is_real = isinstance(scalar, Real) and not isinstance(scalar, (bool, np.timedelta64))
     if not is_real or np.ma.is_masked(value):
         kind = f"number in {unit}" if unit else "number"
-        raise TypeError(f"{name} must be one real {kind}, got {shown(value)}")
+        raise ArgumentTypeError(name, f"be one real {kind}", shown(value))
     try:
         result = float(scalar)
     except OverflowError:  # an int or a fraction beyond float64
@@ -111,8 +164,105 @@ def number(
     )
     if not inside:
         allowed = " and ".join(["finite", *limits]) + (f" {unit}" if unit else "")
-        raise ValueError(f"{name} must be {allowed}, got {result:g}")
+        raise ArgumentError(name, f"be {allowed}", f"{result:g}")
     return result
+
+
+@dataclass(frozen=True)
+class Number:
+    """What a number may be, with its unit and help: declared once, in the type of what takes it.
+
+    A field of a dataclass, or a parameter of a function, declares
+    `Annotated[float, Number("Hz", above=0.0, help="Carrier frequency.")]`. Its checks, and options
+    and tables of scene files that set it, are made from that.
+    """
+
+    unit: str = ""
+    _: KW_ONLY
+    above: float | None = None
+    below: float | None = None
+    least: float | None = None
+    most: float | None = None
+    help: str = ""
+
+    def check(self, name: str, value: float) -> float:
+        """Return a value as `number` does."""
+        limits = {each: getattr(self, each) for each in ("above", "below", "least", "most")}
+        return number(name, value, self.unit, **limits)
+
+
+@dataclass(frozen=True)
+class Count:
+    """What a whole number may be, as `Number` says of others."""
+
+    least: int = 1
+    _: KW_ONLY
+    most: int | None = None
+    help: str = ""
+
+    def check(self, name: str, value: int) -> int:
+        """Return a value as `count` does."""
+        return count(name, value, least=self.least, most=self.most)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a word may be, as `Number` says of numbers."""
+
+    allowed: tuple[Any, ...]
+    _: KW_ONLY
+    help: str = ""
+
+    def check(self, name: str, value: Any) -> Any:
+        """Return a value as `one_of` does."""
+        return one_of(name, value, self.allowed)
+
+
+@dataclass(frozen=True)
+class Flag:
+    """What is true or false, as `Number` says of numbers."""
+
+    help: str = ""
+
+    def check(self, name: str, value: object) -> bool:
+        """Return a value as `flag` does."""
+        return flag(name, value)
+
+
+Declared = Number | Count | Choice | Flag
+
+
+@cache
+def declared(source: Callable[..., Any]) -> dict[str, Declared]:
+    """Return what a dataclass or a function declares of its fields or parameters, by name."""
+    return {
+        name: each
+        for name, kind in get_type_hints(source, include_extras=True).items()
+        for each in getattr(kind, "__metadata__", ())
+        if isinstance(each, Declared)
+    }
+
+
+@cache
+def _optional(source: Callable[..., Any]) -> frozenset[str]:
+    kinds = get_type_hints(source)
+    return frozenset(name for name, kind in kinds.items() if type(None) in get_args(kind))
+
+
+def check_declared(source: Callable[..., Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the given values of the arguments that a class or function declares, checked."""
+    return {
+        name: None if given[name] is None and name in _optional(source)
+        else what.check(name, given[name])
+        for name, what in declared(source).items()
+        if name in given
+    }  # fmt: skip
+
+
+def check_fields(instance: object) -> None:
+    """Check the fields that a frozen dataclass declares, and replace them by what was checked."""
+    for name, value in check_declared(type(instance), vars(instance)).items():
+        object.__setattr__(instance, name, value)
 
 
 def positive(name: str, value: float, unit: str = "") -> float:
@@ -135,19 +285,19 @@ def count(name: str, value: int, *, least: int = 1, most: int | None = None) -> 
             raise TypeError
         result = operator.index(value)  # accepts ints of Python and NumPy, and 0-d arrays of them
     except TypeError:
-        raise TypeError(f"{name} must be a whole number, got {shown(value)}") from None
+        raise ArgumentTypeError(name, "be a whole number", shown(value)) from None
     if result < least:
-        raise ValueError(f"{name} must be at least {least}, got {shown(value)}")
+        raise ArgumentError(name, f"be at least {least}", shown(value))
     most = _MOST_COUNT if most is None else most
     if result > most:
-        raise ValueError(f"{name} must be at most {most}, got {shown(value)}")
+        raise ArgumentError(name, f"be at most {most}", shown(value))
     return result
 
 
 def flag(name: str, value: object) -> bool:
     """Return `value` as a bool; raises TypeError unless it is a bool of Python or NumPy."""
     if not isinstance(value, (bool, np.bool_)):
-        raise TypeError(f"{name} must be of type bool, got {type(value).__name__}")
+        raise ArgumentTypeError(name, "be of type bool", type(value).__name__)
     return bool(value)
 
 
@@ -163,7 +313,7 @@ def one_of(name: str, value: object, allowed: Sequence[_T]) -> _T:
         if alike and value == each:
             return each
     names = ", ".join(map(repr, allowed))
-    raise ValueError(f"{name} must be one of {names}, got {shown(value)}")
+    raise ArgumentError(name, f"be one of {names}", shown(value))
 
 
 def named(name: str, values: object, allowed: Sequence[str]) -> tuple[str, ...]:
@@ -171,7 +321,7 @@ def named(name: str, values: object, allowed: Sequence[str]) -> tuple[str, ...]:
     if isinstance(values, str):
         values = (values,)
     if not isinstance(values, Sequence):
-        raise TypeError(f"{name} must be one or several of {tuple(allowed)}, got {shown(values)}")
+        raise ArgumentTypeError(name, f"be one or several of {tuple(allowed)}", shown(values))
     return tuple(one_of(f"every entry of {name}", each, allowed) for each in values)
 
 
@@ -179,7 +329,7 @@ def entries(name: str, value: object, meaning: str) -> list[Any]:
     """Return the entries of a sequence or array; raises TypeError for other types and for text."""
     several = isinstance(value, (Sequence, np.ndarray)) and not isinstance(value, (str, bytes))
     if not several or (isinstance(value, np.ndarray) and value.ndim == 0):
-        raise TypeError(f"{name} must be {meaning}, got {shown(value)}")
+        raise ArgumentTypeError(name, f"be {meaning}", shown(value))
     assert isinstance(value, (Sequence, np.ndarray))
     return list(value)
 
@@ -188,28 +338,28 @@ def instance(name: str, value: object, *kinds: type) -> None:
     """Raise TypeError unless `value` is an instance of one of the classes `kinds`."""
     if not isinstance(value, kinds):
         names = " or ".join(kind.__name__ for kind in kinds)
-        raise TypeError(f"{name} must be of type {names}, got {type(value).__name__}")
+        raise ArgumentTypeError(name, f"be of type {names}", type(value).__name__)
 
 
 def path(name: str, value: object) -> Path:
     """Return `value` as a Path; raises TypeError for other types, ValueError if it is empty."""
     if not isinstance(value, (str, os.PathLike)):
-        raise TypeError(f"{name} must be a path, got {shown(value)}")
+        raise ArgumentTypeError(name, "be a path", shown(value))
     if not os.fspath(value):
-        raise ValueError(f"{name} must be a path, got an empty one")
+        raise ArgumentError(name, "be a path", "an empty one")
     if not isinstance(os.fspath(value), str) or "\0" in os.fspath(value):
-        raise ValueError(f"{name} must be a path of text without NUL, got {shown(value)}")
+        raise ArgumentError(name, "be a path of text without NUL", shown(value))
     return Path(os.fspath(value))
 
 
 def text(name: str, value: object) -> str:
     """Return `value`; raises TypeError unless it is text, ValueError if UTF-8 cannot encode it."""
     if not isinstance(value, str):
-        raise TypeError(f"{name} must be text, got {shown(value)}")
+        raise ArgumentTypeError(name, "be text", shown(value))
     try:
         value.encode()
     except UnicodeEncodeError:
-        raise ValueError(f"{name} must be text of Unicode characters, got {value!a}") from None
+        raise ArgumentError(name, "be text of Unicode characters", ascii(value)) from None
     return str(value)
 
 
@@ -217,7 +367,7 @@ def sides(name: str, value: object) -> tuple[int, int]:
     """Return the rows and columns of a block of pixels, at least 1 each."""
     given = entries(name, value, "(rows, columns)")
     if len(given) != 2:
-        raise ValueError(f"{name} must be (rows, columns), got {shown(value)}")
+        raise ArgumentError(name, "be (rows, columns)", shown(value))
     rows, columns = (count(f"every side of {name}", side) for side in given)
     return rows, columns
 
@@ -234,10 +384,10 @@ def selection(name: str, value: object, *, ascending: bool = False) -> slice:
     try:
         value.indices(0)
     except (TypeError, ValueError) as error:
-        kind = TypeError if isinstance(error, TypeError) else ValueError
-        raise kind(f"{name} must be a slice of whole numbers, got {shown(value)}") from None
+        kind = ArgumentTypeError if isinstance(error, TypeError) else ArgumentError
+        raise kind(name, "be a slice of whole numbers", shown(value)) from None
     if ascending and value.step is not None and value.step < 1:
-        raise ValueError(f"{name} must be a slice with a step from 1, got {shown(value)}")
+        raise ArgumentError(name, "be a slice with a step from 1", shown(value))
     return value
 
 
@@ -254,14 +404,14 @@ def indices(name: str, value: ArrayLike, count: int, *, least: int = 0) -> NDArr
     try:
         given = np.asarray(value)
     except ValueError as error:
-        raise ValueError(f"{name} must be a regular array: {error}") from None
+        raise ArgumentError(name, "be a regular array", hint=str(error)) from None
     if given.dtype.kind not in "iu":
-        raise TypeError(f"{name} must be whole numbers, got {shown(value)}")
+        raise ArgumentTypeError(name, "be whole numbers", shown(value))
     if np.ma.is_masked(value):
-        raise ValueError(f"{name} must have no masked value, got {shown(value)}")
+        raise ArgumentError(name, "have no masked value", shown(value))
     if given.size and not (least <= given.min() and given.max() < count):
-        raise ValueError(
-            f"{name} must be from {least} to {count - 1}, got {given.min()} to {given.max()}"
+        raise ArgumentError(
+            name, f"be from {least} to {count - 1}", f"{given.min()} to {given.max()}"
         )
     return given.astype(np.int64, copy=False)
 
@@ -272,18 +422,27 @@ def suffix(name: str, value: Path, *allowed: str) -> None:
     A name without a suffix, such as `image`, is allowed.
     """
     if value.suffix and value.suffix.lower() not in allowed:
-        raise ValueError(f"{name} must end in {' or '.join(allowed)}, got {shown(str(value))}")
+        raise ArgumentError(name, f"end in {' or '.join(allowed)}", shown(str(value)))
 
 
 def function(name: str, given: object) -> None:
     """Raise TypeError unless `given` is callable or None."""
     if not (given is None or callable(given)):
-        raise TypeError(f"{name} must be a function or None, got {shown(given)}")
+        raise ArgumentTypeError(name, "be a function or None", shown(given))
 
 
 def progress(given: object) -> None:
     """Raise TypeError unless `given`, a progress argument, is callable or None."""
     function("progress", given)
+
+
+def described(given: object) -> str:
+    """Return what was given as an error's message has it: words as they are, values shortened."""
+    if isinstance(given, str):
+        return given
+    if isinstance(given, tuple) and given and all(isinstance(each, float) for each in given):
+        return f"({', '.join(f'{each:g}' for each in given)})"
+    return shown(given)
 
 
 def shown(value: object) -> str:
@@ -342,10 +501,8 @@ class Budget:
                 asked = f"{wanted / 2**30:.3g} GiB"
             except OverflowError:  # an int beyond float64
                 asked = "more than 1e300 GiB"
-            raise ValueError(
-                f"{name} must ask for at most {self._left_bytes / 2**30:.3g} GiB, what is left of "
-                f"this machine's memory, got {asked}"
-            )
+            most = f"{self._left_bytes / 2**30:.3g} GiB, what is left of this machine's memory"
+            raise ArgumentError(name, f"ask for at most {most}", asked)
         self._left_bytes -= size_bytes
 
     def give_back(self, size_bytes: float) -> None:
@@ -403,10 +560,11 @@ def phase(carrier_hz: float, sound_speed_m_s: float, farthest_m: float) -> None:
     with np.errstate(over="ignore", invalid="ignore"):
         cycles = np.float64(2) * carrier_hz / sound_speed_m_s * farthest_m
     if not cycles <= _MOST_CYCLES:  # also refuses NaN
-        raise ValueError(
-            f"carrier_hz = {carrier_hz:g} Hz makes {cycles:.3g} cycles over {farthest_m:g} m "
-            f"at sound_speed_m_s = {sound_speed_m_s:g} m/s; float64 resolves the phase of up to "
-            f"{_MOST_CYCLES:g}"
+        raise ArgumentError(
+            "carrier_hz",
+            f"make at most {_MOST_CYCLES:g} cycles, of which float64 resolves the phase, over "
+            f"{farthest_m:g} m at `sound_speed_m_s` = {sound_speed_m_s:g} m/s",
+            f"{carrier_hz:g} Hz, with {cycles:.3g} cycles",
         )
 
 
@@ -451,21 +609,19 @@ def array(
     try:
         given = np.asarray(value)
     except ValueError as error:
-        raise ValueError(f"{name} must be a regular array: {error}") from None
+        raise ArgumentError(name, "be a regular array", hint=str(error)) from None
     except TypeError as error:  # an object whose own conversion fails
-        raise TypeError(f"{name} must be an array of numbers: {error}") from None
+        raise ArgumentTypeError(name, "be an array of numbers", hint=str(error)) from None
     if given.dtype.kind not in ("c" if dtype.kind == "c" else "iuf"):
         wanted = "complex" if dtype.kind == "c" else "real"
         got = given.dtype if given.ndim else type(value).__name__
-        reason = ""
+        hint = ""
         if name == "samples" and given.dtype.kind in "iuf":
-            reason = (
-                ": real samples have no phase; form the analytic signal first (clsas.compress does)"
-            )
-        raise TypeError(f"{name} must be {wanted} numbers, got {got}{reason}")
+            hint = "real samples have no phase; form the analytic signal (`clsas.compress` does)"
+        raise ArgumentTypeError(name, f"be {wanted} numbers", str(got), hint)
     if np.ma.is_masked(value):
         masked = np.ma.count_masked(value)
-        raise ValueError(f"{name} must have no masked value, got {masked} of {given.size}")
+        raise ArgumentError(name, "have no masked value", f"{masked} of {given.size}")
     if shape is None:
         shape = given.shape
     elif broadcast and given.shape == shape[1:]:
@@ -476,7 +632,7 @@ def array(
     )
     if not fits:
         wanted = ", ".join("any" if axis is None else str(axis) for axis in shape)
-        raise ValueError(f"{name} must have shape ({wanted}) and no empty axis, got {given.shape}")
+        raise ArgumentError(name, f"have shape ({wanted}) and no empty axis", str(given.shape))
     if given.dtype.kind in "fc" and np.can_cast(dtype, given.dtype) and dtype != given.dtype:
         _check_narrowing(name, given, dtype)
     copied = given.dtype != dtype or not given.flags.c_contiguous
@@ -489,10 +645,8 @@ def array(
     if not finite and not np.isfinite(result).all():
         wrong = ~np.isfinite(result)
         first = [int(index) for index in np.unravel_index(int(wrong.argmax()), wrong.shape)]
-        raise ValueError(
-            f"{name} must be finite, got {int(wrong.sum())} NaN or infinite of {result.size} values"
-            + (f", the first at {first}" if first else "")
-        )
+        count = f"{int(wrong.sum())} NaN or infinite of {result.size} values"
+        raise ArgumentError(name, "be finite", count + (f", the first at {first}" if first else ""))
     result = result.view()
     result.flags.writeable = False
     return result
@@ -512,7 +666,7 @@ def real_or_complex(
     except (TypeError, ValueError):  # `array` refuses the value below
         given = np.dtype(dtype)
     if given.kind not in "iufc":
-        raise TypeError(f"{name} must be real or complex numbers, got {given}")
+        raise ArgumentTypeError(name, "be real or complex numbers", str(given))
     kind = np.dtype(dtype) if given.kind == "c" else np.zeros((), dtype).real.dtype
     return array(name, value, kind, shape, broadcast=broadcast)
 
@@ -528,7 +682,5 @@ def _check_narrowing(name: str, given: NDArray, dtype: np.dtype) -> None:
     ends = [f.reduce(part, axis=None) for part in parts for f in (np.fmin, np.fmax)]
     largest = float(np.max(np.abs(ends)))
     if 0 < largest < least or most < largest < math.inf:
-        raise ValueError(
-            f"{name} must have a largest value from {least:.2g} to {most:.2g}, the range of "
-            f"{kind.dtype}, got {largest:.3g}: scale the values"
-        )
+        allowed = f"have a largest value from {least:.2g} to {most:.2g}, the range of {kind.dtype}"
+        raise ArgumentError(name, allowed, f"{largest:.3g}", "scale the values")
