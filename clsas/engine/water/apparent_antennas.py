@@ -22,6 +22,9 @@ _NODES = 48  # distances from which the change of a range axis follows
 _DEGREE = 20  # of the polynomial through them
 _CHANGED_AT_ONCE = 1 << 16  # samples that are interpolated together; they fit into a cache
 _BEYOND = 0.1  # of the distances of sample pixels, by which those of others may extend farther
+# Samples of the widest filters of the imagers, from which an image reads. Where a line of few
+# samples changes from a curved to a linear offset within them, it is not band-limited there.
+_READ = 32
 _RESAMPLED_DB = -80.0  # largest error of the interpolation of samples
 _MARGIN_DB = 13.0  # by which interpolation is better than the image: its share is a twentieth
 
@@ -211,6 +214,11 @@ def _limits_m(sample: RaySample, level_m: float) -> tuple[float, float]:
     distance = distance[sample.visible]
     near, far = min(on_level.min(), distance.min()), max(on_level.max(), distance.max())
     near, far = near - min(_BEYOND * (far - near), near / 2), far + _BEYOND * (far - near)
+    depth_m = float(np.abs(antenna_z - level_m).max())
+    read_m = _READ * sample.lines.range_step_m
+    nearer = np.hypot(near, depth_m) - read_m
+    near = max(near / 2, math.sqrt(max(nearer, depth_m) ** 2 - depth_m**2))
+    far = math.sqrt((np.hypot(far, depth_m) + read_m) ** 2 - depth_m**2)
     profile = sample.lines.sound_speed
     assert profile is not None
     for z in (antenna_z.min(), antenna_z.max()):
