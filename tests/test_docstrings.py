@@ -7,7 +7,7 @@ import pytest
 
 import clsas
 
-MODULES = sorted(clsas._MODULES)
+MODULES = sorted({module for module in clsas._MODULE_OF.values() if module})
 
 
 @pytest.mark.slow
