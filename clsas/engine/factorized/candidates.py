@@ -347,7 +347,7 @@ class _Candidates:
         if excess[-1] and beam_cycles > 0:
             aperture = found.factorization.aperture.filter
             stages = spaced_stages(found.sides, aperture, trial.oversampling, None)
-            without_beam = self._spacing[found.sides[0]].uneven_error(stages)
+            without_beam = self._spacing[found.sides[0]].of_stage(stages).uneven
             if 2 * without_beam < spacing[-1]:  # the beam causes most of it
                 if beam_cycles >= _MOST_BEAM_CYCLES:
                     return None  # virtual channels cannot follow a step

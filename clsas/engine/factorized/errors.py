@@ -8,9 +8,8 @@ tolerance leaves room for. The planner adds what the lines themselves cause.
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,6 +43,7 @@ from clsas.engine.factorized.sampled import (
     Side,
     mean_over_relief,
     pixels_m,
+    reliefs_of,
     sampled_channels,
 )
 from clsas.engine.factorized.track import MeanTrack
@@ -151,17 +151,23 @@ def errors_of_tree(
     They are those of the filter along the aperture, of uneven spacing of virtual channels, and of
     the expansion of ranges in leaves.
     """
-    roots = spacing.roots
     stages = spaced_stages(sides, filters.aperture, oversampling, beam_cycles)
-    each_stage = [stages[: level + 1] for level in range(len(stages))]
-    of_filters = sum(spacing.filter_error(to) for to in each_stage) + spacing.bias_error(stages)
-    by_stage = tuple(spacing.uneven_error(to) for to in each_stage)
+    of_filters, by_stage, biases = 0.0, [], []
+    for level in range(len(stages)):
+        found = spacing.of_stage(stages[: level + 1])
+        of_filters += found.of_filter
+        by_stage.append(found.uneven)
+        biases += found.biases
+    # Filters of few taps attenuate steering functions. The mean attenuation is common to all
+    # interpolations on a sheet, along and across and in every stage, so that its amplitudes add.
+    bias = np.array(biases)
+    of_filters += float(max(bias.sum() ** 2 - bias @ bias, 0.0))
     errors = ErrorBudget(
         aperture_filters=of_filters,
         spacing=sum(by_stage),
-        leaves=float(leaf_error(roots, np.array([sides[-1]]), device)[0]),
+        leaves=float(leaf_error(spacing.roots, np.array([sides[-1]]), device)[0]),
     )
-    return errors, by_stage
+    return errors, tuple(by_stage)
 
 
 def leaf_error(
@@ -199,16 +205,16 @@ def root_error(roots: SampledRoots, side: Side) -> float:
     `roots` are the sample points alone, without a size.
     """
     surface = roots.sampled.scene.surface
-    replaced = mean_over_relief(
-        surface, side, None, functools.partial(_mean_track_error, roots, side)
-    )
+    reliefs, share = reliefs_of(surface, side, None)
+    errors = np.array([_mean_track_error(roots, side, each) for each in reliefs])
+    replaced = mean_over_relief(errors, share)
     sides_m = roots.extents(side, most=True) * np.linalg.norm(surface.steps_m, axis=1)
     radius_m = np.linalg.norm(sides_m) / 2
     rounding = (2 * np.pi * _FLOAT32 * roots.sampled.highest_cycles_per_m * radius_m) ** 2
     return float(replaced + rounding)
 
 
-def _mean_track_error(roots: SampledRoots, side: Side, extents: NDArray[np.float64]) -> float:
+def _mean_track_error(roots: SampledRoots, side: Side, extents: tuple[float, ...]) -> float:
     """Return the error power of channels that are replaced by positions on the mean track.
 
     This covers track errors, separate transmitters and receivers, and motion during flight. With a
@@ -219,7 +225,9 @@ def _mean_track_error(roots: SampledRoots, side: Side, extents: NDArray[np.float
         return 0.0
     # [points, pixels, channels]; the first pixel is the centre of a root.
     surface, beam = sampled.scene.surface, sampled.scene.beam
-    offsets_m = np.stack([pixels_m(surface, extents, point)[0] for point in channels.points])
+    offsets_m = np.stack(
+        [pixels_m(surface, np.array(extents), point)[0] for point in channels.points]
+    )
     points_m = sampled.points_m[channels.points, None] + offsets_m
     virtual_m = channels.virtual_m(points_m[:, 0])
     error = phase_error(roots, channels, points_m, virtual_m)
@@ -396,6 +404,27 @@ class _Samples:
     exact: NDArray[np.float32]
 
 
+@dataclass(frozen=True)
+class StageErrors:
+    """Errors of a stage's virtual channels.
+
+    Attributes
+    ----------
+    uneven : float
+        Error power that uneven spacing adds to that of the filter.
+    of_filter : float
+        Error power of the filter along the aperture. On a sheet, virtual channels are everywhere as
+        dense as the largest phase rate of any line along it and across it requires. Where phases
+        turn more slowly, the error is below the filter's worst.
+    biases : list of float
+        On a sheet, the biases of the filter along and across it.
+    """
+
+    uneven: float
+    of_filter: float
+    biases: list[float]
+
+
 class SpacingErrors:
     """Error of virtual channels whose spacing changes, and of weights that change between them.
 
@@ -424,58 +453,27 @@ class SpacingErrors:
         self._samples: dict[tuple[_Line, Side, bool, tuple[float, ...]], _Samples | None] = {}
         self._found: dict[tuple[_Line, Stages, tuple[float, ...]], tuple[float, float]] = {}
 
-    def uneven_error(self, stages: Stages) -> float:
-        """Return the error power that uneven spacing adds to that of the filter, in the last stage.
+    def of_stage(self, stages: Stages) -> StageErrors:
+        """Return the errors of the last of some stages, over the relief of the grid.
 
         On a sheet, errors along and across it add up.
         """
-        of_filter = power(stages[-1].aperture.error_db)
-        return self._sum(stages, lambda error: max(error - of_filter, 0.0))
-
-    def filter_error(self, stages: Stages) -> float:
-        """Return the error power of the filter along the aperture, in the last stage.
-
-        On a sheet, virtual channels are everywhere as dense as the largest phase rate of any line
-        along it and across it requires. Where phases turn more slowly, the error is below the
-        filter's worst.
-        """
+        surface, side = self.roots.sampled.scene.surface, stages[-1].side
         worst = power(stages[-1].aperture.error_db)
-        return self._sum(stages, lambda error: min(error, worst)) if self._is_sheet else worst
-
-    def bias_error(self, stages: Stages) -> float:
-        """Return the extra error power because filter biases on a sheet add coherently.
-
-        Filters of few taps attenuate steering functions. The mean attenuation is common to all
-        interpolations, along and across and in every stage, so that its amplitudes add, not its
-        powers.
-        """
-        if not self._is_sheet:
-            return 0.0
-        biases = []
-        for level in range(len(stages)):
-            to = stages[: level + 1]
-            extents = tuple(self.roots.sampled.scene.surface.extents(to[-1].side))
-            for lines in self._lines.values():
-                found = [self._interpolation_error(line, to, extents)[1] for line in lines]
-                biases.append(float(np.mean(found)))
-        total = np.array(biases)
-        return float(max(total.sum() ** 2 - total @ total, 0.0))
-
-    def _sum(self, stages: Stages, part: Callable[[float], float]) -> float:
-        """Return the sum over the aperture's dimensions of a part of the error, over the grid."""
-        surface, side, total = self.roots.sampled.scene.surface, stages[-1].side, 0.0
+        reliefs, share = reliefs_of(surface, side, self.roots.side)
+        uneven, of_filter, biases = 0.0, 0.0 if self._is_sheet else worst, []
         for lines in self._lines.values():
-            means = []
-            for line in lines:
+            found = [[self._error(line, stages, each) for each in reliefs] for line in lines]
+            errors = [np.array([error for error, _ in of_line]) for of_line in found]
+            above = [mean_over_relief(np.maximum(each - worst, 0.0), share) for each in errors]
+            uneven += sum(above) / len(lines)
+            if self._is_sheet:
+                below = [mean_over_relief(np.minimum(each, worst), share) for each in errors]
+                of_filter += sum(below) / len(lines)
+                biases.append(float(np.mean([of_line[0][1] for of_line in found])))
+        return StageErrors(uneven, of_filter, biases)
 
-                def error(extents: NDArray[np.float64], line: _Line = line) -> float:
-                    return part(self._interpolation_error(line, stages, tuple(extents))[0])
-
-                means.append(mean_over_relief(surface, side, self.roots.side, error))
-            total += sum(means) / len(means)
-        return total
-
-    def _interpolation_error(
+    def _error(
         self, line: _Line, stages: Stages, extents: tuple[float, ...]
     ) -> tuple[float, float]:
         """Return the relative error power of steering functions in the last stage's subimages.
@@ -483,14 +481,8 @@ class SpacingErrors:
         The second result is the bias: the mean error in the direction of the exact functions, over
         their power. The error is 1, as large as the image, if no beam touches a subimage.
         """
-        key = line, stages, extents
-        if key not in self._found:
-            self._found[key] = self._interpolated(line, stages, extents)
-        return self._found[key]
-
-    def _interpolated(
-        self, line: _Line, stages: Stages, extents: tuple[float, ...]
-    ) -> tuple[float, float]:
+        if (line, stages, extents) in self._found:
+            return self._found[line, stages, extents]
         weighted = stages[-1].beam_cycles is not None and self.roots.sampled.scene.beam is not None
         key = line, stages[-1].side, weighted, extents
         if key not in self._samples:
@@ -520,7 +512,8 @@ class SpacingErrors:
             "nsp,nsp->n", samples.exact, samples.exact, dtype=np.float64
         )
         total = max(total, 1e-30)
-        return float(error / total), float(bias / total)
+        self._found[line, stages, extents] = float(error / total), float(bias / total)
+        return self._found[line, stages, extents]
 
     def _sources(
         self, line: _Line, samples: _Samples, before: Stages

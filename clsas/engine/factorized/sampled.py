@@ -7,7 +7,7 @@ visible from, how fast phases turn along it, and how far channels lie from it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -734,21 +734,25 @@ def pixels_m(
     return np.concatenate([np.zeros((1, 3)), offsets_m]), numbers[:, -1]
 
 
-def mean_over_relief(
-    surface: Surface,
-    side: Side,
-    root: Side | None,
-    error: Callable[[NDArray[np.float64]], float],
-) -> float:
-    """Return the mean over the grid of an error that depends on the extents of subimages.
+def reliefs_of(
+    surface: Surface, side: Side, root: Side | None
+) -> tuple[list[tuple[float, ...]], float]:
+    """Return the extents of subimages without relief and, if there is some, of the largest relief.
 
-    The error is evaluated without relief and at the largest relief. It grows at least with the
-    square of the relief, so that subimages of less relief are interpolated by the square.
+    The second result is the share of the largest relief for `mean_over_relief`.
     """
-    flat = error(surface.extents(side))
     relief_m = surface.relief_m(side, root)
     largest_m = float(relief_m.max())
     if largest_m <= 0:
-        return flat
+        return [tuple(surface.extents(side))], 0.0
     share = np.average((relief_m / largest_m) ** 2, weights=surface.counts(root or side))
-    return flat + max(error(surface.extents(side, largest_m)) - flat, 0.0) * float(share)
+    return [tuple(surface.extents(side)), tuple(surface.extents(side, largest_m))], float(share)
+
+
+def mean_over_relief(errors: NDArray[np.float64], share: float) -> float:
+    """Return the mean over the grid of errors in `reliefs_of`.
+
+    Errors grow at least with the square of the relief, so that subimages of less relief are
+    interpolated by the square.
+    """
+    return float(errors[0] + max(errors[-1] - errors[0], 0.0) * share)
