@@ -21,11 +21,12 @@ from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.engine.device.device import Device, open_device
-from clsas.engine.exact.decide import ACCURACY_DB, BEST_ACCURACY_DB
+from clsas.engine.exact.decide import ACCURACY, ACCURACY_DB
 from clsas.engine.factorized.costs import Costs
 from clsas.engine.factorized.plan import ExactImage, Plan
-from clsas.engine.factorized.planner import BEST_TOLERANCE_DB, WORST_TOLERANCE_DB, Request, planned
+from clsas.engine.factorized.planner import TOLERANCE, Request, planned
 from clsas.engine.forming import Progress, SceneImager, form, scene_of_plan
 from clsas.engine.scene import Scene
 from clsas.engine.signal.spectrum import (
@@ -285,23 +286,15 @@ def factorize(
     True
     """
     if isinstance(plan_or_tolerance, str):
-        got = validate.shown(plan_or_tolerance)
-        raise TypeError(
-            f"plan_or_tolerance must be a Plan (Plan.from_json reads texts) or dB, got {got}"
-        )
+        given, hint = validate.shown(plan_or_tolerance), "`Plan.from_json` reads texts"
+        raise ArgumentTypeError("plan_or_tolerance", "be a Plan or dB", given, hint)
     if isinstance(plan_or_tolerance, Plan):
         imager = Imager(lines, grid, plan_or_tolerance, beam=beam, device=device)
     else:
         validate.instance("lines", lines, RangeLines)
         validate.instance("grid", grid, Grid)
         validate.progress(progress)
-        tolerance_db = validate.number(
-            "plan_or_tolerance",
-            plan_or_tolerance,
-            "dB",
-            least=BEST_TOLERANCE_DB,
-            most=WORST_TOLERANCE_DB,
-        )
+        tolerance_db = TOLERANCE.check("plan_or_tolerance", plan_or_tolerance)
         imager = Imager(lines, grid, tolerance_db=tolerance_db, beam=beam, device=device)
     return imager(lines, accumulate=accumulate, progress=progress)
 
@@ -421,9 +414,7 @@ def backproject(
         validate.instance("beam", beam, BeamWindow)
     validate.memory("grid", 8 * grid.size)
     validate.progress(progress)
-    accuracy_db = validate.number(
-        "accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
-    )
+    accuracy_db = ACCURACY.check("accuracy_db", accuracy_db)
     is_fixed = taps is not None and upsampling is not None
     device = open_device(device)
     scene = Scene.of(lines, grid, beam, None if is_fixed else accuracy_db)
@@ -533,9 +524,10 @@ class Imager:
             validate.instance("beam", beam, BeamWindow)
         given = [plan, tolerance_db, accuracy_db]
         if sum(value is not None for value in given) != 1:
-            raise ValueError(
-                "exactly one of plan, tolerance_db and accuracy_db must be given, got "
-                + ", ".join(validate.shown(value) for value in given)
+            raise ArgumentError(
+                "plan",
+                "be given, or one of `tolerance_db` and `accuracy_db`, and only one",
+                ", ".join(map(validate.shown, given)),
             )
         validate.memory("grid", 8 * grid.size)
         self.device = open_device(device)
@@ -544,7 +536,7 @@ class Imager:
         if plan is not None:
             validate.instance("plan", plan, Plan)
             if beam is not None:
-                raise ValueError("beam must be left out with a plan, which contains its own")
+                raise ArgumentError("beam", "be left out with a plan, which contains its own")
             plan.check(lines, placed(lines, grid))
             method, beam = plan, plan.beam
             scene = scene_of_plan(lines, grid, plan)
@@ -556,9 +548,7 @@ class Imager:
             method, warned = plan, not scene.is_reached
         else:
             assert accuracy_db is not None
-            accuracy_db = validate.number(
-                "accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
-            )
+            accuracy_db = ACCURACY.check("accuracy_db", accuracy_db)
             scene = Scene.of(lines, grid, beam, accuracy_db)
             scene.warn("accuracy_db", accuracy_db)
             method = ExactImage(accuracy_db)
@@ -616,9 +606,11 @@ class Imager:
             check_accumulate(accumulate, self.grid, self.beam)
         if self._checked() is not lines:
             if lines_digest(lines) != self._lines_digest:
-                raise ValueError(
-                    "lines must have the antennas, ranges, carrier and number of samples of those "
-                    "that the imager was made for; make another Imager for these"
+                raise ArgumentError(
+                    "lines",
+                    "have the antennas, ranges, carrier and number of samples of those that the "
+                    "imager was made for",
+                    hint="make another `Imager` for these",
                 )
             self._check_band(lines)
             self._checked = weakref.ref(lines)
@@ -643,7 +635,7 @@ class Imager:
             validate.warn(
                 f"the lines have {outside_db:.0f} dB of their power outside the band that the "
                 f"images are made for, so the error may exceed {allowed_db:g} dB: make another "
-                "plan or clsas.Imager from these lines"
+                "plan or `clsas.Imager` from these lines"
             )
             self._warned_of_band = True
 
@@ -677,12 +669,10 @@ def check_accumulate(image: Image, grid: Grid, beam: BeamWindow | None) -> None:
     if image.grid is not grid and not (
         is_placed_alike and np.array_equal(image.grid.positions_m(), grid.positions_m())
     ):
-        raise ValueError("accumulate must be an image on the same grid")
+        raise ArgumentError("accumulate", "be an image on the same grid")
     if beam is not None and beam.normalise:
-        raise ValueError(
-            "accumulate must be None with a beam that normalises, because normalised images are "
-            "means and cannot be added"
-        )
+        hint = "normalised images are means and cannot be added"
+        raise ArgumentError("accumulate", "be None with a beam that normalises", hint=hint)
 
 
 def _added(image: Image, accumulate: Image | None) -> Image:

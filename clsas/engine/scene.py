@@ -16,6 +16,7 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, fastest, wavelength_m
 from clsas.engine.data.simplify import leave_out, simplify
 from clsas.engine.data.surface import Surface, surface_of
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.ambiguity import Ambiguity, ambiguity
 from clsas.engine.signal.doubts import warn_before_imaging
 from clsas.engine.signal.spectrum import Spectrum, line_energy, measure_spectrum
@@ -189,7 +190,7 @@ def check_numbers(lines: RangeLines, beam: BeamWindow | None) -> float:
     heaviest = 1.0
     if beam is not None:
         if beam.shape == "inverse" and not lines.carrier_hz:
-            raise ValueError("carrier_hz must be above 0 for a beam of shape 'inverse'")
+            raise ArgumentError("carrier_hz", "be above 0 for a beam with `shape='inverse'`")
         heaviest = max(float(beam.table(wavelength_m(lines)).max()), 1.0)
     validate.number(
         "range_step_m", lines.range_step_m, "m", least=_SMALLEST_STEP_M, most=validate.FARTHEST_M
@@ -201,11 +202,9 @@ def check_numbers(lines: RangeLines, beam: BeamWindow | None) -> float:
     largest = float(max(max(span.max(), -span.min()) for span in spans))
     most = _LARGEST_SUM / heaviest / lines.channels
     if largest > most:
-        raise ValueError(
-            f"samples must be at most {most:.3g} for the sum of {lines.channels} channels to stay "
-            f"within float32, got {largest:.3g}"
-        )
+        allowed = f"be at most {most:.3g} for {lines.channels} channels, to add up within float32"
+        raise ArgumentError("samples", allowed, f"{largest:.3g}")
     speed_m_s = fastest(lines) * lines.sound_speed_m_s
     most_m_s = _FASTEST * lines.sound_speed_m_s
-    validate.number("the speed of rx_velocity_m_s", speed_m_s, "m/s", most=most_m_s * (1 + 1e-9))
+    validate.number("the speed of `rx_velocity_m_s`", speed_m_s, "m/s", most=most_m_s * (1 + 1e-9))
     return largest

@@ -171,7 +171,7 @@ def test_warnings_are_translated_too(folder, monkeypatch):
     with warnings.catch_warnings():
         result = CliRunner().invoke(cli.main, arguments, prog_name="clsas")
     assert result.exit_code == 0, result.output
-    assert "--bank 0 uses the first bank\n" in result.stderr
+    assert "--bank 0 selects the first bank; " in result.stderr
     assert not PYTHON.search(result.stderr)
     monkeypatch.setattr(cli, "_worded", str)
     before = CliRunner().invoke(cli.main, arguments, prog_name="clsas")

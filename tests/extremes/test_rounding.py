@@ -220,7 +220,7 @@ def test_receivers_as_fast_as_allowed(platform, grid, direction):
     assert relative_error_db(execute(preparation), wanted) <= -80
     faster = dataclasses.replace(lines, rx_velocity_m_s=1.01 * velocity)
     with pytest.raises(
-        ValueError, match=r"the speed of rx_velocity_m_s must be .*<= 75 m/s, got 75\.75"
+        ValueError, match=r"the speed of `rx_velocity_m_s` must be .*<= 75 m/s, got 75\.75"
     ):
         backproject(faster, grid, device=platform)
 

@@ -133,7 +133,7 @@ def test_an_argument_that_is_not_allowed_is_named(name, argument, value, error, 
 # (function, arguments that do not go together, exception, message)
 TOGETHER = [
     ("backproject", {"accuracy_db": -80, "taps": 2}, ValueError,
-     r"accuracy_db=-80.* taps=2; the best is -\d"),
+     r"accuracy_db must be within reach of `taps=2`, got -80 dB: the best is -\d"),
     ("backproject", {"grid": "grid", "accumulate": ZEROS},
      TypeError, "grid must be"),
     ("mosaic", {"tolerance_db": -40, "accuracy_db": -70}, ValueError,

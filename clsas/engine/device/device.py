@@ -29,6 +29,7 @@ from numpy.typing import DTypeLike
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.cache import made_private, private_folder, user_caches
 from clsas.engine.data.extras import install_command
+from clsas.engine.data.validate import ArgumentTypeError
 from clsas.engine.device.kernels import Kernel, kernel_parameters, kernel_source, whole_source
 
 ENVIRONMENT_VARIABLE = "CLSAS_DEVICE"
@@ -183,12 +184,14 @@ def choose(request: str | int | None = None) -> tuple[DeviceInfo, str]:
     elif isinstance(request, str):
         matching = _named(request.strip().lower(), devices)
     else:
-        raise TypeError(f"device must be a name, an index or None, got {validate.shown(request)}")
+        given = validate.shown(request)
+        raise ArgumentTypeError("device", "be a name, an index or None", given)
     if not matching:
         have = "; ".join(f"{info.index}: {info.label}" for info in devices)
         why = _why_without_pocl(devices)
+        asked = f", which was requested{source}" if source else " (`device`)"
         raise DeviceError(
-            f"No device matches {validate.shown(request)}, which was requested{source}. "
+            f"No device matches {validate.shown(request)}{asked}. "
             f"Available: {have}{why and f'. {why}'}"
         )
     return _first(matching), f"requested{source} as {request!r}"

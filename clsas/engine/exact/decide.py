@@ -18,6 +18,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import cycles_per_m_at, fastest, some_channels, wavelength_m
+from clsas.engine.data.validate import ArgumentError, Number
 from clsas.engine.data.visibility import sines
 from clsas.engine.device import kernels
 from clsas.engine.device.device import Device
@@ -39,6 +40,10 @@ ACCURACY_DB = -60.0
 """Accuracy of exact images by default."""
 BEST_ACCURACY_DB = BEST_DB
 """Best accuracy that may be requested; float32 does not allow a better one."""
+ACCURACY = Number(
+    "dB", least=BEST_ACCURACY_DB, below=0.0, help="Relative rms error of the exact image."
+)
+"""Declares accuracies of exact images."""
 
 GEOMETRY_ERROR = 3.2e-5
 """Relative rms error that rounding and expanding the geometry may always add: -90 dB."""
@@ -308,7 +313,5 @@ def _check_distances(antennas_m: NDArray[np.float64], layout: Tiles | Groups) ->
     points_m = np.concatenate([antennas_m, layout.centres_m(slice(None))])
     extent_m = float(np.ptp(points_m, axis=0).max())
     if extent_m > validate.FARTHEST_M:
-        raise ValueError(
-            f"lines and grid must lie within {validate.FARTHEST_M:g} m of each other, "
-            f"got {extent_m:g} m"
-        )
+        allowed = f"lie within {validate.FARTHEST_M:g} m of the antennas"
+        raise ArgumentError("grid", allowed, f"{extent_m:g} m")

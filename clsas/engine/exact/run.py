@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from clsas.engine.data.beam import INTERVALS, BeamWindow, normalising
 from clsas.engine.data.geometry import bistatic_range_m, pairwise_range_m
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import BeamTrack
 from clsas.engine.device.buffers import (
     VECTOR_ROOM,
@@ -540,10 +541,11 @@ def blocks_of(
     most = device.info.max_buffer_bytes
     room = min(most, device.info.memory_bytes // 8)
     if line_bytes > most:
-        raise ValueError(
-            f"lines of {lines.length} samples are too long: upsampled they take "
-            f"{line_bytes / 2**10:.0f} KiB each, but a buffer of {device.info.label} has at most "
-            f"{most / 2**10:.0f} KiB"
+        raise ArgumentError(
+            "lines",
+            f"take at most {most / 2**10:.0f} KiB each when upsampled, which a buffer of "
+            f"{device.info.label} can hold",
+            f"{line_bytes / 2**10:.0f} KiB for {lines.length} samples",
         )
     return Blocks(
         reach,

@@ -27,6 +27,7 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Formed, Image
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at, wavelength_m
 from clsas.engine.data.threads import in_threads
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
 from clsas.engine.scene import check_numbers
 from clsas.engine.signal.doubts import warn_before_imaging
@@ -152,7 +153,7 @@ def wavenumber(
     workers = validate.count("workers", (os.cpu_count() or 1) if workers is None else workers)
     if not grid.is_planar:
         kind = "heights" if grid.points_m is None else "points"
-        raise ValueError(f"grid must be a plane with rows along the track, got {kind}")
+        raise ArgumentError("grid", "be a plane with rows along the track", kind)
     check_numbers(lines, beam)
     formed = Formed(
         method="wavenumber",
@@ -166,11 +167,11 @@ def wavenumber(
         lines_digest=samples_digest(lines),
     )
     if beam is not None and beam.normalise:
-        raise ValueError("beam must not normalise here; use clsas.backproject for that")
+        raise ArgumentError("beam", "not normalise here", hint="use `clsas.backproject` for that")
     if lines.sound_speed is not None:
         water = homogeneous(lines, grid, beam, None, corrected=False)
         if not water.grid.is_planar:
-            raise ValueError("grid must be level for lines with a profile of the sound speed")
+            raise ArgumentError("grid", "be level for lines with a profile of the sound speed")
         lines, beam = water.lines(lines), water.beam
     band = band_of(lines)
     track = straighten(lines, grid, beam, motion_compensation)
@@ -273,7 +274,7 @@ def straighten(
     # The line runs along the rows of the grid, which must run along the track and the beam.
     course = np.linalg.svd(offset_m, full_matrices=False)[2][0]
     if not np.ptp(offset_m @ course) > 0:
-        raise ValueError("lines must have phase centres at two positions or more, got one")
+        raise ArgumentError("lines", "have phase centres at two positions or more", "one")
     direction = column_step_m if columns > 1 else course
     direction = direction / np.linalg.norm(direction)
     courses = {"track": course}

@@ -11,6 +11,7 @@ from typing import Any, get_args
 import numpy as np
 
 from clsas.engine.data import validate
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.buffers import (
     Buffer,
     Buffers,
@@ -144,7 +145,7 @@ class KnownCosts:
         """Check the source and the time."""
         validate.one_of("source", self.source, get_args(CostSource))
         if self.measured and datetime.fromisoformat(self.measured).tzinfo is None:
-            raise ValueError(f"measured must have a time zone, got {self.measured}")
+            raise ArgumentError("measured", "have a time zone", self.measured)
 
 
 def defaults(device: Device | DeviceInfo) -> Costs:

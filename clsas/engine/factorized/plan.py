@@ -14,7 +14,16 @@ from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cache, partial
 from itertools import pairwise
 from types import UnionType
-from typing import Any, ClassVar, Literal, TypeAlias, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    TypeAlias,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +37,11 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.reading import parse_json
 from clsas.engine.data.reprs import Report, Table
 from clsas.engine.data.simplify import EFFECTS
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError, Choice, Number
 from clsas.engine.device.kernels import PHASE_TERMS
+from clsas.engine.exact.decide import ACCURACY
 from clsas.engine.factorized.track import Shape
 from clsas.engine.factorized.virtual_channels import InterpolatedAperture, NearestBeams
-from clsas.engine.signal.ambiguity import BEST_DB
 from clsas.engine.signal.interpolation import (
     MOST_UPSAMPLING,
     PHASES,
@@ -133,13 +143,13 @@ class Plan:
         effects = validate.entries("left_out", self.left_out, "names of effects")
         if len(effects) > len(EFFECTS) or not all(each in EFFECTS for each in effects):
             got = validate.shown(self.left_out)
-            raise ValueError(f"left_out must be some of {', '.join(EFFECTS)}, got {got}")
+            raise ArgumentError("left_out", f"be some of {', '.join(EFFECTS)}", got)
         object.__setattr__(self, "left_out", tuple(effects))
         _check(self, lines_digest=validate.text, grid_digest=validate.text)
         if not (self.is_exact or self.stages):
-            raise ValueError("prediction.stages must not be empty for a factorization")
+            raise ArgumentError("prediction.stages", "not be empty for a factorization")
         if not self.is_exact and (self.factorization.limits is None) != (self.beam is None):
-            raise ValueError("limits must be given with a beam, and must be None without one")
+            raise ArgumentError("limits", "be given with a beam, and be None without one")
 
     @property
     def is_exact(self) -> bool:
@@ -150,7 +160,7 @@ class Plan:
     def factorization(self) -> Factorization:
         """Division of the image and its filters. Raises TypeError for an exact image."""
         if isinstance(self.method, ExactImage):
-            raise TypeError("the plan must divide the image, got a plan for an exact image")
+            raise ArgumentTypeError("plan", "divide the image", "a plan for an exact image")
         return self.method
 
     @property
@@ -218,10 +228,8 @@ class Plan:
             ("grid", self.grid_digest, grid_digest(grid)),
         ):
             if mine != theirs:
-                raise ValueError(
-                    f"{name} must have the geometry for which the plan was made; make a new plan "
-                    "with clsas.plan"
-                )
+                allowed = "have the geometry for which the plan was made"
+                raise ArgumentError(name, allowed, hint="make a new plan with `clsas.plan`")
         if not self.is_exact:
             # Sampled lines contain no higher frequencies; a higher bound would only need memory.
             most = abs(lines.carrier_cycles_per_m) + 1 / lines.range_step_m
@@ -278,7 +286,7 @@ class Plan:
                 raise ValueError(
                     f"it has version {validate.shown(values['version'])}, written by another "
                     f"version of clsas; this clsas reads version {VERSION}: make the plan again "
-                    "with clsas.plan"
+                    "with `clsas.plan`"
                 )
             if DIGEST not in values:
                 raise ValueError(
@@ -289,7 +297,7 @@ class Plan:
             del values["version"], values[DIGEST]
             return _from_table(cls, values, "")
         except (TypeError, ValueError) as error:
-            raise ValueError(f"text must be a plan as of Plan.to_json: {error}") from None
+            raise ArgumentError("text", "be a plan as of Plan.to_json", hint=str(error)) from None
 
     def __repr__(self) -> str:
         """Return the request, the sizes of the subimages and the prediction."""
@@ -395,7 +403,7 @@ class Factorization:
         """Raise TypeError or ValueError if a field is not allowed, or contradicts another."""
         levels = len(validate.entries("sides", self.sides, "rows and columns of each stage"))
         if not 1 <= levels <= _MOST_STAGES:
-            raise ValueError(f"sides must be of 1 to {_MOST_STAGES} stages, got {levels}")
+            raise ArgumentError("sides", f"be of 1 to {_MOST_STAGES} stages", levels)
         pair = partial(_each, length=2, meaning="rows and columns", check=_whole)
         of_stages = partial(_each, length=levels, meaning="one for each stage", check=_count)
         _check(
@@ -423,8 +431,7 @@ class Factorization:
 
         def require(fits: bool, name: str, allowed: str) -> None:
             if not fits:
-                got = validate.shown(getattr(self, name))
-                raise ValueError(f"{name} must be {allowed}, got {got}")
+                raise ArgumentError(name, f"be {allowed}", validate.shown(getattr(self, name)))
 
         nested = all(
             a % b == 0
@@ -462,11 +469,14 @@ class ExactImage:
         Interpolation of the lines; None to choose the fastest: see `clsas.backproject`.
     """
 
-    accuracy_db: float
+    accuracy_db: Annotated[float, ACCURACY]
     reason: str = ""
-    taps: int | None = None
-    upsampling: float | None = None
-    kind: Literal["exact"] = "exact"
+    taps: Annotated[int | None, Choice(TAPS, help="Samples per interpolation; 2 is linear.")] = None
+    upsampling: Annotated[
+        float | None,
+        Number(least=1.0, most=MOST_UPSAMPLING, help="Upsampling of lines before interpolation."),
+    ] = None
+    kind: Annotated[Literal["exact"], Choice(("exact",))] = "exact"
 
     sides: ClassVar[tuple[tuple[int, int], ...]] = ()
     half_precision: ClassVar[bool] = False
@@ -474,16 +484,8 @@ class ExactImage:
 
     def __post_init__(self) -> None:
         """Raise TypeError or ValueError if a field is not allowed."""
-        _check(
-            self,
-            accuracy_db=partial(validate.number, unit="dB", least=BEST_DB, below=0.0),
-            reason=validate.text,
-            kind=partial(validate.one_of, allowed=("exact",)),
-        )
-        if self.taps is not None:
-            _check(self, taps=partial(validate.one_of, allowed=TAPS))
-        if self.upsampling is not None:
-            _check(self, upsampling=partial(validate.number, least=1.0, most=MOST_UPSAMPLING))
+        validate.check_fields(self)
+        _check(self, reason=validate.text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -530,7 +532,7 @@ class Prediction:
         """Raise TypeError or ValueError if a field, or an amount in it, is not allowed."""
         stages = validate.entries("stages", self.stages, "stages")
         if len(stages) > _MOST_STAGES + 1:
-            raise ValueError(f"stages must be at most {_MOST_STAGES + 1}, got {len(stages)}")
+            raise ArgumentError("stages", f"be at most {_MOST_STAGES + 1}", len(stages))
         for number, stage in enumerate(stages):
             validate.instance(f"stages[{number}]", stage, Stage)
         object.__setattr__(self, "stages", tuple(stages))
@@ -754,8 +756,7 @@ def _each(
     """Return so many values, each checked; `meaning` says what they are."""
     given = validate.entries(name, values, f"{length} numbers, {meaning}")
     if len(given) != length:
-        got = validate.shown(values)
-        raise ValueError(f"{name} must be {length} numbers, {meaning}, got {got}")
+        raise ArgumentError(name, f"be {length} numbers, {meaning}", validate.shown(values))
     return tuple(check(f"{name}[{number}]", each) for number, each in enumerate(given))
 
 
@@ -773,11 +774,10 @@ def _check_coefficients(name: str, given: Any, shapes: Sequence[tuple[int, ...]]
     values = validate.array(f"{name}.coefficients", given, np.float64, None)
     if values.shape not in shapes:
         allowed = " or ".join(map(str, shapes))
-        raise ValueError(f"{name}.coefficients must have shape {allowed}, got {values.shape}")
+        raise ArgumentError(f"{name}.coefficients", f"have shape {allowed}", values.shape)
     if (largest := float(np.abs(values).max())) > _MOST_COEFFICIENT:
-        raise ValueError(
-            f"{name}.coefficients must be at most {_MOST_COEFFICIENT:g} in size, got {largest:g}"
-        )
+        allowed = f"be at most {_MOST_COEFFICIENT:g} in size"
+        raise ArgumentError(f"{name}.coefficients", allowed, f"{largest:g}")
 
 
 def _check_resampling(given: Resampling, upsampler: Upsampler | None) -> None:
@@ -791,7 +791,7 @@ def _check_resampling(given: Resampling, upsampler: Upsampler | None) -> None:
     if upsampler is None:
         if not 0 <= given.first <= given.upsampled_period - given.length:
             got = validate.shown(given)
-            raise ValueError(f"resampling must be from samples within its period, got {got}")
+            raise ArgumentError("resampling", "be from samples within its period", got)
         return
     validate.instance("upsampler", upsampler, Upsampler)
     _whole("upsampler.step", upsampler.step)
@@ -799,10 +799,8 @@ def _check_resampling(given: Resampling, upsampler: Upsampler | None) -> None:
     shapes = [(PHASES, taps) for taps in UPSAMPLING_TAPS]
     _check_coefficients("upsampler", upsampler.coefficients, shapes)
     if given.period * PHASES != given.upsampled_period * upsampler.step:
-        raise ValueError(
-            f"resampling must be by {PHASES} / {upsampler.step}, as the upsampler does, "
-            f"got {validate.shown(given)}"
-        )
+        allowed = f"be by {PHASES} / {upsampler.step}, as the upsampler does"
+        raise ArgumentError("resampling", allowed, validate.shown(given))
 
 
 def _check_aperture(given: InterpolatedAperture | NearestBeams, levels: int) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from clsas.engine.data.digests import grid_digest, lines_digest
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, some_channels, wavelength_m
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError, Count, Flag, Number
 from clsas.engine.data.visibility import sines
 from clsas.engine.device.device import Device
 from clsas.engine.exact.decide import ACCURACY_DB
@@ -53,6 +55,13 @@ BEST_TOLERANCE_DB = -75.0
 """Tightest tolerance that may be requested: the rounding error of a factorized image in float32."""
 WORST_TOLERANCE_DB = -10.0
 """Loosest tolerance that may be requested."""
+TOLERANCE = Number(
+    "dB",
+    least=BEST_TOLERANCE_DB,
+    most=WORST_TOLERANCE_DB,
+    help="Largest relative rms error against the exact image.",
+)
+"""Declares tolerances in dB."""
 
 TOLERANCE_DB = -50.0
 """Tolerance of images for which none is requested."""
@@ -102,15 +111,15 @@ class Request:
 
     lines: RangeLines
     grid: Grid
-    tolerance_db: float | None = None
+    tolerance_db: Annotated[float | None, TOLERANCE] = None
     tolerance_wavelengths: InitVar[float | None] = None
     stages: Sequence[tuple[int, int]] | None = None
     beam: BeamWindow | None = None
-    memory_bytes: int | None = None
+    memory_bytes: Annotated[int | None, Count(help="Device memory that may be used.")] = None
     costs: Costs | None = None
     taps: InitVar[tuple[int, int] | None] = None
     depth: InitVar[int | None] = None
-    full_model: bool = False
+    full_model: Annotated[bool, Flag(help="Model every effect, however small.")] = False
     allowed: Allowed | None = field(init=False, default=None)
 
     def __post_init__(
@@ -127,22 +136,22 @@ class Request:
             validate.instance("beam", self.beam, BeamWindow)
         given = [self.tolerance_db, tolerance_wavelengths, self.stages]
         if sum(value is not None for value in given) != 1:
-            raise ValueError(
-                "exactly one of tolerance_db, tolerance_wavelengths and stages must be given, "
-                f"got {given[0]}, {given[1]} and {given[2]}"
+            raise ArgumentError(
+                "tolerance_db",
+                "be given, or one of `tolerance_wavelengths` and `stages`, and only one",
+                f"{given[0]}, {given[1]} and {given[2]}",
             )
         validate.memory("grid", 8 * self.grid.size)
+        validate.check_fields(self)
         self._set("tolerance_db", tolerance_in_db(self.tolerance_db, tolerance_wavelengths))
         if self.stages is not None:
             self._set("stages", _stages_within(self.stages, self.lines, self.grid))
         self._set("allowed", _allowed(taps, depth))
         if self.allowed is not None and self.stages is not None:
-            raise ValueError("taps and depth go with a tolerance, not with stages")
+            hint = "`taps` and `depth` go with a tolerance"
+            raise ArgumentError("stages", "be left out with `taps` or `depth`", hint=hint)
         if self.costs is not None:
             validate.instance("costs", self.costs, Costs)
-        validate.flag("full_model", self.full_model)
-        if self.memory_bytes is not None:
-            self._set("memory_bytes", validate.count("memory_bytes", self.memory_bytes))
 
     def scene(self) -> Scene:
         """Return the scene, without effects whose errors lie far below the tolerance."""
@@ -156,9 +165,7 @@ class Request:
 
 def checked_tolerance_db(tolerance_db: float) -> float:
     """Return a tolerance in dB; raise TypeError or ValueError if it is outside the limits."""
-    return validate.number(
-        "tolerance_db", tolerance_db, "dB", least=BEST_TOLERANCE_DB, most=WORST_TOLERANCE_DB
-    )
+    return TOLERANCE.check("tolerance_db", tolerance_db)
 
 
 def tolerance_in_db(
@@ -169,12 +176,7 @@ def tolerance_in_db(
         return checked_tolerance_db(tolerance_db)
     if tolerance_wavelengths is None:
         return None
-    least, most = (wavelengths(each) for each in (BEST_TOLERANCE_DB, WORST_TOLERANCE_DB))
-    return decibels(
-        validate.number(
-            "tolerance_wavelengths", tolerance_wavelengths, "wavelengths", least=least, most=most
-        )
-    )
+    return decibels(TOLERANCE_WAVELENGTHS.check("tolerance_wavelengths", tolerance_wavelengths))
 
 
 def decibels(wavelengths: float) -> float:
@@ -187,6 +189,15 @@ def wavelengths(decibels: float) -> float:
     return 10 ** (decibels / 20) * math.sqrt(3) / (4 * math.pi)
 
 
+TOLERANCE_WAVELENGTHS = Number(
+    "wavelengths",
+    least=wavelengths(BEST_TOLERANCE_DB),
+    most=wavelengths(WORST_TOLERANCE_DB),
+    help="The tolerance, stated as a range error in wavelengths, such as 1/30.",
+)
+"""Declares tolerances in wavelengths."""
+
+
 def checked_pairs(stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     """Return (QR, QI) of every stage; raise TypeError or ValueError if one is not allowed."""
     meaning = "a sequence of (QR, QI)"
@@ -195,7 +206,7 @@ def checked_pairs(stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
         for stage in validate.entries("stages", stages, meaning)
     ]
     if any(len(pair) != 2 for pair in pairs):
-        raise TypeError(f"stages must be {meaning}, got {validate.shown(stages)}")
+        raise ArgumentTypeError("stages", f"be {meaning}", validate.shown(stages))
     return [
         (validate.count("QR of stages", beams), validate.count("QI of stages", divisions))
         for beams, divisions in pairs
@@ -210,13 +221,15 @@ def _stages_within(
     if not pairs:
         return pairs
     if not grid.is_planar:
-        raise ValueError("grid must be a plane for stages")
+        raise ArgumentError("grid", "be a plane for `stages`")
     most_beams, most_divisions = lines.channels, max(min(grid.shape), 1)
     beams, divisions = (math.prod(numbers) for numbers in zip(*pairs, strict=True))
     if beams > most_beams or divisions > most_divisions:
-        raise ValueError(
-            f"stages must leave a line and a pixel: they sum {beams} of {lines.channels} lines and "
-            f"divide {grid.shape[0]} x {grid.shape[1]} pixels by {divisions} along either side"
+        raise ArgumentError(
+            "stages",
+            "leave a line and a pixel",
+            hint=f"they sum {beams} of {lines.channels} lines and divide {grid.shape[0]} x "
+            f"{grid.shape[1]} pixels by {divisions} along either side",
         )
     return pairs
 
@@ -230,15 +243,14 @@ def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
         meaning = "two, in range and along the aperture"
         given = validate.entries("taps", taps, meaning)
         if len(given) != 2:
-            raise TypeError(f"taps must be {meaning}, got {validate.shown(taps)}")
+            raise ArgumentTypeError("taps", f"be {meaning}", validate.shown(taps))
         align, aperture = (
             validate.one_of("taps", validate.count("every entry of taps", each), ALIGN_TAPS)
             for each in given
         )
         fields = {"align_taps": (align,), "aperture_taps": (aperture,)}
     if depth is not None:
-        depths = range(1, MOST_STAGES + 1)
-        fields["stages"] = (validate.one_of("depth", validate.count("depth", depth), depths),)
+        fields["stages"] = (validate.count("depth", depth, most=MOST_STAGES),)
     return Allowed(**fields)
 
 
@@ -341,21 +353,19 @@ def _with_given_stages(
 ) -> tuple[Plan, MeanTrack]:
     """Return the plan of given stages, and its mean track."""
     if roots is None:
-        raise ValueError("lines must have channels at more than one place for stages")
+        raise ArgumentError("lines", "have channels at more than one place for `stages`")
     beam = roots.sampled.scene.beam
     if beam is not None and beam.normalise:
-        raise ValueError("beam must not normalise with stages; clsas.backproject does")
+        raise ArgumentError("beam", "not normalise with `stages`", hint="`clsas.backproject` does")
     found = nearest_plan(SampledRoots.of(roots.sampled, roots.limits), stages, conditions)
     if found.memory_bytes > conditions.memory_bytes:
         raise _too_little_memory(found.memory_bytes, conditions.memory_bytes)
     return found, roots.sampled.track
 
 
-def _too_little_memory(least_bytes: float, room_bytes: int) -> ValueError:
-    return ValueError(
-        f"memory_bytes must be at least {math.ceil(10 * least_bytes / 2**20) / 10:.1f} MiB for "
-        f"this image, got {room_bytes / 2**20:.3g} MiB"
-    )
+def _too_little_memory(least_bytes: float, room_bytes: int) -> ArgumentError:
+    allowed = f"be at least {math.ceil(10 * least_bytes / 2**20) / 10:.1f} MiB for this image"
+    return ArgumentError("memory_bytes", allowed, f"{room_bytes / 2**20:.3g} MiB")
 
 
 def _exact_fits(request: Request, exact: ExactPrediction) -> bool:

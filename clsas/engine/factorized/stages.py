@@ -16,6 +16,7 @@ from scipy.spatial.distance import cdist
 
 from clsas.engine.data import validate
 from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device import kernels
 from clsas.engine.device.buffers import (
     GUARD,
@@ -215,11 +216,12 @@ def upload(
     pitch = padded_length(resampling)
     needed = lines_buffer(lines.channels, pitch, half_precision).nbytes
     if needed > device.info.max_buffer_bytes:
-        raise ValueError(
-            f"{lines.channels} lines of {lines.length} samples need {needed / 2**20:.0f} MiB when "
-            f"upsampled, but a buffer of {device.info.label} holds at most "
-            f"{device.info.max_buffer_bytes / 2**20:.0f} MiB: image a part of the lines, or "
-            "backproject exactly"
+        raise ArgumentError(
+            "lines",
+            f"take at most {device.info.max_buffer_bytes / 2**20:.0f} MiB when upsampled, which a "
+            f"buffer of {device.info.label} can hold",
+            f"{needed / 2**20:.0f} MiB for {lines.channels} lines of {lines.length} samples",
+            "image a part of the lines, or backproject exactly",
         )
     if factorization.upsampler is None:
         align, final = factorization.align, factorization.final
@@ -271,7 +273,7 @@ def in_enough_precision(
     device.finish()  # kernels may still write to the buffer that is given up
     single = upload(lines, geometry.factorization, device, largest, half_precision=False)
     validate.warn(
-        "lines are kept in single precision, not in half as planned, and need up to twice the "
+        "the lines are kept in single precision, not in half as planned, and need up to twice the "
         "memory: echoes from the grid are too weak compared with the largest sample, "
         f"{largest:.3g}, or the gain that they need is out of range"
     )

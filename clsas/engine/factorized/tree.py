@@ -22,6 +22,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.lines import RangeLines, antennas_of, band_wavelength_m
 from clsas.engine.data.surface import Surface
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import BeamTrack, Boxes
 from clsas.engine.device.buffers import MARGIN
 from clsas.engine.factorized.phase_rates import (
@@ -215,10 +216,11 @@ def geometry_of(
     shape = factorization.aperture.shape
     track = track or mean_track_of(lines, shape, wavelength_m)
     if track is None:
-        raise ValueError(
-            "lines must have channels at more than one place for a plan that divides the image"
+        raise ArgumentError(
+            "lines",
+            "have channels at more than one place for a plan that divides the image"
             if shape == "track"
-            else f"lines must have channels that lie on {_SHAPES[shape]}, as the plan assumes"
+            else f"have channels that lie on {_SHAPES[shape]}, as the plan assumes",
         )
 
     tree = Tree(surface, sides)

@@ -105,30 +105,30 @@ class Ambiguity:
 
         def outcome(error_power: float) -> str:
             found_db = in_db(allowed + error_power)
-            return f"the error may be {found_db:.0f} dB instead of {name} {requested_db:.3g} dB"
+            return f"the error may be {found_db:.0f} dB instead of `{name}` {requested_db:.3g} dB"
 
         if requested_db + in_db(self.brightness) < BEST_DB - _CLOSE_DB:
             dark_db = -in_db(self.brightness)
             validate.warn(
                 f"the image is {dark_db:.0f} dB darker than the echoes at its ranges, because most "
                 "of them come from places beside the grid, or that the beam hardly covers: the "
-                f"error may be {BEST_DB + dark_db:.0f} dB instead of {name} {requested_db:.3g} dB; "
-                "use a larger grid, or a wider beam"
+                f"error may be {BEST_DB + dark_db:.0f} dB instead of `{name}` {requested_db:.3g} "
+                "dB; use a larger grid, or a wider beam"
             )
         if self.ends > _MOST * allowed:
             validate.warn(
-                "lines do not fade towards ends that the grid reaches, or their guard band is thin "
-                f"(oversampling {self.oversampling:.4g}) and the cut affects samples farther "
+                "the lines do not fade towards ends that the grid reaches, or their guard band is "
+                f"thin (oversampling {self.oversampling:.4g}) and the cut affects samples farther "
                 "inside: pixels depend on how the lines are interpolated, so that "
                 f"{outcome(self.ends)}; let the grid end before the lines do, fade the lines "
-                "(lines.tapered_ends), or sample them more finely"
+                "(`lines.tapered_ends`), or sample them more finely"
             )
         if self.aliasing > _MOST * allowed:
             validate.warn(
                 "the band of the lines fills the whole sampled band, so that its edges may alias: "
                 f"oversampling is {self.oversampling:.4g}, but must be above "
                 f"{NEEDED_OVERSAMPLING:.4g}; {outcome(self.aliasing)}; sample more finely "
-                "(compress(oversampling=...))"
+                "(`clsas.compress(oversampling=...)`)"
             )
 
 

@@ -9,6 +9,7 @@ from scipy import fft
 
 from clsas.engine.data import validate
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.spectrum import measure_spectrum
 
 _BLOCK = 1 << 22  # complex128 samples that are filtered together
@@ -70,10 +71,8 @@ def sub_bands(lines: RangeLines, count: int) -> tuple[RangeLines, ...]:
     found = measure_spectrum(lines)
     width = 1 / max(found.oversampling, 1.0)  # cycles per sample
     if width * lines.length < count:
-        raise ValueError(
-            f"count must leave a cycle per line in every part, at most {int(width * lines.length)} "
-            f"parts of lines of {lines.length} samples, got {count}"
-        )
+        most = f"{int(width * lines.length)} parts of lines of {lines.length} samples"
+        raise ArgumentError("count", f"leave a cycle per line in every part, at most {most}", count)
     validate.memory("count", 8 * count * lines.samples.size)
     padded = fft.next_fast_len(2 * lines.length)
     distance = np.mod(fft.fftfreq(padded) - found.centre + 0.5, 1.0) - 0.5

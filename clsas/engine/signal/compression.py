@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from fractions import Fraction
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +19,14 @@ from clsas.engine.data import validate
 from clsas.engine.data.fourier import EDGE_PRODUCT, fourier_integral, smooth_edge
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.system import Pulse
+from clsas.engine.data.validate import ArgumentError, Flag, Number
 from clsas.engine.signal.echoes import Echoes
 from clsas.engine.signal.replica import Replica
 
 Window = str | float | tuple
+
+OVERSAMPLING = Number(least=1.0, most=1e4, help="Sample rate of the lines over the bandwidth.")
+"""Declares the oversampling of lines. Its limit is arbitrary, far beyond what improves them."""
 
 # Width, in bandwidths, of the edges that the band of the filter gets when the filter is truncated.
 # They are wider if the filter would otherwise need a padding longer than this many recordings.
@@ -140,10 +145,8 @@ def compress(
     duration = 0.0 if pulse is None else pulse.duration_s
     whole = echoes.length - 1 - duration * rate
     if whole < 0:
-        raise ValueError(
-            f"echoes must be longer than the pulse ({duration:g} s), "
-            f"got {(echoes.length - 1) / rate:g} s"
-        )
+        given = f"{(echoes.length - 1) / rate:g} s"
+        raise ArgumentError("echoes", f"be longer than the pulse ({duration:g} s)", given)
 
     edge = max(_BAND_EDGE * band, EDGE_PRODUCT * rate / (_MOST_PADDING * echoes.length))
     fade = EDGE_PRODUCT * rate / edge
@@ -199,12 +202,14 @@ def compress(
 
 
 def check_options(
-    *, window: Window = "none", oversampling: float = 2.0, equalize: bool = False
+    *,
+    window: Window = "none",
+    oversampling: Annotated[float, OVERSAMPLING] = 2.0,
+    equalize: Annotated[bool, Flag(help="Remove the ripples of the pulse's spectrum.")] = False,
 ) -> None:
     """Raise TypeError or ValueError for options that `compress` refuses for all echoes."""
     band_window(window, 1.0)
-    validate.oversampling(oversampling)
-    validate.flag("equalize", equalize)
+    validate.check_declared(check_options, {"oversampling": oversampling, "equalize": equalize})
 
 
 def band_window(
@@ -235,38 +240,38 @@ def band_window(
             window = validate.number("it", window)
         values = get_window(window, count, fftbins=False)
     except (ValueError, TypeError, IndexError) as error:
-        raise ValueError(
-            f"window must be 'none' or a window of scipy.signal.get_window, "
-            f"got {validate.shown(window)} ({error})"
-        ) from None
+        allowed = "be 'none' or a window of `scipy.signal.get_window`"
+        given = validate.shown(window)
+        raise ArgumentError("window", allowed, given, str(error)) from None
     values = validate.array("window", values, np.float64, (count,))
     nodes = np.linspace(-bandwidth_hz / 2, bandwidth_hz / 2, count)
     if not np.diff(nodes).min() > 0:
-        raise ValueError(f"bandwidth_hz must be wider for a window, got {bandwidth_hz:g} Hz")
+        raise ArgumentError("bandwidth_hz", "be wider for a window", f"{bandwidth_hz:g} Hz")
     return CubicSpline(nodes, values)
 
 
 def _band(echoes: Echoes, bandwidth_hz: float | None, replica: Replica | None) -> float:
     if bandwidth_hz is None:
         if echoes.pulse is None:
-            raise ValueError("bandwidth_hz must be given for echoes without a pulse")
+            raise ArgumentError("bandwidth_hz", "be given for echoes without a pulse")
         bandwidth_hz = echoes.pulse.bandwidth_hz
     limit = echoes.sample_rate_hz
     if echoes.is_passband:
         limit = min(2 * echoes.carrier_hz, limit - 2 * echoes.carrier_hz)
         if limit <= 0:
-            raise ValueError(
-                f"carrier_hz of real echoes must be between 0 and half the sample rate, "
-                f"{echoes.sample_rate_hz / 2:g} Hz, got {echoes.carrier_hz:g} Hz"
-            )
+            half = f"half the sample rate, {echoes.sample_rate_hz / 2:g} Hz"
+            allowed = f"be between 0 and {half}, for real echoes"
+            raise ArgumentError("carrier_hz", allowed, f"{echoes.carrier_hz:g} Hz")
     if replica is not None:
         limit = min(limit, replica.sample_rate_hz)
     band = validate.number("bandwidth_hz", bandwidth_hz, "Hz", above=0.0, most=limit)
     least = least_bandwidth_hz(echoes.length, echoes.sample_rate_hz)
     if band < least:
-        raise ValueError(
-            f"bandwidth_hz must be at least {least:.4g} Hz, a tenth over the duration of the "
-            f"recording ({echoes.length / echoes.sample_rate_hz:.4g} s), got {band:g} Hz"
+        raise ArgumentError(
+            "bandwidth_hz",
+            f"be at least {least:.4g} Hz, a tenth over the duration of the recording "
+            f"({echoes.length / echoes.sample_rate_hz:.4g} s)",
+            f"{band:g} Hz",
         )
     return band
 
@@ -331,7 +336,7 @@ def _filter_response(
     impulse = fourier_integral(matched, edges, lag, sign=1, rate=rate)
     total = fourier_integral(energy, edges, 0.0, sign=1, rate=rate).real
     if not total > 0:
-        raise ValueError("replica must have energy within bandwidth_hz, got none")
+        raise ArgumentError("replica", "have energy within `bandwidth_hz`", "none")
     impulse /= total
     impulse *= smooth_edge((np.abs(lag) - reach_s) / (period_s / 2 - reach_s))
     return fft.fft(impulse)[bins % points] * (period_s / points)

@@ -85,10 +85,10 @@ def warn_before_imaging(
         heights_m = [float(rx_m[:, 2].mean()) for rx_m in of_bank]
         apart_m = max(heights_m) - min(heights_m)
         validate.warn(
-            f"lines have {lines.banks} banks, {measured(apart_m, 'm', 3)} apart in height. In one "
-            "image of all, their echoes cancel wherever the seabed is not at the height of the "
-            "grid. lines.bank(0) has the lines of the first bank; dataclasses.replace(lines, "
-            "bank_numbers=None) declares all channels to be one array"
+            f"the lines have {lines.banks} banks, {measured(apart_m, 'm', 3)} apart in height. In "
+            "one image of all, their echoes cancel wherever the seabed is not at the height of the "
+            "grid. `lines.bank(0)` selects the first bank; without `bank_numbers`, all channels "
+            "count as one array"
         )
     found = behind(lines, grid, last_range_m)
     warn_of([] if found is None else [found])
@@ -126,8 +126,8 @@ def _speed(lines: RangeLines) -> Iterator[Finding]:
     if speed_m_s < _SLOWEST or _FASTEST_SOUND < speed_m_s < _SLOWEST_LIGHT:
         yield Finding(
             "sound_speed",
-            f"sound_speed_m_s is {speed_m_s:g} m/s, but no medium has less than {_SLOWEST:g} m/s, "
-            f"or between {_FASTEST_SOUND:g} and {_SLOWEST_LIGHT:g} m/s",
+            f"`sound_speed_m_s` is {speed_m_s:g} m/s, but no medium has less than {_SLOWEST:g} "
+            f"m/s, or between {_FASTEST_SOUND:g} and {_SLOWEST_LIGHT:g} m/s",
             speed_m_s,
             _SLOWEST if speed_m_s < _SLOWEST else _FASTEST_SOUND,
             "give it in m/s: water has 1500, air 340, and light 299 792 458",
@@ -153,7 +153,7 @@ def _units(lines: RangeLines, wavelength_m: float) -> Iterator[Finding]:
         usual_m = float(np.median(cKDTree(places_m).query(asked_m, k=2)[0][:, 1]))
     remedy = (
         "check the units: positions in metres (not kilometres, or degrees of latitude and "
-        "longitude), carrier_hz in Hz (not kHz)"
+        "longitude), `carrier_hz` in Hz (not kHz)"
     )
     if extent_m < _SHORTEST * wavelength_m:
         yield Finding(
@@ -181,8 +181,8 @@ def _units(lines: RangeLines, wavelength_m: float) -> Iterator[Finding]:
             f"{MOST_WAVELENGTHS:g} wavelengths of {wavelength}",
             usual_m,
             MOST_WAVELENGTHS * wavelength_m,
-            "check the units: positions in metres (not millimetres), carrier_hz in Hz, "
-            "sound_speed_m_s in m/s (not km/s)",
+            "check the units: positions in metres (not millimetres), `carrier_hz` in Hz, "
+            "`sound_speed_m_s` in m/s (not km/s)",
         )
 
 
@@ -219,7 +219,7 @@ def _stray(fixes_m: NDArray[np.float64], of_channels_m: NDArray[np.float64]) -> 
         "of the navigation",
         float(away_m[worst]),
         limit_m,
-        "interpolate the navigation over these pings, or leave them out with lines.select(...)",
+        "interpolate the navigation over these pings, or leave them out with `lines.select(...)`",
         tuple(where.tolist()),
     )
 
@@ -274,7 +274,7 @@ def _beam(
             "there is no aperture",
             usual,
             2.0,
-            "use a wider beam (width_deg is in degrees, not in radians), or more pings",
+            "use a wider beam (`width_deg` is in degrees, not in radians), or more pings",
         )
     elif beam.width_deg < _RADIANS and grid.is_planar:
         course = along.mean(axis=0)
@@ -292,7 +292,7 @@ def _beam(
                 f"{cell_m / pitch_m:.3g} times the spacing of the pixels",
                 cell_m,
                 _COARSER * pitch_m,
-                f"give width_deg in degrees: {beam.width_deg:g} radians are "
+                f"give `width_deg` in degrees: {beam.width_deg:g} radians are "
                 f"{math.degrees(beam.width_deg):.3g} degrees",
             )
 
@@ -311,8 +311,8 @@ def _samples(lines: RangeLines) -> Iterator[Finding]:
             "phases",
             0.0,
             0.0,
-            "form the analytic signal first, scipy.signal.hilbert(samples, axis=1) with "
-            "carrier_hz=0, or mix the samples down and filter them",
+            "form the analytic signal first, `scipy.signal.hilbert(samples, axis=1)` with "
+            "`carrier_hz=0`, or mix the samples down and filter them",
         )
         return
     # The phase of z steps from sample to sample; in a chirp these steps grow evenly.
@@ -328,7 +328,7 @@ def _samples(lines: RangeLines) -> Iterator[Finding]:
             "compressed",
             share,
             _CHIRPED,
-            "compress them with clsas.compress, or correlate them with the transmitted pulse",
+            "compress them with `clsas.compress`, or correlate them with the transmitted pulse",
         )
 
 
@@ -382,17 +382,17 @@ def _focus(lines: RangeLines, grid: Grid) -> Iterator[Finding]:
         )
 
     if conjugate > least:
-        remedy = "conjugate the samples: dataclasses.replace(lines, samples=lines.samples.conj())"
+        remedy = "conjugate the samples: `dataclasses.replace(lines, samples=lines.samples.conj())`"
         what = message("its phase had the opposite sign", conjugate)
         yield Finding("phase_sign", what, conjugate, least, remedy)
         return
     for cause, first in (
-        ("range_step_m were half as large, c/(2 fs) instead of c/fs", 1.0),
+        ("`range_step_m` were half as large, c/(2 fs) instead of c/fs", 1.0),
         ("all ranges were half as large, since they are half the two-way path", 0.5),
     ):
         other = _focused(lines, grid, first * lines.first_range_m, lines.range_step_m / 2)
         if other is not None and other[0] > least:
-            remedy = "check range_step_m and first_range_m: an echo at the time t is at c t/2"
+            remedy = "check `range_step_m` and `first_range_m`: an echo at the time t is at c t/2"
             yield Finding("ranges", message(cause, other[0]), other[0], least, remedy)
             return
 

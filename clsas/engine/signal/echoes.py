@@ -12,6 +12,7 @@ from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.lines import checked_channels
 from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.data.system import Pulse
+from clsas.engine.data.validate import ArgumentError
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,13 +101,10 @@ class Echoes:
         for name, value in checked_channels(self, "start_time_s").items():
             put(name, value)
         if self.pulse is not None:
-            if not isinstance(self.pulse, Pulse):
-                raise TypeError(f"pulse must be a Pulse or None, got {type(self.pulse).__name__}")
+            validate.instance("pulse", self.pulse, Pulse)
             if self.pulse.carrier_hz != self.carrier_hz:
-                raise ValueError(
-                    f"carrier_hz must be the pulse's {self.pulse.carrier_hz:g} Hz, "
-                    f"got {self.carrier_hz:g} Hz"
-                )
+                allowed = f"be the pulse's {self.pulse.carrier_hz:g} Hz"
+                raise ArgumentError("carrier_hz", allowed, f"{self.carrier_hz:g} Hz")
 
     def __repr__(self) -> str:
         """Return sizes and rates, because the arrays are long."""

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from clsas.engine.data import validate
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.compression import Window, compress, least_bandwidth_hz
 from clsas.engine.signal.echoes import Echoes
 
@@ -88,7 +89,7 @@ def from_full_matrix(
         samples = validate.array("samples", samples, np.float32, (None, None))
         both = validate.entries("pairs", pairs, "transmitting and receiving elements")
         if len(both) != 2:
-            raise ValueError(f"pairs must be two arrays of elements, got {len(both)}")
+            raise ArgumentError("pairs", "be two arrays of elements", len(both))
         tx, rx = (_elements(each, len(samples), count) for each in both)
     rate_hz = validate.number(
         "sample_rate_hz", sample_rate_hz, "Hz", above=0.0, most=validate.MOST_HZ
@@ -99,25 +100,27 @@ def from_full_matrix(
     start_s = validate.number("start_time_s", start_time_s, "s")
     carrier_hz = validate.number("carrier_hz", carrier_hz, "Hz", above=0.0, below=rate_hz / 2)
     if bandwidth_hz is None and carrier_hz > rate_hz / 4:
-        raise ValueError(
-            f"carrier_hz must be at most a quarter of the sample rate, {rate_hz / 4:g} Hz, for a "
-            f"band of twice the carrier, got {carrier_hz:g} Hz: give bandwidth_hz, at most "
-            f"{rate_hz - 2 * carrier_hz:g} Hz"
+        raise ArgumentError(
+            "carrier_hz",
+            f"be at most a quarter of the sample rate, {rate_hz / 4:g} Hz, for a band of twice the "
+            "carrier",
+            f"{carrier_hz:g} Hz",
+            f"give `bandwidth_hz`, at most {rate_hz - 2 * carrier_hz:g} Hz",
         )
     least = least_bandwidth_hz(samples.shape[-1], rate_hz)
     if bandwidth_hz is None and 2 * carrier_hz < least:
-        raise ValueError(
-            f"carrier_hz must be at least {least / 2:.4g} Hz for a band of twice the carrier and "
-            f"samples of {samples.shape[-1] / rate_hz:.4g} s, got {carrier_hz:g} Hz"
+        raise ArgumentError(
+            "carrier_hz",
+            f"be at least {least / 2:.4g} Hz for a band of twice the carrier and samples of "
+            f"{samples.shape[-1] / rate_hz:.4g} s",
+            f"{carrier_hz:g} Hz",
         )
     last_s = abs(start_s) + samples.shape[-1] / rate_hz
     validate.phase(carrier_hz, speed, speed / 2 * last_s)
     numbers = tx * count + rx
-    if len(np.unique(numbers)) < len(numbers):
-        raise ValueError(
-            f"pairs must differ from each other, got {len(np.unique(numbers))} different ones of "
-            f"{len(numbers)}"
-        )
+    if (kinds := len(np.unique(numbers))) < len(numbers):
+        given = f"{kinds} different ones of {len(numbers)}"
+        raise ArgumentError("pairs", "differ from each other", given)
     alone = (tx != rx) & ~np.isin(rx * count + tx, numbers)
     lines = compress(
         Echoes(
@@ -139,7 +142,6 @@ def from_full_matrix(
 def _elements(given: ArrayLike, length: int, count: int) -> np.ndarray:
     numbers = validate.indices("every entry of pairs", given, count)
     if numbers.shape != (length,):
-        raise ValueError(
-            f"pairs must be whole numbers, one per line ({length}), got shape {numbers.shape}"
-        )
+        allowed = f"be whole numbers, one per line ({length})"
+        raise ArgumentError("pairs", allowed, f"shape {numbers.shape}")
     return numbers

@@ -16,8 +16,9 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, toeplitz
 
-from clsas.engine.data import reprs, validate
+from clsas.engine.data import reprs
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.spectrum import Spectrum, measure_spectrum
 
 _Complex = TypeVar("_Complex", np.complex64, np.complex128)
@@ -216,13 +217,8 @@ def choose(
     Raises
     ------
     ValueError
-        If `taps` is not one of 2, 4, 6, 8, `upsampling` is outside 1 to 64, or `accuracy_db` cannot
-        be reached with the fixed value.
+        If `accuracy_db` cannot be reached with the fixed value.
     """
-    if taps is not None:
-        taps = validate.one_of("taps", taps, TAPS)
-    if upsampling is not None:
-        upsampling = validate.number("upsampling", upsampling, least=1.0, most=MOST_UPSAMPLING)
     if taps is not None and upsampling is not None:
         return design(taps, upsampling, spectrum)
     power_left = 10 ** (accuracy_db / 10) - other_error**2
@@ -236,10 +232,8 @@ def choose(
                 break
     if not candidates:
         fixed = f"taps={taps}" if taps is not None else f"upsampling={upsampling}"
-        raise ValueError(
-            f"accuracy_db={accuracy_db:g} cannot be reached with {fixed}; "
-            f"the best is {found.error_db:.1f} dB"
-        )
+        allowed, best = f"be within reach of `{fixed}`", f"the best is {found.error_db:.1f} dB"
+        raise ArgumentError("accuracy_db", allowed, f"{accuracy_db:g} dB", best)
 
     def cost(candidate: Interpolator) -> float:
         upsampling_cost = _UPSAMPLING_COST * candidate.upsampling / pixels_per_sample

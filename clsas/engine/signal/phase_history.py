@@ -11,7 +11,8 @@ from scipy import fft
 from clsas.engine.data import validate
 from clsas.engine.data.fourier import fourier_series
 from clsas.engine.data.lines import RangeLines
-from clsas.engine.signal.compression import Window, band_window
+from clsas.engine.data.validate import ArgumentError
+from clsas.engine.signal.compression import OVERSAMPLING, Window, band_window
 
 _BLOCK = 1 << 22  # complex128 samples of the channels that are transformed together
 _LEAST_OF_BAND = 1e-2
@@ -113,12 +114,9 @@ def from_phase_history(
     samples = validate.array("samples", samples, np.complex64, (None, None))
     channels, count = samples.shape
     if count < 2:
-        raise ValueError(f"samples must have at least 2 frequencies, got {count}")
-    try:
-        sign = validate.one_of("sign", sign, (-1, 1))
-    except ValueError:
-        raise ValueError(f"sign must be -1 or +1, got {validate.shown(sign)}") from None
-    oversampling = validate.oversampling(oversampling)
+        raise ArgumentError("samples", "have at least 2 frequencies", count)
+    sign = validate.one_of("sign", sign, (-1, 1))
+    oversampling = OVERSAMPLING.check("oversampling", oversampling)
     speed = validate.number(
         "sound_speed_m_s", sound_speed_m_s, "m/s", above=0.0, most=validate.MOST_M_S
     )
@@ -151,7 +149,8 @@ def from_phase_history(
         weights = np.where(np.abs(place) <= 0.5 + 1e-9, weigh(np.clip(place, -0.5, 0.5)), 0.0)
         total = weights.sum(axis=1, keepdims=True)
         if not np.abs(total).min() > 0:
-            raise ValueError(f"window must have a sum other than 0, got {validate.shown(window)}")
+            given = validate.shown(window)
+            raise ArgumentError("window", "have a sum other than 0", given)
         spectrum = (spectrum if sign == -1 else spectrum.conj()) * (weights / total)
         if equal:
             part = fft.fftshift(length * fft.ifft(spectrum, length, workers=-1), axes=1)
@@ -178,14 +177,14 @@ def _warn_of_slips(
     low = int(np.argmin(first_hz / band_hz))
     if first_hz[low] < _LEAST_OF_BAND * band_hz[low]:
         validate.warn(
-            f"first_frequency_hz is {first_hz[low]:g} Hz, less than 1/{1 / _LEAST_OF_BAND:g} of "
+            f"`first_frequency_hz` is {first_hz[low]:g} Hz, less than 1/{1 / _LEAST_OF_BAND:g} of "
             f"the band of {band_hz[low]:g} Hz: is it in Hz (not GHz), as transmitted (not after "
             "mixing)?"
         )
     if reference_m.min() < 0:
         validate.warn(
-            f"reference_range_m is negative, {reference_m.min():g} m at least: ranges are at least "
-            "half the distance from transmitter to receiver"
+            f"`reference_range_m` is negative, {reference_m.min():g} m at least: ranges are at "
+            "least half the distance from transmitter to receiver"
         )
 
 
@@ -204,10 +203,11 @@ def _bands(
     narrow = np.flatnonzero(~(np.diff(band)[:, 0] >= step_hz))
     if narrow.size:
         low, high = given[narrow[0]]
-        raise ValueError(
-            "band_hz must ascend and contain at least 2 sampled frequencies of every channel, got "
+        raise ArgumentError(
+            "band_hz",
+            "ascend and contain at least 2 sampled frequencies of every channel",
             f"{low:g} to {high:g} Hz for channel {narrow[0]}, sampled from "
-            f"{sampled_hz[narrow[0], 0]:g} to {sampled_hz[narrow[0], 1]:g} Hz"
+            f"{sampled_hz[narrow[0], 0]:g} to {sampled_hz[narrow[0], 1]:g} Hz",
         )
     return band
 
@@ -215,10 +215,8 @@ def _bands(
 def _frequencies(name: str, value: ArrayLike, channels: int) -> NDArray[np.float64]:
     """Return one frequency per channel, each greater than 0."""
     array = validate.array(name, value, np.float64, (channels,), broadcast=True)
-    if not array.min() > 0:
-        raise ValueError(f"{name} must be > 0, got {array.min():g}")
-    if not array.max() <= validate.MOST_HZ:
-        raise ValueError(f"{name} must be <= {validate.MOST_HZ:g} Hz, got {array.max():g}")
+    validate.number(name, array.min(), "Hz", above=0.0)
+    validate.number(name, array.max(), "Hz", most=validate.MOST_HZ)
     return array
 
 

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.fourier import fourier_series
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +51,17 @@ class Replica:
     def __post_init__(self) -> None:
         """Check every field and convert it."""
         if not np.iscomplexobj(validate.real_or_complex("samples", self.samples)):
-            raise TypeError(
-                "samples must be complex numbers, relative to the carrier, got real ones: form the "
-                "analytic signal (scipy.signal.hilbert) and multiply it by exp(-2j pi carrier t)"
+            raise ArgumentTypeError(
+                "samples",
+                "be complex numbers, relative to the carrier",
+                "real ones",
+                "form the analytic signal (`scipy.signal.hilbert`) and multiply it by "
+                "exp(-2j pi carrier t)",
             )
         samples = validate.array("samples", self.samples, np.complex128, (None,))
         if len(samples) < 2 or not samples.any():
-            raise ValueError(
-                "samples must be at least 2 and not all zero, "
-                f"got {len(samples)} with a largest amplitude of {np.abs(samples).max():g}"
-            )
+            given = f"{len(samples)} with a largest amplitude of {np.abs(samples).max():g}"
+            raise ArgumentError("samples", "be at least 2 and not all zero", given)
         object.__setattr__(self, "samples", samples)
         rate = validate.positive("sample_rate_hz", self.sample_rate_hz, "Hz")
         object.__setattr__(self, "sample_rate_hz", rate)

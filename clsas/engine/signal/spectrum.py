@@ -129,10 +129,10 @@ def measure_spectrum(
     centre, width, left_out, gap = _occupied_band(frequency, faded)
     if grid is not None and gap:
         validate.warn(
-            f"lines: the band wraps around half the sample rate, and has a gap of {gap:.0%} of the "
-            f"sample rate or more beside a guard band of {1 - width:.0%}. Which of them lies "
-            "within the band is not known: if it is the wider one, the image is in error. Mix the "
-            "middle of the band to 0 Hz"
+            f"the band of the lines wraps around half the sample rate, and has a gap of {gap:.0%} "
+            f"of the sample rate or more beside a guard band of {1 - width:.0%}. Which of them "
+            "lies within the band is not known: if it is the wider one, the image is in error. Mix "
+            "the middle of the band to 0 Hz"
         )
     distance = _distance(frequency, centre)
     share = _histogram(distance, power)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.interpolation import Readout
 from clsas.engine.water.ray_delays import FLIGHT_STEPS, RaySample, at_speed, straight_m, times_s
 from clsas.engine.water.rays import Rays, rays, shadow
@@ -244,7 +245,8 @@ def _rays_to(
         distance, z = (
             float(np.broadcast_to(each, dark.shape)[dark][0]) for each in (distance_m, z_m)
         )
-        raise ValueError(f"sound_speed: {shadow(profile, distance, z, level_m)}")
+        why = shadow(profile, distance, z, level_m)
+        raise ArgumentError("sound_speed", "lead a direct ray to every pixel", hint=why)
     return found
 
 

@@ -13,6 +13,7 @@ from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid, spread_indices
 from clsas.engine.data.lines import RangeLines, some_channels
 from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import sines
 from clsas.engine.water.rays import Rays, rays, shadow
 from clsas.engine.water.thinning import FEW, vertical_errors_s
@@ -82,7 +83,8 @@ def one_way_s(
         dark = np.flatnonzero(~found.exists)
         nearest = dark[distance[dark].argmin()]
         place = distance[nearest], antennas_m[nearest, 2], points_m[nearest, 2]
-        raise ValueError(f"sound_speed: {shadow(profile, *map(float, place))}")
+        why = shadow(profile, *map(float, place))
+        raise ArgumentError("sound_speed", "lead a direct ray to every pixel", hint=why)
     return times_s(profile, found, antennas_m[:, 2], points_m[:, 2])
 
 

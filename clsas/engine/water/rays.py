@@ -145,7 +145,7 @@ def shadow(profile: SoundSpeed, horizontal_m: float, one_z_m: float, other_z_m: 
     return (
         f"no direct ray connects depths of {depths[0]:g} m and {depths[1]:g} m over "
         f"{horizontal_m:.1f} m: the sound speed bends rays away beyond {reach:.1f} m, a shadow "
-        "zone. Use only nearer ranges, or check sound_speed"
+        "zone. Use only nearer ranges, or check `sound_speed`"
     )
 
 

@@ -188,9 +188,7 @@ def test_chosen_by_kind_and_platform(wish, index, monkeypatch):
 
 def test_a_kind_that_is_not_there_is_told(monkeypatch):
     monkeypatch.setattr(module, "list_devices", lambda: several_devices()[:2])
-    words = (
-        "No device matches 'gpu', which was requested. Available: 0: Portable Computing Language: "
-    )
+    words = "No device matches 'gpu' (`device`). Available: 0: Portable Computing Language: "
     with pytest.raises(DeviceError, match=re.escape(words)):
         choose("gpu")
 

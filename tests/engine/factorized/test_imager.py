@@ -138,8 +138,12 @@ def test_it_is_closed_after_a_with_block():
 @pytest.mark.parametrize(
     ("request_", "error", "message"),
     [
-        ({}, ValueError, "exactly one of plan, tolerance_db and accuracy_db must be given"),
-        ({"tolerance_db": -40, "accuracy_db": -40}, ValueError, "exactly one of"),
+        (
+            {},
+            ValueError,
+            "plan must be given, or one of `tolerance_db` and `accuracy_db`, and only one, got",
+        ),
+        ({"tolerance_db": -40, "accuracy_db": -40}, ValueError, "and only one, got None, -40, -40"),
         ({"plan": "a plan"}, TypeError, "plan must be of type Plan"),
         ({"tolerance_db": -90}, ValueError, "tolerance_db must be"),
         ({"accuracy_db": 3}, ValueError, "accuracy_db must be"),

@@ -220,7 +220,7 @@ def test_the_message_names_the_mistake(chosen, field, value, message):
 @pytest.mark.parametrize("version", [VERSION - 1, VERSION + 1, "2", None])
 def test_a_plan_of_another_version_is_refused(chosen, version):
     values = changeable(chosen) | {"version": version}
-    with pytest.raises(ValueError, match=r"written by .*: make the plan again with clsas\.plan"):
+    with pytest.raises(ValueError, match=r"written by .*: make the plan again with `clsas\.plan`"):
         Plan.from_json(json.dumps(values))
 
 

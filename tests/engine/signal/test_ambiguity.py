@@ -63,7 +63,7 @@ def test_ends_that_matter_little_or_are_not_reached_keep_the_tolerance(
 @pytest.mark.parametrize("accuracy_db", [-50, -60, -70])
 def test_exact_images_too_tell_of_ends_that_do_not_fade(cut_off, accuracy_db):
     lines, ((grid, exact), _) = cut_off
-    with pytest.warns(ClsasWarning, match=f"do not fade.* instead of accuracy_db {accuracy_db}"):
+    with pytest.warns(ClsasWarning, match=f"do not fade.* instead of `accuracy_db` {accuracy_db}"):
         image = clsas.backproject(lines, grid, accuracy_db=accuracy_db)
     predicted_db = prepare(lines, grid, accuracy_db=accuracy_db).error_db
     assert accuracy_db < predicted_db < -35

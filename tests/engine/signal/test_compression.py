@@ -365,7 +365,7 @@ def test_recording_shorter_than_the_pulse():
 def test_real_echoes_need_their_band_inside_what_was_sampled():
     real = replace(GOOD, samples=np.zeros((2, 900), np.float32))
     with pytest.raises(
-        ValueError, match=r"carrier_hz of real echoes must be between 0 and .* 100000 Hz, got 1e"
+        ValueError, match=r"carrier_hz must be between 0 and .* 100000 Hz, for real echoes, got 1e"
     ):
         compress(real, bandwidth_hz=BAND)
     with pytest.raises(ValueError, match=r"bandwidth_hz must be .* <= 40000 Hz, got 50000"):
@@ -385,7 +385,7 @@ def test_real_echoes_need_their_band_inside_what_was_sampled():
         ({"tx_m": np.zeros((3, 3))}, ValueError, r"tx_m must have shape \(2, 3\)"),
         ({"rx_velocity_m_s": [np.inf, 0, 0]}, ValueError, "rx_velocity_m_s must be finite"),
         ({"sound_speed_m_s": -1}, ValueError, "sound_speed_m_s must be finite and > 0 m/s"),
-        ({"pulse": "chirp"}, TypeError, "pulse must be a Pulse or None, got str"),
+        ({"pulse": "chirp"}, TypeError, "pulse must be of type Pulse, got str"),
         ({"pulse": Pulse(2e6, 1e5, 1e-3)}, ValueError, r"the pulse's 2e\+06 Hz, got 1e\+06 Hz"),
     ],
 )

@@ -27,7 +27,7 @@ def test_a_carrier_above_a_quarter_of_the_rate_needs_a_band():
         (
             {"carrier_hz": 9e6},
             r"carrier_hz must be at most a quarter of the sample rate, 6\.25e\+06 Hz, .* "
-            r"got 9e\+06 Hz: give bandwidth_hz, at most 7e\+06 Hz",
+            r"got 9e\+06 Hz: give `bandwidth_hz`, at most 7e\+06 Hz",
         ),
         ({"carrier_hz": 9e6, "bandwidth_hz": 8e6}, "bandwidth_hz must be .*<= 7e"),
         ({"carrier_hz": 0}, "carrier_hz must be"),
@@ -37,7 +37,7 @@ def test_a_carrier_above_a_quarter_of_the_rate_needs_a_band():
         ({"sample_rate_hz": 1e301}, r"sample_rate_hz must be .* <= 1e\+15 Hz, got 1e\+301"),
         ({"sample_rate_hz": np.inf}, "sample_rate_hz must be finite"),
         ({"sample_rate_hz": -1.0}, r"sample_rate_hz must be .* > 0 .* Hz, got -1"),
-        ({"start_time_s": 1e300}, "makes .* cycles over"),
+        ({"start_time_s": 1e300}, "make at most .* cycles, .* over"),
         ({"start_time_s": np.nan}, "start_time_s must be finite"),
         ({"sound_speed_m_s": 0.0}, "sound_speed_m_s must be"),
         ({"sound_speed_m_s": 1e300}, r"sound_speed_m_s must be .* <= 3e\+08 m/s, got 1e\+300"),

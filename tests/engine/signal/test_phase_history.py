@@ -127,8 +127,11 @@ def test_oversampling_only_interpolates():
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"first_frequency_hz": 9.3}, "first_frequency_hz is 9.3 Hz, less than 1/100 of the band"),
-        ({"reference_range_m": -10.0}, "reference_range_m is negative, -10 m at least"),
+        (
+            {"first_frequency_hz": 9.3},
+            "`first_frequency_hz` is 9.3 Hz, less than 1/100 of the band",
+        ),
+        ({"reference_range_m": -10.0}, "`reference_range_m` is negative, -10 m at least"),
     ],
 )
 def test_slips_that_are_possible_are_a_warning(wrong, said):
@@ -146,25 +149,34 @@ def test_slips_that_are_possible_are_a_warning(wrong, said):
     [
         ({"samples": np.ones((3, 1), complex)}, "at least 2 frequencies, got 1"),
         ({"samples": np.ones((3, 4))}, "samples must be complex"),
-        ({"sign": 0}, "sign must be -1 or \\+1, got 0"),
-        ({"sign": 1.5}, "sign must be -1 or"),
-        ({"frequency_step_hz": -1e6}, "frequency_step_hz must be > 0, got -1e\\+06"),
-        ({"first_frequency_hz": [1e9, 0, 1e9]}, "first_frequency_hz must be > 0, got 0"),
+        ({"sign": 0}, "sign must be one of -1, 1, got 0"),
+        ({"sign": 1.5}, "sign must be one of -1, 1, got 1.5"),
+        ({"frequency_step_hz": -1e6}, "frequency_step_hz must be finite and > 0 Hz, got -1e\\+06"),
+        (
+            {"first_frequency_hz": [1e9, 0, 1e9]},
+            "first_frequency_hz must be finite and > 0 Hz, got 0",
+        ),
         ({"reference_range_m": [1.0, 2.0]}, "reference_range_m must have shape"),
         ({"reference_range_m": np.nan}, "reference_range_m must be finite"),
         ({"oversampling": 0.5}, "oversampling must be finite and >= 1"),
         ({"oversampling": 1e12}, "oversampling must be finite and >= 1 and <= 10000"),
         ({"window": "nonsense"}, "window must be 'none' or"),
         ({"sound_speed_m_s": 0}, "sound_speed_m_s must be"),
-        ({"first_frequency_hz": 1e300}, "first_frequency_hz must be <= 1e.15 Hz, got 1e.300"),
-        ({"first_frequency_hz": -1e9}, "first_frequency_hz must be > 0, got -1e"),
+        (
+            {"first_frequency_hz": 1e300},
+            "first_frequency_hz must be finite and <= 1e.15 Hz, got 1e.300",
+        ),
+        ({"first_frequency_hz": -1e9}, "first_frequency_hz must be finite and > 0 Hz, got -1e"),
         ({"first_frequency_hz": np.nan}, "first_frequency_hz must be finite"),
-        ({"frequency_step_hz": 1e300}, "frequency_step_hz must be <= 1e.15 Hz, got 1e.300"),
-        ({"frequency_step_hz": 1e308}, "frequency_step_hz must be <= 1e.15 Hz"),
-        ({"frequency_step_hz": 1e-300}, "makes .* cycles over"),
+        (
+            {"frequency_step_hz": 1e300},
+            "frequency_step_hz must be finite and <= 1e.15 Hz, got 1e.300",
+        ),
+        ({"frequency_step_hz": 1e308}, "frequency_step_hz must be finite and <= 1e.15 Hz"),
+        ({"frequency_step_hz": 1e-300}, "make at most .* cycles, .* over"),
         ({"frequency_step_hz": np.nan}, "frequency_step_hz must be finite"),
-        ({"reference_range_m": 1e300}, "makes .* cycles over 1e.300 m"),
-        ({"sound_speed_m_s": 1e-300}, "makes .* cycles over"),
+        ({"reference_range_m": 1e300}, "make at most .* cycles, .* over 1e.300 m"),
+        ({"sound_speed_m_s": 1e-300}, "make at most .* cycles, .* over"),
         ({"sound_speed_m_s": 1e300}, "sound_speed_m_s must be .* <= 3e.08 m/s, got 1e.300"),
     ],
 )

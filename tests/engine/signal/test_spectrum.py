@@ -133,7 +133,9 @@ def test_a_band_that_wraps_is_unwrapped_unless_two_gaps_compete(parts, centre, s
         warnings.simplefilter("always")
         spectrum = measure_spectrum(bands(*parts), GRID)
     assert bool(caught) == says
-    assert all("the band wraps around half the sample rate" in str(c.message) for c in caught)
+    assert all(
+        "the band of the lines wraps around half the sample rate" in str(c.message) for c in caught
+    )
     if centre is not None:
         assert abs((spectrum.centre - centre + 0.5) % 1 - 0.5) < 0.015
 

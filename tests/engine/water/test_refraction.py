@@ -253,7 +253,8 @@ def test_a_profile_must_reach_antennas_and_pixels():
 
 def test_a_shadow_zone_is_refused_with_its_range():
     lines = over(profile=SoundSpeed([0, 20, 30, 60], [1400, 1400, 1650, 1650]))
-    with pytest.raises(ValueError, match=r"sound_speed: no direct ray .* beyond \d+\.\d m"):
+    says = r"sound_speed must lead a direct ray to every pixel: no direct ray .* beyond \d+\.\d m"
+    with pytest.raises(ValueError, match=says):
         clsas.backproject(lines, GRID)
 
 
