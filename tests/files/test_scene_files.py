@@ -453,8 +453,8 @@ def test_a_track_file_that_is_no_text(tmp_path):
         ("[simulate]\nsnr_db = nan", "[simulate] snr_db must be finite"),
         ("[simulate]\nseed = -1", "[simulate] seed must be at least 0, got -1"),
         ("[simulate]\nrange_m = [5, 1]", "[simulate] range_m must be 0 <= near < far in m, got"),
-        ("[compress]\nwindow = 'foo'", "[compress] window must be 'none' or a window of scipy"),
-        ("[compress]\nwindow = []", "[compress] window must be 'none' or a window of scipy"),
+        ("[compress]\nwindow = 'foo'", "[compress] window must be 'none' or a window of `scipy"),
+        ("[compress]\nwindow = []", "[compress] window must be 'none' or a window of `scipy"),
         (
             "[compress]\noversampling = 0",
             "[compress] oversampling must be finite and >= 1 and <= 10000, got 0",

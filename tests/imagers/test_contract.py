@@ -246,7 +246,7 @@ def test_the_order_of_channels_does_not_matter(bound):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:lines are kept in single precision, not in half")
+@pytest.mark.filterwarnings("ignore:the lines are kept in single precision, not in half")
 @every_imager
 @pytest.mark.parametrize("scale", [1e-36, *also(1e-30, 1e-10, 1e10, 1e20), 1e30])
 def test_the_unit_of_the_samples_does_not_matter(bound, scale):

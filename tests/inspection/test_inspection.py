@@ -484,7 +484,7 @@ def test_a_carrier_in_khz_is_found_wherever_the_band_is(lines, middle_hz):
     assert found.wavelength_m == pytest.approx(1500 / 7.5e3, rel=0.1)  # at half of 15 kHz
     narrow = clsas.inspect(in_khz(lines, middle_hz, share=0.02))
     assert {"advance", "band"} <= set(names(narrow))
-    assert "carrier_hz in Hz (not kHz)" in narrow["advance"].remedy
+    assert "`carrier_hz` in Hz (not kHz)" in narrow["advance"].remedy
 
 
 @pytest.mark.slow
