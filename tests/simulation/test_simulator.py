@@ -660,7 +660,7 @@ def test_nothing_in_the_window():
         ({"tx_m": np.zeros((3, 3))}, r"rx_m must have shape \(3, 3\) .* got \(2, 3\)"),
         ({"rx_m": [np.nan, 0, 0]}, "rx_m must be finite"),
         ({"rx_velocity_m_s": [0, 2e3, 0]}, "rx_velocity_m_s must be slower than sound"),
-        ({"window": "square"}, "window must be 'none' or a window of scipy"),
+        ({"window": "square"}, "window must be 'none' or a window of `scipy"),
     ],
 )
 def test_bad_lines(arguments, message):
