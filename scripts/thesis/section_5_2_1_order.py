@@ -18,7 +18,7 @@ import chapter5
 import clsas
 from clsas.engine.factorized import candidates
 from clsas.engine.factorized.planner import Request, planned
-from clsas.engine.factorized.search import Allowed, Tree
+from clsas.engine.factorized.search import Choices, Division
 
 FACTORS = ((8, 2), (4, 4), (4, 2, 2), (16, 2), (8, 4), (8, 2, 2), (4, 4, 2))  # QR
 RATIOS = (1, 2)  # QI over QR, the same in each stage
@@ -55,8 +55,8 @@ def with_sides(
     taps = factorization.align.taps, factorization.aperture.filter.taps
     request = Request(scene.lines, scene.grid, tolerance_db=TOLERANCE_DB)
     # A search for such trees that finds one, however slow it is.
-    object.__setattr__(request, "allowed", Allowed(stages=(len(sides),)))
-    with mock.patch.object(candidates, "search", return_value=Tree(sides, *taps)):
+    object.__setattr__(request, "choices", Choices(stages=(len(sides),)))
+    with mock.patch.object(candidates, "search", return_value=Division(sides, *taps)):
         return planned(request.scene(), request, scene.device)[0]
 
 

@@ -23,7 +23,7 @@ from section_7_1 import SYSTEMS, System
 import clsas
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.factorized.planner import Request, planned
-from clsas.engine.factorized.search import Allowed
+from clsas.engine.factorized.search import Choices
 from clsas.measures.tradeoff import REFERENCE_DB
 
 TAPS = (2, 4, 6, 8)
@@ -49,7 +49,7 @@ def interpolated(system: System, taps: int, tolerance_db: float, device: Device)
     """Return the plan with some taps along the aperture; any taps in range, any stages."""
     request = Request(system.lines, system.grid, tolerance_db=tolerance_db, beam=system.beam)
     # `clsas.plan` offers 4, 6 and 8 taps only.
-    object.__setattr__(request, "allowed", Allowed(aperture_taps=(taps,)))
+    object.__setattr__(request, "choices", Choices(aperture_taps=(taps,)))
     return planned(request.scene(), request, device)[0]
 
 

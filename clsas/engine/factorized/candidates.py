@@ -1,9 +1,9 @@
 """The fastest factorization within a tolerance and a memory limit.
 
-The search proposes the fastest tree for the error that is left to its filters. The prediction then
-adds all other errors, such as those of unevenly spaced virtual channels. If their sum exceeds the
-tolerance, the next candidate has denser virtual channels, or more accurate filters; if it needs too
-much memory, the next one has smaller roots. The candidates are therefore tried in the order of
+The search proposes the fastest division for the error that is left to its filters. The prediction
+then adds all other errors, such as those of unevenly spaced virtual channels. If their sum exceeds
+the tolerance, the next candidate has denser virtual channels, or more accurate filters; if it needs
+too much memory, the next one has smaller roots. The candidates are therefore tried in the order of
 their times, and the first that meets both limits is accepted.
 """
 
@@ -49,14 +49,14 @@ from clsas.engine.factorized.plan import (
     Factorization,
     Plan,
     Prediction,
-    Stage,
+    StagePrediction,
     Work,
 )
 from clsas.engine.factorized.sampled import SampledRoots, Side
 from clsas.engine.factorized.search import (
-    Allowed,
+    Choices,
+    Division,
     Sizes,
-    Tree,
     all_sizes,
     half_range_extents_m,
     largest_root,
@@ -146,7 +146,7 @@ class _Trial:
 
     Attributes
     ----------
-    choices : Allowed
+    choices : Choices
         Taps and numbers of stages to choose from.
     most_root : (rows, columns)
         Size of the largest roots.
@@ -155,23 +155,23 @@ class _Trial:
     reserved : float
         Error power that is reserved for everything but filters and roots.
     least_leaf_pixels : int
-    tree : Tree or None
-        The fastest tree within the limits; None if it must be searched for.
+    division : Division or None
+        The fastest division within the limits; None if it must be searched for.
     oversampling : tuple of float
         Density of virtual channels over that which the filter requires, stage by stage.
     """
 
-    choices: Allowed
+    choices: Choices
     most_root: Side
     beam_cycles: float
     reserved: float
     least_leaf_pixels: int = 1
-    tree: Tree | None = None
+    division: Division | None = None
     oversampling: tuple[float, ...] = ()
 
 
-def fastest(
-    roots: SampledRoots, conditions: Conditions, seconds: float, choices: Allowed
+def fastest_plan(
+    roots: SampledRoots, conditions: Conditions, seconds: float, choices: Choices
 ) -> Outcome:
     """Return the fastest plan within a tolerance, if it takes less than `seconds`.
 
@@ -187,15 +187,15 @@ def fastest(
     trial: _Trial | None = _Trial(choices, most_root, beam_cycles, candidates.reserved)
     least_bytes = math.inf
     while trial is not None:
-        tree = trial.tree
-        if tree is None:
+        division = trial.division
+        if division is None:
             trial = candidates.searched(trial)
             continue
-        filters = candidates.filters(trial, tree)
+        filters = candidates.filters(trial, division)
         if filters is None:
-            trial = candidates.with_fewer_stages(trial, tree)
+            trial = candidates.with_fewer_stages(trial, division)
             continue
-        found, spacing = candidates.predicted(trial, tree, filters)
+        found, spacing = candidates.predicted(trial, division, filters)
         if found.predicted_seconds >= seconds:
             break
         if found.predicted_error_db > candidates.tolerance_db:
@@ -204,7 +204,7 @@ def fastest(
             least_bytes = min(least_bytes, found.memory_bytes)
             rows, columns = found.sides[0]
             smaller = (rows // 2, columns) if rows > columns else (rows, columns // 2)
-            trial = replace(trial, most_root=smaller, tree=None)
+            trial = replace(trial, most_root=smaller, division=None)
         else:
             return Outcome(found, roots.sampled.track, is_off_track=is_off_track)
     return Outcome(least_bytes=least_bytes, is_off_track=is_off_track)
@@ -245,14 +245,14 @@ class _Candidates:
         return in_db(self.allowed - spent) - self.margin_db
 
     def searched(self, trial: _Trial) -> _Trial | None:
-        """Return the trial with the fastest tree; None if there is no tree."""
+        """Return the trial with the fastest division; None if there is no division."""
         filters_db = self.filters_db(trial.reserved, trial.most_root)
         if filters_db is None:
             return None
         if trial.most_root not in self._sizes:
             sizes = all_sizes(self.roots, trial.most_root, self.conditions.device)
             self._sizes[trial.most_root] = sizes
-        tree = search(
+        division = search(
             self._sizes[trial.most_root],
             filters_db,
             trial.least_leaf_pixels,
@@ -260,19 +260,19 @@ class _Candidates:
             self.conditions.costs,
             trial.choices,
         )
-        if tree is None:
+        if division is None:
             return None
-        return replace(trial, tree=tree, oversampling=(1.0,) * len(tree.sides))
+        return replace(trial, division=division, oversampling=(1.0,) * len(division.sides))
 
-    def filters(self, trial: _Trial, tree: Tree) -> Filters | None:
-        """Return the filters of a trial's tree; None if none are accurate enough."""
+    def filters(self, trial: _Trial, division: Division) -> Filters | None:
+        """Return the filters of a trial's division; None if none are accurate enough."""
         # Roots are often smaller than the largest allowed, which leaves more to filters.
-        filters_db = self.filters_db(trial.reserved, tree.sides[0])
+        filters_db = self.filters_db(trial.reserved, division.sides[0])
         if filters_db is None:
             return None
-        sampled, stages = self.roots.sampled, len(tree.sides)
+        sampled, stages = self.roots.sampled, len(division.sides)
         spectrum = self.roots.stretch.spectrum(sampled.scene.spectrum)
-        choice = tree.filters(spectrum, filters_db)
+        choice = division.filters(spectrum, filters_db)
         if choice is None:
             return None
         key = choice, stages, filters_db
@@ -283,10 +283,10 @@ class _Candidates:
         return self._designs[key]
 
     def predicted(
-        self, trial: _Trial, tree: Tree, filters: Filters
+        self, trial: _Trial, division: Division, filters: Filters
     ) -> tuple[Plan, tuple[float, ...]]:
         """Return the plan of a candidate, and its errors of uneven spacing, stage by stage."""
-        sides = tree.sides
+        sides = division.sides
         if sides[0] not in self._spacing:
             self._spacing[sides[0]] = SpacingErrors(self.roots.within(sides[0]))
         spacing = self._spacing[sides[0]]
@@ -320,17 +320,17 @@ class _Candidates:
         )
         return plan, by_stage
 
-    def with_fewer_stages(self, trial: _Trial, tree: Tree) -> _Trial | None:
+    def with_fewer_stages(self, trial: _Trial, division: Division) -> _Trial | None:
         """Return a trial of fewer stages, whose larger subimages have more virtual channels.
 
         This helps if the virtual channels are as dense as allowed. Otherwise return None: no other
         refinement is left.
         """
-        fewer = tuple(n for n in trial.choices.stages if n < len(tree.sides))
+        fewer = tuple(n for n in trial.choices.stages if n < len(division.sides))
         if not fewer or _MOST_OVERSAMPLING not in trial.oversampling[:-1]:
             return None
         choices = replace(trial.choices, stages=fewer)
-        return replace(trial, choices=choices, tree=None, reserved=self.reserved)
+        return replace(trial, choices=choices, division=None, reserved=self.reserved)
 
     def more_accurate(
         self, trial: _Trial, spacing: tuple[float, ...], found: Plan
@@ -359,7 +359,7 @@ class _Candidates:
                 )
         if excess[-1] and trial.oversampling[-1] == _MOST_OVERSAMPLING:
             # Smaller leaves have fewer virtual channels, less evenly spaced.
-            return replace(trial, least_leaf_pixels=2 * math.prod(last), tree=None)
+            return replace(trial, least_leaf_pixels=2 * math.prod(last), division=None)
         if any(excess) and max(trial.oversampling) < _MOST_OVERSAMPLING:
             return replace(trial, oversampling=_denser(trial.oversampling, excess, share))
         too_much = power(-self.margin_db) * (power(found.predicted_error_db) - allowed)
@@ -499,7 +499,7 @@ def _plan(
     method: Factorization | ExactImage,
     conditions: Conditions,
     memory_bytes: int,
-    stages: Sequence[Stage],
+    stages: Sequence[StagePrediction],
     work: Work,
     errors: ErrorBudget,
 ) -> Plan:
@@ -537,7 +537,7 @@ def _work(
     width: int,
     half_precision: bool,
     singly: bool,
-) -> tuple[list[Work], list[Stage]]:
+) -> tuple[list[Work], list[StagePrediction]]:
     """Return the work of every stage and of the leaves, and their descriptions, without times."""
     sampled, scene = roots.sampled, roots.sampled.scene
     work, stages = [], []
@@ -559,7 +559,9 @@ def _work(
         work.append(of_stage)
         operations = float(combined * samples)
         stages.append(
-            Stage(*side, count, round(predicted.count), samples, operations, in_db(error), 0.0)
+            StagePrediction(
+                *side, count, round(predicted.count), samples, operations, in_db(error), 0.0
+            )
         )
     leaf, virtual = sides[-1], channels[-1].count
     count, pixels = sampled.count(leaf), sampled.padded_pixels(leaf, width)
@@ -577,7 +579,9 @@ def _work(
     work.append(of_leaves)
     operations = float(count * pixels * virtual)
     samples = levels[-1].length
-    stages.append(Stage(*leaf, count, round(virtual), samples, operations, final.scatter_db, 0.0))
+    stages.append(
+        StagePrediction(*leaf, count, round(virtual), samples, operations, final.scatter_db, 0.0)
+    )
     return work, stages
 
 

@@ -32,7 +32,7 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.version import __version__
 from clsas.engine.device.buffers import padded_length, upsampled_lines
 from clsas.engine.device.device import Device, DeviceInfo
-from clsas.engine.factorized.candidates import Conditions, fastest
+from clsas.engine.factorized.candidates import Conditions, fastest_plan
 from clsas.engine.factorized.costs import (
     Costs,
     ExactPrediction,
@@ -42,7 +42,7 @@ from clsas.engine.factorized.costs import (
 )
 from clsas.engine.factorized.plan import Plan, Work
 from clsas.engine.factorized.sampled import SampledRoots, SampledScene
-from clsas.engine.factorized.search import Allowed
+from clsas.engine.factorized.search import Choices
 from clsas.engine.forming import form, form_exactly, scene_of_plan
 from clsas.engine.scene import Scene
 from clsas.engine.signal import interpolation
@@ -78,7 +78,7 @@ _CHANNELS = 192
 _LEAST_PIXELS, _MOST_PIXELS = 192, 1024  # along either side of the exact images
 _TOLERANCE_DB = -45.0
 _PLANNED_WITH = Costs(pixel_ns=1e3, point_ns=1e3)  # so that an image is factorized
-_ALLOWED = Allowed(align_taps=(4,), aperture_taps=(6,), stages=(2,))
+_CHOICES = Choices(align_taps=(4,), aperture_taps=(6,), stages=(2,))
 _measuring = threading.Lock()
 
 
@@ -270,7 +270,7 @@ def _built(device: Device, side: int) -> tuple[_Images, float]:
         _PLANNED_WITH,
         device.info.memory_bytes // 2,
     )
-    found = fastest(SampledRoots.of(sampled, None), conditions, math.inf, _ALLOWED).plan
+    found = fastest_plan(SampledRoots.of(sampled, None), conditions, math.inf, _CHOICES).plan
     assert found is not None  # the scene is made so
     # A kernel takes twice as long if it is the first to touch a buffer, which matters less in large
     # images, of many batches.

@@ -174,7 +174,7 @@ class Plan:
         return self.method.half_precision
 
     @property
-    def stages(self) -> tuple[Stage, ...]:
+    def stages(self) -> tuple[StagePrediction, ...]:
         """Predictions for each stage and, last, for the backprojection."""
         return self.prediction.stages
 
@@ -507,7 +507,7 @@ class Prediction:
         measurement; or "default".
     costs_measured : str
         Time of that measurement, UTC, in ISO 8601; "" without one.
-    stages : tuple of Stage
+    stages : tuple of StagePrediction
         All stages and, last, the backprojection; empty for an exact image.
     work : Work
         Counted operations, from which the time follows.
@@ -520,7 +520,7 @@ class Prediction:
     exact_seconds: float
     memory_bytes: int
     device: str
-    stages: tuple[Stage, ...]
+    stages: tuple[StagePrediction, ...]
     work: Work
     errors: ErrorBudget
     cost_source: CostSource = "given"
@@ -534,7 +534,7 @@ class Prediction:
         if len(stages) > _MOST_STAGES + 1:
             raise ArgumentError("stages", f"be at most {_MOST_STAGES + 1}", len(stages))
         for number, stage in enumerate(stages):
-            validate.instance(f"stages[{number}]", stage, Stage)
+            validate.instance(f"stages[{number}]", stage, StagePrediction)
         object.__setattr__(self, "stages", tuple(stages))
         _check(
             self,
@@ -555,7 +555,7 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Stage:
+class StagePrediction:
     """Predicted work, error and time of one stage, or of the backprojection at the end.
 
     Attributes
@@ -922,7 +922,7 @@ def _report(plan: Plan) -> Report:
     return Report(parts)
 
 
-def _table(stages: tuple[Stage, ...]) -> Table:
+def _table(stages: tuple[StagePrediction, ...]) -> Table:
     """Return the table of stages, of which the last is the backprojection."""
     headings = (
         "stage", "subimages", "rows x columns", "channels", "samples", "operations", "error",

@@ -31,7 +31,7 @@ from clsas.engine.factorized.candidates import (
     Conditions,
     Outcome,
     exact_plan,
-    fastest,
+    fastest_plan,
     predicted_plan,
 )
 from clsas.engine.factorized.costs import (
@@ -45,7 +45,7 @@ from clsas.engine.factorized.errors import MARGIN_DB, leaf_error, nearest_errors
 from clsas.engine.factorized.filters import ALIGN_TAPS
 from clsas.engine.factorized.plan import UNREACHED, ErrorBudget, Plan
 from clsas.engine.factorized.sampled import SampledRoots, SampledScene, Side, points_at_m
-from clsas.engine.factorized.search import MOST_STAGES, Allowed
+from clsas.engine.factorized.search import MOST_STAGES, Choices
 from clsas.engine.factorized.track import MeanTrack, shapes_after
 from clsas.engine.factorized.virtual_channels import NearestBeams
 from clsas.engine.scene import Scene
@@ -105,7 +105,7 @@ class Request:
         The tolerance, also if it was given in wavelengths; None if stages were given.
     stages : sequence of (QR, QI) or None
     memory_bytes : int or None
-    allowed : Allowed or None
+    choices : Choices or None
         Filters and numbers of stages to choose from; None if the search is free.
     """
 
@@ -120,7 +120,7 @@ class Request:
     taps: InitVar[tuple[int, int] | None] = None
     depth: InitVar[int | None] = None
     full_model: Annotated[bool, Flag(help="Model every effect, however small.")] = False
-    allowed: Allowed | None = field(init=False, default=None)
+    choices: Choices | None = field(init=False, default=None)
 
     def __post_init__(
         self,
@@ -146,8 +146,8 @@ class Request:
         self._set("tolerance_db", tolerance_in_db(self.tolerance_db, tolerance_wavelengths))
         if self.stages is not None:
             self._set("stages", _stages_within(self.stages, self.lines, self.grid))
-        self._set("allowed", _allowed(taps, depth))
-        if self.allowed is not None and self.stages is not None:
+        self._set("choices", _choices(taps, depth))
+        if self.choices is not None and self.stages is not None:
             hint = "`taps` and `depth` go with a tolerance"
             raise ArgumentError("stages", "be left out with `taps` or `depth`", hint=hint)
         if self.costs is not None:
@@ -234,7 +234,7 @@ def _stages_within(
     return pairs
 
 
-def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
+def _choices(taps: tuple[int, int] | None, depth: int | None) -> Choices | None:
     """Return the requested filters and stages; None if the search is free."""
     if taps is None and depth is None:
         return None
@@ -251,7 +251,7 @@ def _allowed(taps: tuple[int, int] | None, depth: int | None) -> Allowed | None:
         fields = {"align_taps": (align,), "aperture_taps": (aperture,)}
     if depth is not None:
         fields["stages"] = (validate.count("depth", depth, most=MOST_STAGES),)
-    return Allowed(**fields)
+    return Choices(**fields)
 
 
 # The plan
@@ -331,9 +331,9 @@ def _chosen(
         return _with_given_stages(request.stages, roots, conditions)
     exact_fits, outcome, reason = _exact_fits(request, exact), Outcome(), _SOON_DONE
     if _worth_a_search(request, exact, conditions.costs):
-        is_free = exact_fits and request.allowed is None
+        is_free = exact_fits and request.choices is None
         to_beat_s = _WORTH * conditions.costs.seconds(exact.work) if is_free else math.inf
-        outcome = _fastest_of_shapes(roots, conditions, to_beat_s, request.allowed or Allowed())
+        outcome = _fastest_of_shapes(roots, conditions, to_beat_s, request.choices or Choices())
         if outcome.plan is not None:
             return outcome.plan, outcome.track
         reason = _NOT_FASTER
@@ -377,7 +377,7 @@ def _worth_a_search(request: Request, exact: ExactPrediction, costs: Costs) -> b
     """Return whether a search may pay, or is needed because the exact image does not fit."""
     if request.stages is not None:
         return False
-    is_needed = not _exact_fits(request, exact) or request.allowed is not None
+    is_needed = not _exact_fits(request, exact) or request.choices is not None
     return is_needed or bool(costs.seconds(exact.work) > _SEARCH_S)
 
 
@@ -411,9 +411,9 @@ def _completed(found: Plan, request: Request, scene: Scene, costs: KnownCosts) -
 
 
 def _fastest_of_shapes(
-    roots: SampledRoots | None, conditions: Conditions, seconds: float, choices: Allowed
+    roots: SampledRoots | None, conditions: Conditions, seconds: float, choices: Choices
 ) -> Outcome:
-    """Return the fastest plan with a mean track of any shape: see `fastest`.
+    """Return the fastest plan with a mean track of any shape: see `fastest_plan`.
 
     Strips and sheets are tried where channels lie too far from one curve for roots as large as
     the image.
@@ -448,15 +448,15 @@ def _fastest_unless_hindered(
     limits: tuple[float, float] | None,
     conditions: Conditions,
     seconds: float,
-    choices: Allowed,
+    choices: Choices,
 ) -> Outcome:
-    """Return the fastest plan with one mean track, unless the beam hinders any: see `fastest`."""
+    """Return the fastest plan with one mean track, unless the beam hinders any."""
     hindrance = obstacle(sampled)
     if hindrance:
         return Outcome(obstacle=hindrance)
     assert conditions.tolerance_db is not None
     limits = trimmed(sampled, limits, EDGES_SHARE * power(conditions.tolerance_db))
-    return fastest(SampledRoots.of(sampled, limits), conditions, seconds, choices)
+    return fastest_plan(SampledRoots.of(sampled, limits), conditions, seconds, choices)
 
 
 # Plans of given stages: nearest beams, as in chapter 4 of the thesis

@@ -64,7 +64,7 @@ _SPARE_SAMPLES = 16  # of a line, for filters and padding; twice changes times b
 
 
 @dataclass(frozen=True)
-class Allowed:
+class Choices:
     """Taps of filters and numbers of stages that a search may choose from."""
 
     align_taps: tuple[int, ...] = ALIGN_TAPS
@@ -73,7 +73,7 @@ class Allowed:
 
 
 @dataclass(frozen=True)
-class Tree:
+class Division:
     """Sizes of subimages from the roots to the leaves, and taps of the filters between them."""
 
     sides: tuple[Side, ...]
@@ -95,13 +95,13 @@ def search(
     leaf_pixels: int,
     beam_cycles: float,
     costs: Costs,
-    allowed: Allowed,
-) -> Tree | None:
+    choices: Choices,
+) -> Division | None:
     """Return the fastest tree whose filters are, together, as accurate as `filters_db`.
 
     Return None if there is no such tree whose leaves have at least `leaf_pixels` pixels.
     """
-    options = all_options(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed)
+    options = all_options(sizes, filters_db, leaf_pixels, beam_cycles, costs, choices)
     if options is None or not sizes.pairs:
         return None
     # The phase rate is lowest at a root's centre, so that these are lower bounds.
@@ -126,7 +126,7 @@ def search(
     path = options.path(sizes.in_root(root), option, root)
     choice = options.choices[option]
     sides = tuple(sizes.pairs[i] for i in path)
-    return Tree(sides, choice.align_taps, choice.aperture_taps, choice.dimensions)
+    return Division(sides, choice.align_taps, choice.aperture_taps, choice.dimensions)
 
 
 # Sizes of subimages
@@ -490,23 +490,23 @@ def all_options(
     leaf_pixels: int,
     beam_cycles: float,
     costs: Costs,
-    allowed: Allowed,
+    choices: Choices,
 ) -> Options | None:
     """Return all options whose filters are as accurate as `filters_db`; None if there are none."""
     roots, counts = sizes.roots, sizes.counts
     scene, track = roots.sampled.scene, roots.sampled.track
     lines, spectrum = scene.lines, scene.spectrum
-    choices, stages, dimensions = [], [], 1 + track.is_sheet
+    rates, stages, dimensions = [], [], 1 + track.is_sheet
     aligned = roots.stretch.spectrum(spectrum)
-    most_first = sorted(allowed.stages, reverse=True)
-    for number, align, aperture in product(most_first, allowed.align_taps, allowed.aperture_taps):
+    most_first = sorted(choices.stages, reverse=True)
+    for number, align, aperture in product(most_first, choices.align_taps, choices.aperture_taps):
         choice = choose(aligned, align, aperture, number, filters_db, dimensions)
         if choice is not None:
-            choices.append(choice)
+            rates.append(choice)
             stages.append(number)
-    if not choices:
+    if not rates:
         return None
-    numbers = [(c.upsampling, c.final_taps, c.stage_taps) for c in choices]
+    numbers = [(c.upsampling, c.final_taps, c.stage_taps) for c in rates]
     rate, final_taps, taps = np.array(numbers).T[..., None]
     samples = 2 * sizes.half_range_extent_m * rate / lines.range_step_m
     samples += final_taps + _SPARE_SAMPLES
@@ -522,22 +522,22 @@ def all_options(
     pixels = sizes.padded_pixels
     leaves_s = {
         n: costs.seconds(backprojecting_leaves(counts, pixels, n, tiled=tiled, weighted=weighted))
-        for n in {choice.final_taps for choice in choices}
+        for n in {choice.final_taps for choice in rates}
     }
     leaf = sizes.leaf_error <= _LEAF_SHARE * power(filters_db)
     leaf &= np.prod(sizes.sides, axis=1) >= leaf_pixels
-    density = np.array([2 * choice.oversampling for choice in choices])
+    density = np.array([2 * choice.oversampling for choice in rates])
     # In trees of several stages, filters extend past the ends as if they had more taps.
     further = np.where(np.array(stages) > 1, OVERHANG, 1.0)
-    aperture_taps = further * [choice.aperture_taps for choice in choices]
+    aperture_taps = further * [choice.aperture_taps for choice in rates]
     return Options(
-        choices,
+        rates,
         np.array(stages),
         density[:, None, None],
         np.array(roots.virtual_channels(aperture_taps, 0.0, 0.0))[:, None, None],
         channel_s=np.asarray(costs.seconds(combining(counts, samples, taps, given=False))),
         subimages_s=np.asarray(costs.seconds(Work(subimage=counts))),
-        leaves_s=np.where(leaf, np.array([leaves_s[c.final_taps] for c in choices]), np.inf),
+        leaves_s=np.where(leaf, np.array([leaves_s[c.final_taps] for c in rates]), np.inf),
         roots_s=np.asarray(costs.seconds(first_stage)),
         leaf_beam_cycles=beam_cycles * sizes.beam_cycles,
         rows=aperture_taps[:, None],

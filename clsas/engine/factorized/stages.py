@@ -113,7 +113,7 @@ class FactorizedImager:
         geometry = self.geometry
         uploaded = in_enough_precision(uploaded, lines, geometry, device, largest)
         work = Slot(device)
-        stages = Stages(uploaded, geometry, device, work)
+        stages = StageKernels(uploaded, geometry, device, work)
         leaves = self._leaves(uploaded, work, pixels)
 
         # Some batches are under way at a time, so that the device works on one sector while the
@@ -297,7 +297,7 @@ def _imaged_rms(geometry: Geometry, lines: RangeLines) -> float:
     return math.sqrt(total / max(count, 1))
 
 
-class Stages:
+class StageKernels:
     """The stages of an image on a device: from the raw lines to those of the leaves.
 
     Parameters

@@ -28,7 +28,7 @@ _SMOOTHED_CHANNELS = 2.5  # rms width over which the spacing is smoothed, virtua
 _LEAST_RATE = 0.3  # lower bound of phase rates, relative to their mean over the track
 _LEAST_CHANNELS = 2.0  # lower bound of the virtual channels between the ends of the track
 
-Stages = Sequence[tuple[int, int]]
+ThesisStages = Sequence[tuple[int, int]]
 """(QR, QI) of each stage: the number of lines summed, and the divisor of both image sides."""
 
 
@@ -696,7 +696,7 @@ class NearestBeams:
 
 
 def stage_errors_m(
-    stages: Stages, aperture_m: float, image_m: float, nearest_m: float
+    stages: ThesisStages, aperture_m: float, image_m: float, nearest_m: float
 ) -> list[float]:
     """Return the largest range error of each stage [45]; those of all stages add up.
 
@@ -734,7 +734,7 @@ def stage_errors_m(
 
 
 def operations(
-    stages: Stages, channels: int, samples: Sequence[int], pixels: int, gamma: float = 0.0
+    stages: ThesisStages, channels: int, samples: Sequence[int], pixels: int, gamma: float = 0.0
 ) -> list[float]:
     """Return the operations of each stage and, last, of the backprojection [44].
 

@@ -9,7 +9,7 @@ from factorizing import BEAMS, around, over
 from clsas.engine.device.device import open_device
 from clsas.engine.factorized import search
 from clsas.engine.factorized.costs import Costs
-from clsas.engine.factorized.search import Allowed, all_sizes
+from clsas.engine.factorized.search import Choices, all_sizes
 
 
 def priced(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed):
@@ -39,7 +39,7 @@ def sizes(request):
 def cost_of(tree, sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed):
     """The time of a tree, summed stage by stage."""
     taps = (tree.align_taps,), (tree.aperture_taps,)
-    allowed = Allowed(*taps, stages=(len(tree.sides),))
+    allowed = Choices(*taps, stages=(len(tree.sides),))
     sizes, options = priced(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed)
     (choice,) = options.choices
     path = [sizes.pairs.index(side) for side in tree.sides]
@@ -64,19 +64,19 @@ def cost_of(tree, sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed):
 @pytest.mark.parametrize("filters_db", [-20.0, -55.0])
 @pytest.mark.parametrize("costs", [Costs(), Costs(leaf_ns=50.0), Costs(reference_ns=1e5)])
 def test_nothing_is_faster_than_what_is_found(sizes, filters_db, costs):
-    arguments = (sizes, filters_db, 1, 0.5, costs, Allowed())
+    arguments = (sizes, filters_db, 1, 0.5, costs, Choices())
     tree = search.search(*arguments)
     assert cost_of(tree, *arguments) == pytest.approx(everything_tried(*arguments), rel=1e-9)
 
 
 def test_leaves_are_as_large_as_asked(sizes):
     for pixels in (1, 512, 4096):
-        tree = search.search(sizes, -40.0, pixels, 0.5, Costs(), Allowed())
+        tree = search.search(sizes, -40.0, pixels, 0.5, Costs(), Choices())
         assert math.prod(tree.sides[-1]) >= pixels
 
 
 def test_without_any_size_that_fits_there_is_none(sizes):
-    arguments = (0.5, Costs(), Allowed())
+    arguments = (0.5, Costs(), Choices())
     none = all_sizes(sizes.roots, (8, 2), open_device())
     assert search.search(none, -40.0, 1, *arguments) is None
     assert search.search(sizes, -40.0, 10**9, *arguments) is None
