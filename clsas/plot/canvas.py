@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from clsas.engine.data import validate
 from clsas.engine.data.atomic import replacing
 from clsas.engine.data.extras import needed
+from clsas.engine.data.validate import ArgumentError
 from clsas.files.sidecars import remove_sidecars
 
 if TYPE_CHECKING:
@@ -173,7 +174,7 @@ def drawable(name: str, value: object) -> str:
             MathTextParser("path").parse(given)
         except ValueError as error:
             reason = str(error).splitlines()[-1]
-            raise ValueError(f"{name} must be text or valid mathematics: {reason}") from None
+            raise ArgumentError(name, "be text or valid mathematics", hint=reason) from None
     return given
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from clsas.engine.data import validate
 from clsas.engine.data.extras import needed
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 
 if TYPE_CHECKING:
     from matplotlib.colors import Colormap
@@ -46,12 +47,13 @@ def colour_map(name: str | Colormap) -> Colormap:
     if isinstance(name, Colormap):
         return name
     if not isinstance(name, str):
-        raise TypeError(f"colour_map must be a name or a Colormap, got {validate.shown(name)}")
+        raise ArgumentTypeError("colour_map", "be a name or a `Colormap`", validate.shown(name))
     if name == "sonar":
         return LinearSegmentedColormap.from_list("sonar", _SONAR, 256)
     if name not in colormaps:
-        raise ValueError(
-            "colour_map must be 'sonar' or one of matplotlib's, such as 'inferno', 'gray', "
-            f"'copper' or 'cividis', got {validate.shown(name)}"
+        raise ArgumentError(
+            "colour_map",
+            "be 'sonar' or one of matplotlib's, such as 'inferno', 'gray', 'copper' or 'cividis'",
+            validate.shown(name),
         )
     return colormaps[name]

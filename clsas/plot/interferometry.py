@@ -11,6 +11,7 @@ from scipy.ndimage import distance_transform_edt
 
 from clsas.engine.data import validate
 from clsas.engine.data.grid import Grid
+from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.interferogram import Interferogram
 from clsas.interferometry.result import Heights
 from clsas.plot import colours
@@ -91,7 +92,7 @@ def heights(heights: Heights, *, colour_map: str | Colormap = "viridis", title: 
     validate.instance("heights", heights, Heights)
     grid, known = heights.image.grid, heights.mask
     if not known.any():
-        raise ValueError("heights must have at least one pixel that is not masked")
+        raise ArgumentError("heights", "have at least one pixel that is not masked")
     height_m, sd_m = (np.where(known, each, 0.0) for each in (heights.height_m, heights.sd_m))
     title = drawable("title", title)
     chosen = colours.colour_map(colour_map)

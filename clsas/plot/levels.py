@@ -16,6 +16,7 @@ from clsas.engine.data.decibels import level_db
 from clsas.engine.data.extras import is_installed
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.plot.canvas import (
     axis_label,
     drawable,
@@ -70,11 +71,11 @@ class Scale:
                 put("dynamic_range_db", validate.dynamic_range_db(self.dynamic_range_db))
             return
         if self.dynamic_range_db is not None:
-            raise ValueError("dynamic_range_db and percentiles exclude each other, got both")
+            raise ArgumentError("percentiles", "be left out if `dynamic_range_db` is given")
         given = validate.entries("percentiles", self.percentiles, "(low, high)")
         if len(given) != 2:
-            got = validate.shown(self.percentiles)
-            raise TypeError(f"percentiles must be (low, high), got {got}")
+            shown = validate.shown(self.percentiles)
+            raise ArgumentTypeError("percentiles", "be (low, high)", shown)
         low = validate.number("low of percentiles", given[0], least=0.0, below=100.0)
         put(
             "percentiles",
@@ -175,7 +176,7 @@ def image(
     """
     validate.instance("image", image, Image)
     if image.grid.points_m is not None:
-        raise ValueError("image must be on a plane or height map to be drawn, got points")
+        raise ArgumentError("image", "be on a plane or height map to be drawn", "points")
     scale = Scale(dynamic_range_db, percentiles, reference, colour_map)
     for name, flag in {
         "colour_bar": colour_bar, "north_arrow": north_arrow, "scale_bar": scale_bar,

@@ -9,6 +9,7 @@ import numpy as np
 
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.reprs import quantity
+from clsas.engine.data.validate import ArgumentError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,7 +33,7 @@ def draw_north(axes: Axes, grid: Grid) -> None:
     from matplotlib.patheffects import withStroke
 
     if grid.georeference is None:
-        raise ValueError("north_arrow needs an image with a georeference, got one without")
+        raise ArgumentError("north_arrow", "be off for an image without a georeference")
     north = (
         grid.georeference.from_map([0.0, 1.0, 0.0])[:2]
         - grid.georeference.from_map([0.0, 0.0, 0.0])[:2]
@@ -94,7 +95,7 @@ def _direction(grid: Grid, side: int) -> np.ndarray:
         step_m = np.eye(3)["xyz".index(axis.name)]
     length = math.hypot(*step_m[:2])
     if length <= _HORIZONTAL * np.linalg.norm(step_m):
-        raise ValueError("north_arrow needs an image that is not vertical")
+        raise ArgumentError("north_arrow", "be off for a vertical image")
     return step_m[:2] / length
 
 

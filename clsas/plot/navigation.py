@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.image import Image
+from clsas.engine.data.validate import ArgumentError
 from clsas.navigation.autofocus import Autofocus
 from clsas.navigation.micronavigation import Micronavigation
 from clsas.plot.canvas import new_figure
@@ -145,7 +146,7 @@ def _edges_m(found: Micronavigation, range_m: tuple[float, float] | None) -> NDA
     if range_m is not None:
         near_m, far_m = validate.array("range_m", range_m, np.float64, (2,))
         if not near_m < far_m:
-            raise ValueError(f"range_m must be near < far in m, got ({near_m:g}, {far_m:g})")
+            raise ArgumentError("range_m", "be near < far in m", (float(near_m), float(far_m)))
     elif windows > 1:
         half_m = float(middles_m[1] - middles_m[0]) / 2
         near_m, far_m = middles_m[0] - half_m, middles_m[-1] + half_m
@@ -208,7 +209,9 @@ def before_and_after(before: Image, after: Image, **options: Any) -> Figure:
     validate.instance("before", before, Image)
     validate.instance("after", after, Image)
     if before.shape != after.shape:
-        raise ValueError(f"after must have the pixels of before, {before.shape}, got {after.shape}")
+        raise ArgumentError(
+            "after", f"have the pixels of `before`, {before.shape}", str(after.shape)
+        )
     largest = max(float(np.abs(each.pixels).max()) for each in (before, after)) or 1.0
     scale = Scale(reference=largest, **options)
     high = height_per_width(before)

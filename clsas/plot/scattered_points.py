@@ -8,6 +8,7 @@ import numpy as np
 
 from clsas.engine.data import validate
 from clsas.engine.data.image import Image
+from clsas.engine.data.validate import ArgumentError
 from clsas.plot.canvas import axis_label, drawable, length_unit, new_figure, plain_ticks
 from clsas.plot.colours import COLOUR_MAP
 from clsas.plot.colours import colour_map as checked_colour_map
@@ -51,7 +52,7 @@ def points(
     """
     validate.instance("image", image, Image)
     if image.grid.points_m is None:
-        raise ValueError("image must be on points, got one on a plane or height map")
+        raise ArgumentError("image", "be on points", "one on a plane or height map")
     scale = Scale(dynamic_range_db, percentiles, reference, colour_map)
     title = drawable("title", title)
     level = image.db(reference=reference).ravel()

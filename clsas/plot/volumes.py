@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
+from clsas.engine.data.validate import ArgumentError
 from clsas.plot.canvas import axis_label, drawable, figure_class, length_unit
 from clsas.plot.levels import Scale, add_colour_bar, draw_levels, edges
 
@@ -92,7 +93,7 @@ def volume(
     title = drawable("title", title)
     scale = Scale(**options)
     if at is not None and kind != "slices":
-        raise ValueError(f"at goes with kind 'slices', got kind {kind!r}")
+        raise ArgumentError("at", f"be left out with `kind={kind!r}`, since only slices have one")
     box = _box_of(image, scale.reference)
     indices = _nearest(box, at) if kind == "slices" else None
     factor, unit = length_unit(max(float(np.abs(p).max()) for p in box.places_m.values()))
@@ -167,11 +168,11 @@ def _sides_m(grid: Grid) -> dict[str, NDArray[np.float64]]:
 
     Raise ValueError if the points are not a regular box.
     """
-    wanted = "image must be on points [n, m, k, 3] that form a regular box along x, y and z"
+    wanted = "be on points [n, m, k, 3] that form a regular box along x, y and z"
     points_m = grid.points_m
     if points_m is None or points_m.ndim != 4:
         kind = "a plane or height map" if points_m is None else "points"
-        raise ValueError(f"{wanted}, got {kind} of shape {grid.shape}")
+        raise ArgumentError("image", wanted, f"{kind} of shape {grid.shape}")
     lines_m = points_m[:, 0, 0], points_m[0, :, 0], points_m[0, 0, :]
     changes_m = np.array([np.abs(line[-1] - line[0]) for line in lines_m])
     free, order = {0, 1, 2}, [0, 1, 2]
@@ -187,7 +188,8 @@ def _sides_m(grid: Grid) -> dict[str, NDArray[np.float64]]:
         shape = [-1 if other == axis else 1 for other in range(3)]
         off_m = np.abs(points_m[..., c] - even_m.reshape(shape)).max()
         if off_m > room_m or (len(place_m) > 1 and place_m[0] == place_m[-1]):
-            raise ValueError(f"{wanted}, got points up to {off_m:.3g} m off it along {'xyz'[c]}")
+            given = f"points up to {off_m:.3g} m off it along {'xyz'[c]}"
+            raise ArgumentError("image", wanted, given)
     return places_m
 
 
@@ -202,9 +204,7 @@ def _nearest(box: _Box, at: Sequence[float] | None) -> dict[str, int]:
         places = box.places_m[name]
         step = np.ptp(places) / max(len(places) - 1, 1)
         if not places[0] - step / 2 <= value <= places[-1] + step / 2:
-            raise ValueError(
-                f"at must lie in the volume, {name} from {places[0]:g} to {places[-1]:g} m, got "
-                f"{value:g} m"
-            )
+            allowed = f"lie in the volume, {name} from {places[0]:g} to {places[-1]:g} m"
+            raise ArgumentError("at", allowed, f"{value:g} m")
         found[name] = int(np.abs(places - value).argmin())
     return found

@@ -8,6 +8,7 @@ import numpy as np
 
 from clsas.engine.data import validate
 from clsas.engine.data.grid import Grid
+from clsas.engine.data.validate import ArgumentError
 from clsas.measures.quality import on_axes
 
 _AROUND = 32  # pixels on either side by default, along the coarser axis
@@ -46,10 +47,8 @@ def window_around(
         ends_m = sorted((axis.places_m[0], axis.places_m[-1]))
         step_m = abs(axis.step_m)
         if not ends_m[0] - step_m / 2 <= at_m <= ends_m[1] + step_m / 2:
-            raise ValueError(
-                f"near must be inside the image: {axis.name} from {ends_m[0]:g} to "
-                f"{ends_m[1]:g} m, got {at_m:g} m"
-            )
+            allowed = f"be inside the image, {axis.name} from {ends_m[0]:g} to {ends_m[1]:g} m"
+            raise ArgumentError("near", allowed, f"{at_m:g} m")
         inside = np.flatnonzero(distance_m <= extent_m + _ROUNDING * step_m)
         first, last = (inside[0], inside[-1]) if len(inside) else (nearest, nearest)
         parts.append(slice(int(first), int(last) + 1))

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.trials import oracle
 from clsas.trials.oracle import Band, Echo
 
@@ -404,7 +405,7 @@ def _weights(
 ) -> NDArray[np.float64]:
     """Return the weights of a beam from their definition, [channels, pixels]."""
     if beam.along is None:
-        raise ValueError("beam must have the direction `along`")
+        raise ArgumentError("beam", "have the direction `along`")
     towards = pixels_m.reshape(1, -1, 3) - centres_m[:, None]
     along = np.broadcast_to(beam.along, centres_m.shape)
     sine = np.einsum("cpi,ci->cp", towards, along) / np.linalg.norm(towards, axis=-1)

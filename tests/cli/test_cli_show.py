@@ -241,7 +241,7 @@ def test_a_mosaic_is_read_patch_by_patch(store, monkeypatch):
         (["image.h5", "--percentile", "101"], 2, "got 101"),
         (["image.h5", "--colours", "rainbows"], 2, "--colour-map must be 'sonar' or one of"),
         (["image.h5", "--near", "1"], 2, "must be X,Y or X,Y,Z in metres"),
-        (["image.h5", "--near", "9,20"], 1, "near must be inside the image: x from -1 to 1 m"),
+        (["image.h5", "--near", "9,20"], 1, "near must be inside the image, x from -1 to 1 m"),
         (
             ["image.h5", "--near", "0,21", "--extent-m", "-1"],
             2,

@@ -112,7 +112,7 @@ def test_images_before_and_after_have_one_scale():
     titles = [axes.get_title() for axes in figure.axes[:2]]
     assert titles == ["Before: peak −20.0 dB", "After: peak 0.0 dB"]
     assert {axes.images[0].get_clim() for axes in figure.axes[:2]} == {(-30.0, 0.0)}
-    with pytest.raises(ValueError, match="after must have the pixels of before"):
+    with pytest.raises(ValueError, match="after must have the pixels of `before`"):
         clsas.plot.before_and_after(before, Image(np.ones((2, 2), complex), grid.window(
             slice(2), slice(2))))  # fmt: skip
 

@@ -195,14 +195,18 @@ def test_colour_maps_by_name_or_themselves():
     assert level_of(plot.image_db(SPECKLE, colour_map=own)).get_cmap().name == "own"
     with pytest.raises(ValueError, match=r"colour_map must be 'sonar' or one of matplotlib's.*got"):
         plot.image_db(SPECKLE, colour_map="sonnar")
-    with pytest.raises(TypeError, match="colour_map must be a name or a Colormap, got 3"):
+    with pytest.raises(TypeError, match="colour_map must be a name or a `Colormap`, got 3"):
         plot.image_db(SPECKLE, colour_map=3)
 
 
 @pytest.mark.parametrize(
     ("options", "error", "words"),
     [
-        ({"percentiles": (1, 99), "dynamic_range_db": 40}, ValueError, "exclude each other"),
+        (
+            {"percentiles": (1, 99), "dynamic_range_db": 40},
+            ValueError,
+            "percentiles must be left out if",
+        ),
         ({"percentiles": 99}, TypeError, r"percentiles must be \(low, high\), got 99"),
         ({"percentiles": (99, 1)}, ValueError, "high of percentiles must be finite and > 99"),
         ({"percentiles": (-1, 50)}, ValueError, "low of percentiles must be .* >= 0"),
@@ -410,7 +414,7 @@ def test_a_volume_is_a_regular_box():
             plot.volume(image)
     with pytest.raises(ValueError, match="kind must be one of 'maximum', 'slices', got 'mean'"):
         plot.volume(VOLUME, kind="mean")
-    with pytest.raises(ValueError, match="at goes with kind 'slices'"):
+    with pytest.raises(ValueError, match="at must be left out with `kind='maximum'`"):
         plot.volume(VOLUME, at=(0, 41, -1.5))
     with pytest.raises(ValueError, match="at must lie in the volume, y from 40 to 43 m, got 50 m"):
         plot.volume(VOLUME, kind="slices", at=(0, 50, -1.5))

@@ -137,7 +137,7 @@ def test_windows_of_grids_that_run_backwards_or_are_slanted():
 @pytest.mark.parametrize(
     ("near", "extent_m", "words"),
     [
-        ((2, 21), 0.1, "near must be inside the image: x from -1 to 1 m, got 2 m"),
+        ((2, 21), 0.1, "near must be inside the image, x from -1 to 1 m, got 2 m"),
         ((0, 19.9), 0.1, "y from 20 to 22 m, got 19.9 m"),
         ((0, 21), 0.0, "extent_m must be finite and > 0"),
         ((0,), 0.1, "near must have shape"),

@@ -279,5 +279,5 @@ def test_the_arrow_points_to_the_north_of_a_rotated_scene():
         along / np.hypot(*along), [np.cos(expected[0]), np.sin(expected[0])], atol=1e-9
     )
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("Along-track (m)", "Across-track (m)")
-    with pytest.raises(ValueError, match="north_arrow needs an image with a georeference"):
+    with pytest.raises(ValueError, match="north_arrow must be off for an image without a georef"):
         plot.image_db(IMAGE, north_arrow=True)
