@@ -11,6 +11,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, antennas_of
+from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.baseline import Baseline
 from clsas.interferometry.errors import UnmeasurableError
 
@@ -25,12 +26,10 @@ def checked_search(search_m: ArrayLike) -> tuple[float, float]:
     """Return the lowest and the highest height to search, metres."""
     low_m, high_m = map(float, validate.array("search_m", search_m, np.float64, (2,)))
     if not low_m < high_m:
-        raise ValueError(f"search_m must be (lowest, highest) in m, got ({low_m:g}, {high_m:g})")
+        raise ArgumentError("search_m", "be (lowest, highest) in m", (low_m, high_m))
     if max(-low_m, high_m) > _MOST_SEARCH_M:
-        raise ValueError(
-            f"search_m must lie within {_MOST_SEARCH_M:g} m of the grid, got ({low_m:g}, "
-            f"{high_m:g})"
-        )
+        allowed = f"lie within {_MOST_SEARCH_M:g} m of the grid"
+        raise ArgumentError("search_m", allowed, (low_m, high_m))
     return low_m, high_m
 
 
@@ -49,7 +48,7 @@ def checked_points(points_m: ArrayLike) -> NDArray[np.float64]:
     """Return control points on the seabed, metres, float64 [points, 3]."""
     checked_m = validate.array("points_m", points_m, np.float64, (None, 3))
     farthest_m = float(np.abs(checked_m).max())
-    validate.number("the farthest of points_m", farthest_m, "m", most=validate.FARTHEST_M)
+    validate.number("points_m", farthest_m, "m", most=validate.FARTHEST_M)
     return checked_m
 
 
@@ -61,18 +60,17 @@ def checked_known_sd(known_sd_m: float) -> float:
 def check_grid(grid: Grid) -> None:
     """Raise ValueError unless a grid is a plane or height map that heights along z can raise."""
     if grid.points_m is not None:
-        raise ValueError(
-            "grid must be a plane or height map, above which heights are measured, got arbitrary "
-            "points"
-        )
+        allowed = "be a plane or height map, above which heights are measured"
+        raise ArgumentError("grid", allowed, "arbitrary points")
     rows, columns = grid.shape
     if min(rows, columns) < 2:
-        raise ValueError(f"grid must have at least 2 rows and 2 columns, got {rows} x {columns}")
+        raise ArgumentError("grid", "have at least 2 rows and 2 columns", f"{rows} x {columns}")
     normal = np.cross(*grid.vectors_m[1:])
     if abs(normal[2]) < 0.1 * float(np.linalg.norm(normal)):
-        raise ValueError(
-            "grid must be a plane that heights along z can raise, got a vertical one: its steps "
-            f"are {grid.row_step_m} and {grid.column_step_m} m"
+        raise ArgumentError(
+            "grid",
+            "be a plane that heights along z can raise",
+            f"a vertical one with steps of {grid.row_step_m} and {grid.column_step_m} m",
         )
 
 
@@ -81,28 +79,31 @@ def check_pair(a: RangeLines, b: RangeLines) -> None:
     validate.instance("a", a, RangeLines)
     validate.instance("b", b, RangeLines)
     if a.channels != b.channels or len(a.ping_starts) != len(b.ping_starts):
-        raise ValueError(
-            "a and b must contain the same pings, with as many channels each, got "
-            f"{_pings(a)} and {_pings(b)}"
+        raise ArgumentError(
+            "a and b",
+            "contain the same pings, with as many channels each",
+            f"{_pings(a)} and {_pings(b)}",
         )
     for name, unit in (("carrier_hz", "Hz"), ("sound_speed_m_s", "m/s"), ("range_step_m", "m")):
         first, second = getattr(a, name), getattr(b, name)
         if not math.isclose(first, second, rel_tol=1e-9):
-            raise ValueError(
-                f"a and b must have the same {name}, got {first:.9g} and {second:.9g} {unit}"
-            )
+            got = f"{first:.9g} and {second:.9g} {unit}"
+            raise ArgumentError("a and b", f"have the same `{name}`", got)
     if a.sound_speed != b.sound_speed:
-        raise ValueError(
-            "a and b must have the same sound_speed, since echoes reach both banks through the "
-            f"same water, got {a.sound_speed!r} and {b.sound_speed!r}"
+        raise ArgumentError(
+            "a and b",
+            "have the same `sound_speed`, since echoes reach both banks through the same water",
+            f"{a.sound_speed!r} and {b.sound_speed!r}",
         )
     apart_m = np.linalg.norm(a.phase_centres_m - b.phase_centres_m, axis=1)
     usual_m = float(np.median(apart_m))
     worst = int(np.abs(apart_m - usual_m).argmax())
     if abs(apart_m[worst] - usual_m) > _APART * usual_m + 1e-6:
-        raise ValueError(
-            "a and b must contain the same pings in the same order: their phase centres are "
-            f"{usual_m:.3g} m apart in most channels, and {apart_m[worst]:.3g} m in channel {worst}"
+        raise ArgumentError(
+            "a and b",
+            "contain the same pings in the same order",
+            f"phase centres {usual_m:.3g} m apart in most channels, and {apart_m[worst]:.3g} m in "
+            f"channel {worst}",
         )
 
 
@@ -110,7 +111,7 @@ def check_echoes(a: RangeLines, b: RangeLines) -> None:
     """Raise ValueError if the samples of a bank are all zero."""
     for name, lines in (("a", a), ("b", b)):
         if not lines.samples.any():
-            raise ValueError(f"{name} must contain echoes, got samples that are all zero")
+            raise ArgumentError(name, "contain echoes", "samples that are all zero")
 
 
 def _pings(lines: RangeLines) -> str:
@@ -148,21 +149,24 @@ def check_geometry(
     if usual_rad_m * (high_m - low_m) < _LEAST_PHASE_RAD:
         apart_m = float(np.median(np.linalg.norm(_separation_m(baseline), axis=1)))
         raise UnmeasurableError(
-            "a and b must be apart across the line of sight: their phase centres are "
-            f"{apart_m:.3g} m apart, and the phase between them changes by "
-            f"{usual_rad_m * (high_m - low_m):.2g} rad over search_m, less than "
-            f"{_LEAST_PHASE_RAD:g} rad"
+            "a and b",
+            f"be apart across the line of sight, with a phase that changes by {_LEAST_PHASE_RAD:g} "
+            "rad or more over `search_m`",
+            f"phase centres {apart_m:.3g} m apart, and {usual_rad_m * (high_m - low_m):.2g} rad",
         )
     if (rad_m > 0).any() and (rad_m < 0).any():
         raise UnmeasurableError(
-            "a and b must see all of the grid and search_m from one side: the sign of the phase "
-            "changes within them. Divide the grid at the track's nadir"
+            "a and b",
+            "see all of the grid and `search_m` from one side",
+            "a phase whose sign changes within them",
+            "divide the grid at the track's nadir",
         )
     ambiguity_m = 2 * math.pi / usual_rad_m
     if high_m - low_m > _MOST_CYCLES * ambiguity_m:
         raise UnmeasurableError(
-            f"search_m must span at most {_MOST_CYCLES:g} heights of ambiguity "
-            f"({ambiguity_m:.3g} m each), got {high_m - low_m:g} m"
+            "search_m",
+            f"span at most {_MOST_CYCLES:g} heights of ambiguity ({ambiguity_m:.3g} m each)",
+            f"{high_m - low_m:g} m",
         )
     _check_decorrelation(baseline, points_m, ambiguity_m, relative_band, least_coherence)
     return ambiguity_m
@@ -183,13 +187,15 @@ def _check_below(
     highest_m = float(antennas_m[:, 2].max() - points_m[:, 2].min())
     if lowest_m > 0 and search_m[1] >= lowest_m:
         raise UnmeasurableError(
-            f"search_m must end below the sonar, which is {lowest_m:.4g} m above the grid, got "
-            f"{search_m[1]:g} m"
+            "search_m",
+            f"end below the sonar, which is {lowest_m:.4g} m above the grid",
+            f"{search_m[1]:g} m",
         )
     if highest_m < 0 and search_m[0] <= highest_m:
         raise UnmeasurableError(
-            f"search_m must begin above the sonar, which is {-highest_m:.4g} m below the grid, got "
-            f"{search_m[0]:g} m"
+            "search_m",
+            f"begin above the sonar, which is {-highest_m:.4g} m below the grid",
+            f"{search_m[0]:g} m",
         )
 
 
@@ -204,9 +210,10 @@ def _check_ranges(
         range_m = pairwise_range_m(raised_m, *antennas_of(baseline.a, some))
         if not ((range_m >= first_m) & (range_m <= last_m)).any():
             raise UnmeasurableError(
-                f"search_m must lie within the range of the lines, {first_m.min():.5g} to "
-                f"{last_m.max():.5g} m: at {offset_m:g} m the grid is at {range_m.min():.5g} to "
-                f"{range_m.max():.5g} m"
+                "search_m",
+                f"lie within the range of the lines, {first_m.min():.5g} to {last_m.max():.5g} m",
+                f"{offset_m:g} m, where the grid is at {range_m.min():.5g} to "
+                f"{range_m.max():.5g} m",
             )
 
 
@@ -231,7 +238,9 @@ def _check_decorrelation(
     if left < least_coherence:
         apart_m = float(np.median(np.linalg.norm(_separation_m(baseline), axis=1)))
         raise UnmeasurableError(
-            f"a and b must be closer together: at {2 * apart_m:.3g} m between the banks, the "
-            f"height of ambiguity is {ambiguity_m:.2g} m and a level seabed has a coherence of at "
-            f"most {max(left, 0):.2f}, less than least_coherence = {least_coherence:g}"
+            "a and b",
+            "be closer together",
+            f"{2 * apart_m:.3g} m between the banks",
+            f"the height of ambiguity is {ambiguity_m:.2g} m and a level seabed has a coherence of "
+            f"at most {max(left, 0):.2f}, less than `least_coherence` = {least_coherence:g}",
         )

@@ -202,6 +202,7 @@ def check_looks(window_m: float, looks: float) -> None:
     """Raise UnmeasurableError if a window has too few looks to estimate a coherence."""
     if looks < LEAST_LOOKS:
         raise UnmeasurableError(
-            f"window_m must contain at least {LEAST_LOOKS:g} independent samples of the images, "
-            f"got {window_m:g} m, which contains {looks:.1f}"
+            "window_m",
+            f"contain at least {LEAST_LOOKS:g} independent samples of the images",
+            f"{window_m:g} m, which contains {looks:.1f}",
         )

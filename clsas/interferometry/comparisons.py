@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import validate
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.interferometry.checks import checked_level, checked_points
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.displaced import Displaced
@@ -59,36 +60,35 @@ def at_pixels(surface: Displaced, known_height_m: ArrayLike, known_sd_m: float) 
 
 def _checked_heights(known_height_m: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
     """Return known heights as float64 [rows, columns]; NaN is allowed."""
+    name = "known_height_m"
     if isinstance(known_height_m, Real):
         known_height_m = checked_level(known_height_m)
     given = np.asanyarray(known_height_m)
     if np.ma.isMaskedArray(given) or given.dtype.kind not in "iuf":
-        raise TypeError(
-            "known_height_m must be a real number or an array of real numbers, NaN where heights "
-            f"are not known, got {validate.shown(known_height_m)}"
+        raise ArgumentTypeError(
+            name,
+            "be a real number or an array of real numbers, NaN where heights are not known",
+            validate.shown(known_height_m),
         )
     if given.shape not in ((), shape):
-        raise ValueError(
-            f"known_height_m must be a number or have the shape of the heights, {shape}, got "
-            f"{given.shape}"
-        )
+        allowed = f"be a number or have the shape of the heights, {shape}"
+        raise ArgumentError(name, allowed, str(given.shape))
     known_m = np.broadcast_to(given.astype(np.float64), shape)
     if np.isinf(known_m).any() or np.isnan(known_m).all():
-        raise ValueError(
-            "known_height_m must be finite, or NaN where it is not known; got "
-            + ("infinite heights" if np.isinf(known_m).any() else "NaN everywhere")
-        )
+        got = "infinite heights" if np.isinf(known_m).any() else "NaN everywhere"
+        raise ArgumentError(name, "be finite, or NaN where it is not known", got)
     if float(np.nanmax(np.abs(known_m))) > validate.FARTHEST_M:
-        raise ValueError(
-            f"known_height_m must lie within {validate.FARTHEST_M:g} m of the grid, got heights "
-            f"from {np.nanmin(known_m):g} to {np.nanmax(known_m):g} m"
+        raise ArgumentError(
+            name,
+            f"lie within {validate.FARTHEST_M:g} m of the grid",
+            f"heights from {np.nanmin(known_m):g} to {np.nanmax(known_m):g} m",
         )
     return known_m
 
 
 def at_points(surface: Displaced, points_m: ArrayLike, known_sd_m: float) -> Comparison:
     """Compare heights with control points."""
-    return _against(surface, checked_points(points_m), known_sd_m, "one of points_m")
+    return _against(surface, checked_points(points_m), known_sd_m, "one of `points_m`")
 
 
 def _against(
@@ -126,7 +126,7 @@ def in_overlap(first: Displaced, second: Displaced) -> Comparison:
         )
 
     places = _places(first, places_m, window_m)
-    what = "a place that other measured as well"
+    what = "a place that `other` measured as well"
     return Comparison(equations_at, places, what, _most_roll_rad(first))
 
 

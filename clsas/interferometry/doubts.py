@@ -41,17 +41,17 @@ class Doubts(NamedTuple):
         """Warn of each."""
         if self.large_m is not None:
             validate.warn(
-                f"grid is smaller than the windows of {self.large_m:.2g} m that tell heights apart "
-                f"which differ by the height of ambiguity, {self.ambiguity_m:.3g} m, where the "
-                "coherence is low: make the grid larger or search_m smaller"
+                f"`grid` is smaller than the windows of {self.large_m:.2g} m that tell heights "
+                f"apart which differ by the height of ambiguity, {self.ambiguity_m:.3g} m, where "
+                "the coherence is low: make the grid larger or `search_m` smaller"
             )
         if self.end is not None:
             beyond = BEYOND[self.end]
             validate.warn(
-                f"search_m may not contain the seabed: the banks agree best at its {self.end} end, "
-                f"so that most of the seabed seems to lie {beyond} it. Heights may be wrong by "
-                f"multiples of the height of ambiguity, {self.ambiguity_m:.3g} m: search farther "
-                f"{beyond}"
+                f"`search_m` may not contain the seabed: the banks agree best at its {self.end} "
+                f"end, so that most of the seabed seems to lie {beyond} it. Heights may be wrong "
+                f"by multiples of the height of ambiguity, {self.ambiguity_m:.3g} m: search "
+                f"farther {beyond}"
             )
 
 

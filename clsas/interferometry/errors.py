@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from clsas.engine.data.validate import ArgumentError
 
-class UnmeasurableError(ValueError):
+
+class UnmeasurableError(ArgumentError):
     """Two banks do not show the heights of a grid, as the message explains."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.comparisons import Comparison
 from clsas.interferometry.error_fit import Equations, Fit, fitted
 
@@ -83,28 +84,32 @@ def _is_observable(covariance: NDArray[np.float64], columns: list[int], roll_rad
     return bool((sd_rad <= MOST_SD_RAD).all() and (amplification <= _MOST_AMPLIFICATION).all())
 
 
-def _incomparable(comparison: Comparison, given: str) -> ValueError:
+def _incomparable(comparison: Comparison, given: str) -> ArgumentError:
     equations = comparison.equations_at(np.zeros(2))
     some = equations.usable
     if not some.any():
-        return ValueError(
-            f"{given} must share places with the valid heights: no valid height lies at "
-            f"{comparison.what}"
+        return ArgumentError(
+            given,
+            "share places with the valid heights",
+            hint=f"no valid height lies at {comparison.what}",
         )
     typical_m = float(np.median(np.abs(equations.residual_m[some])))
-    return ValueError(
-        f"{given} must lie close enough to the heights for errors of the pair to explain the "
-        f"difference, which is {typical_m:.3g} m"
+    return ArgumentError(
+        given,
+        "lie close enough to the heights for errors of the pair to explain the difference",
+        f"{typical_m:.3g} m",
     )
 
 
 def _unobservable(
     fit: Fit, unknowns: tuple[str, ...], column: int, comparison: Comparison
-) -> ValueError:
+) -> ArgumentError:
     name = next(each for each in unknowns if (each == "roll") == bool(column))
     sd_rad = float(np.sqrt(fit.covariance[0, 0])) * (comparison.roll_rad if column else 1.0)
-    return ValueError(
-        f"{name} is not observable from these heights: its standard deviation would be "
-        f"{sd_rad:.2g} rad of phase, more than {MOST_SD_RAD:g} rad. More places or a smaller "
-        "known_sd_m show it, or two tracks at different ranges"
+    return ArgumentError(
+        "unknowns",
+        f"be observable from these heights, with a standard deviation up to {MOST_SD_RAD:g} rad of "
+        "phase",
+        f"{name} with {sd_rad:.2g} rad",
+        "more places or a smaller `known_sd_m` show it, or two tracks at different ranges",
     )

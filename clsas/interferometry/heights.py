@@ -428,7 +428,7 @@ def _warn(refined: Refined) -> None:
     if share < 0.01:
         validate.warn(
             f"only {100 * share:.2g} % of the pixels are coherent: the seabed may lie outside "
-            "search_m, or the positions of the banks may be wrong"
+            "`search_m`, or the positions of the banks may be wrong"
         )
     elif not refined.converged:
         validate.warn(

@@ -11,6 +11,7 @@ from clsas.engine.data import reprs, validate
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.image_error import check_one_grid
+from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.coherence import (
     Moments,
     Window,
@@ -62,7 +63,7 @@ class Interferogram:
         """Check every field and convert it."""
         validate.instance("grid", self.grid, Grid)
         if self.grid.points_m is not None:
-            raise ValueError("grid must be a plane or a height map, got points")
+            raise ArgumentError("grid", "be a plane or a height map", "points")
         object.__setattr__(self, "window_m", validate.positive("window_m", self.window_m, "m"))
         for name in ("phase_rad", "coherence", "looks", "phase_sd_rad"):
             values = validate.array(name, getattr(self, name), np.float32, self.grid.shape)
@@ -158,9 +159,9 @@ def interferogram(a: Image, b: Image, window_m: float) -> Interferogram:
     validate.instance("b", b, Image)
     window_m = validate.positive("window_m", window_m, "m")
     if a.grid.points_m is not None or b.grid.points_m is not None:
-        raise ValueError("a and b must lie on a plane or a height map, got arbitrary points")
+        raise ArgumentError("a and b", "lie on a plane or a height map", "arbitrary points")
     if a.shape != b.shape:
-        raise ValueError(f"a and b must lie on one grid, got shapes {a.shape} and {b.shape}")
+        raise ArgumentError("a and b", "lie on one grid", f"shapes {a.shape} and {b.shape}")
     check_one_grid(a.grid, b.grid, "a and b")
     window = window_within(a.grid, window_m)
     most = effective_looks((a.pixels, b.pixels), window)
@@ -181,8 +182,8 @@ def _check_share(window: Window, grid: Grid) -> None:
     if share > _LARGEST_SHARE:
         validate.warn(
             f"windows should be at most two thirds as long and wide as the images, got "
-            f"{100 * share:.0f} %: looks may be 1.6 times too many, and phase_sd_rad 0.8 times its "
-            "true value"
+            f"{100 * share:.0f} %: looks may be 1.6 times too many, and `phase_sd_rad` 0.8 times "
+            "its true value"
         )
 
 
@@ -195,6 +196,6 @@ def window_within(grid: Grid, window_m: float) -> Window:
         if n > 1  # the window of a single row is that row
     ]
     if not sides_m:
-        raise ValueError("grid must have more than one pixel")
+        raise ArgumentError("grid", "have more than one pixel")
     validate.number("window_m", window_m, "m", above=0.0, most=min(sides_m))
     return Window.of(grid, window_m)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.factorized.planner import checked_tolerance_db
 from clsas.engine.signal.spectrum import middle_cycles_per_m
@@ -164,9 +165,10 @@ def pair_errors(
     given = {"known_height_m": known_height_m, "points_m": points_m, "other": other}
     names = [name for name, value in given.items() if value is not None]
     if len(names) != 1:
-        raise ValueError(
-            "one of known_height_m, points_m and other must be given, got "
-            + (" and ".join(names) or "none")
+        raise ArgumentError(
+            "known_height_m",
+            "be given, or one of `points_m` and `other`, and only one",
+            " and ".join(f"`{name}`" for name in names) or "none",
         )
     measured = [(a, b, found)]
     _check_measured(a, b, found, "found")
@@ -177,7 +179,7 @@ def pair_errors(
     surfaces = [
         Displaced.of(pair, heights) for pair, (_, _, heights) in zip(pairs, measured, strict=True)
     ]
-    for surface, name in zip(surfaces, ("found", "the heights of other"), strict=False):
+    for surface, name in zip(surfaces, ("found", "other"), strict=False):
         _check_belongs(surface, name)
     if other is not None:
         comparison = in_overlap(*surfaces)
@@ -199,8 +201,8 @@ def pair_errors(
     if errors.misfit > _MOST_MISFIT:
         validate.warn(
             f"heights still differ from those expected by {errors.residual_m:.2g} m rms, "
-            f"{errors.misfit:.0f} of their standard deviations: {names[0]} may not be that of this "
-            "seabed, and the estimates may be wrong"
+            f"{errors.misfit:.0f} of their standard deviations: `{names[0]}` may not be that of "
+            "this seabed, and the estimates may be wrong"
         )
     return errors
 
@@ -210,17 +212,16 @@ def _warn_of_points(comparison: Comparison) -> None:
     usable = comparison.equations_at(np.zeros(2)).usable
     if usable.any() and not usable.all():
         validate.warn(
-            f"{np.count_nonzero(~usable)} of {usable.size} points_m lie where no height is valid, "
-            "and are left out"
+            f"{np.count_nonzero(~usable)} of {usable.size} `points_m` lie where no height is "
+            "valid, and are left out"
         )
 
 
 def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
     named = validate.named("unknowns", unknowns, UNKNOWNS)
     if not named or len(set(named)) < len(named):
-        raise ValueError(
-            f"unknowns must be one or several of {', '.join(UNKNOWNS)}, each once, got {named}"
-        )
+        allowed = f"be one or several of {', '.join(UNKNOWNS)}, each once"
+        raise ArgumentError("unknowns", allowed, named or "none")
     return named
 
 
@@ -228,27 +229,29 @@ def _check_measured(a: RangeLines, b: RangeLines, found: Heights, name: str) -> 
     check_pair(a, b)
     validate.instance(name, found, Heights)
     if not found.mask.any():
-        raise ValueError(f"{name} must have valid heights, got a mask that is all False")
+        raise ArgumentError(name, "have valid heights", "a mask that is all False")
 
 
 def _checked_other(
     other: tuple[RangeLines, RangeLines, Heights], a: RangeLines
 ) -> tuple[RangeLines, RangeLines, Heights]:
     kinds = RangeLines, RangeLines, Heights
-    parts = validate.entries("other", other, "(a, b, found) of another track")
+    meaning = "(a, b, found) of another track"
+    parts = validate.entries("other", other, meaning)
     if len(parts) != 3:
-        raise ValueError(f"other must be (a, b, found) of another track, got {len(parts)} entries")
+        raise ArgumentError("other", f"be {meaning}", f"{len(parts)} entries")
     for part, kind in zip(parts, kinds, strict=True):
         validate.instance("every entry of other", part, kind)
     low, high, found = parts
     try:
         _check_measured(low, high, found, "found")
-    except ValueError as error:
-        raise ValueError(f"other: {error}") from None
+    except ArgumentError as error:
+        raise error.within("other:") from None
     if not math.isclose(low.carrier_hz, a.carrier_hz, rel_tol=1e-9):
-        raise ValueError(
-            "other must be lines of the same sonar, with the same carrier_hz, got "
-            f"{low.carrier_hz:.9g} and {a.carrier_hz:.9g} Hz"
+        raise ArgumentError(
+            "other",
+            "be lines of the same sonar, with the same `carrier_hz`",
+            f"{low.carrier_hz:.9g} and {a.carrier_hz:.9g} Hz",
         )
     return low, high, found
 
@@ -259,9 +262,11 @@ def _check_belongs(surface: Displaced, name: str) -> None:
     expected = -1 / np.median(surface.sights.values[..., 0])
     ratio = float(np.median(found.m_per_rad[found.mask])) / expected
     if not 1 / _UNLIKE < ratio < _UNLIKE:
-        raise ValueError(
-            f"{name} must be measured from the lines given, in the same order: its m_per_rad is "
-            f"{expected * ratio:.3g} m, and that of the lines about {expected:.3g} m"
+        raise ArgumentError(
+            name,
+            "be measured from the lines given, in the same order, whose `m_per_rad` is about "
+            f"{expected:.3g} m",
+            f"{expected * ratio:.3g} m",
         )
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.image import Image
+from clsas.engine.data.validate import ArgumentTypeError
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,7 @@ class Heights:
         shape = self.image.shape
         mask = _as_array(self.mask)
         if mask is None or not _is_plain(mask, "b", shape):
-            raise TypeError(f"mask must be bools of shape {shape}, got {validate.shown(self.mask)}")
+            raise ArgumentTypeError("mask", f"be bools of shape {shape}", validate.shown(self.mask))
         put("mask", _read_only(mask))
         for name in ("coherence", "looks", "m_per_rad"):
             put(name, validate.array(name, getattr(self, name), np.float64, shape))

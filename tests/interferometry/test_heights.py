@@ -435,16 +435,16 @@ class TestBadInput:
 
     def test_other_carrier(self):
         _, second = flat_banks()
-        self.refused("same carrier_hz", b=replace(second, carrier_hz=90e3))
+        self.refused("same `carrier_hz`", b=replace(second, carrier_hz=90e3))
 
     def test_other_water(self):
         first, second = flat_banks()
         profile = clsas.SoundSpeed([0, 30], [1500, 1490], 20.0)
         other = clsas.SoundSpeed([0, 30], [1500, 1480], 20.0)
-        refused = "same sound_speed.*None and SoundSpeed"
+        refused = "same `sound_speed`.*None and SoundSpeed"
         self.refused(refused, b=replace(second, sound_speed=profile))
         self.refused(
-            "same sound_speed", replace(first, sound_speed=profile),
+            "same `sound_speed`", replace(first, sound_speed=profile),
             replace(second, sound_speed=other),
         )  # fmt: skip
 
@@ -461,7 +461,7 @@ class TestBadInput:
     def test_baseline_too_long(self):
         first, _ = flat_banks()
         far = replace(first, rx_m=first.rx_m + [0, 0, 40.0])
-        self.refused("closer together: at 40 m between the banks", b=far)
+        self.refused("closer together, got 40 m between the banks", b=far)
 
     def test_search(self):
         self.refused("must end below the sonar, which is 12 m", search_m=(-1, 12.5))

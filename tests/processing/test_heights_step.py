@@ -376,7 +376,7 @@ def test_printed_errors_have_units(name, value, sd, expected):
         ("known_height_m = 0.0\nknown_sd_m = -1", "known_sd_m must be"),
         ('known_height_m = 0.0\nunknowns = ["heave"]', "unknowns"),
         ("known_height_m = 1e300", r"\[process.pair_errors\] known_height_m must be finite and"),
-        ("points_m = [[0, 32, 1e300]]", "the farthest of points_m must be finite and <= 1e"),
+        ("points_m = [[0, 32, 1e300]]", "points_m must be finite and <= 1e"),
         ("known_height_m = 0.0\nknown_sd_m = 1e300", "known_sd_m must be finite and"),
         ("points_m = [[0, 32]]", "points_m"),
         ("height = 0", "unknown key 'height'"),
