@@ -15,6 +15,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
+from clsas.engine.data.validate import ArgumentError
 from clsas.maps.collection import Collection
 
 # Highest total order of the polynomial, and pixels along either side of the raster to which it is
@@ -79,7 +80,7 @@ class Carrier:
                 places.append(place)
                 supports.append(collection.support(changes_m))
         if not places:
-            raise ValueError("lines must reach the image within the beam, but none does")
+            raise ArgumentError("lines", "reach the image within the beam, but none does")
         support = np.array(supports)  # [places, axes, lowest and highest]
         slopes, used = _slopes(np.array(places), shape)
         solved = np.linalg.lstsq(slopes, support.mean(axis=2).T.ravel(), rcond=None)[0]

@@ -11,6 +11,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at, wavelength_m
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import sines
 from clsas.engine.signal.spectrum import measure_spectrum, power_spectrum
 
@@ -18,12 +19,10 @@ from clsas.engine.signal.spectrum import measure_spectrum, power_spectrum
 def check_lines(lines: RangeLines, grid: Grid) -> None:
     """Raise ValueError if lines lie elsewhere on Earth than an image of them, or are silent."""
     if lines.georeference not in (None, grid.georeference):
-        raise ValueError(
-            f"lines must have the georeference of the source ({grid.georeference}), "
-            f"got {lines.georeference}"
-        )
+        allowed = f"have the georeference of the source ({grid.georeference})"
+        raise ArgumentError("lines", allowed, str(lines.georeference))
     if not lines.samples.any():
-        raise ValueError("lines must have samples other than 0, from which the band is measured")
+        raise ArgumentError("lines", "have samples other than 0, from which the band is measured")
 
 
 @dataclass(frozen=True, eq=False)

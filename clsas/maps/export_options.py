@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Annotated, Any
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError, Choice, Flag, Number
 from clsas.engine.factorized.plan import Plan
 from clsas.maps import geotiff, netcdf, sicd
 from clsas.maps.encoding import KINDS
@@ -33,34 +34,26 @@ class ExportOptions:
         If a value has the wrong type or is outside its limits.
     """
 
-    kind: str | None = None
+    kind: Annotated[str | None, Choice(KINDS, help="Pixels of a GeoTIFF.")] = None
     dynamic_range_db: float | None = None
-    reference: float | None = None
+    reference: Annotated[float | None, Number(above=0.0, help="Amplitude of 0 dB.")] = None
     colour_map: str | None = None
-    north_up: bool = False
-    pixel_m: float | None = None
+    north_up: Annotated[bool, Flag(help="Resample a GeoTIFF so that its rows run east.")] = False
+    pixel_m: Annotated[
+        float | None, Number("m", above=0.0, help="Size of the pixels of a resampled GeoTIFF.")
+    ] = None
     plan: Plan | None = None
     lines: RangeLines | None = None
     beam: BeamWindow | None = None
-    north_arrow: bool = False
-    scale_bar: bool = False
+    north_arrow: Annotated[bool, Flag(help="Draw an arrow that points north.")] = False
+    scale_bar: Annotated[bool, Flag(help="Draw a scale bar.")] = False
 
     def __post_init__(self) -> None:
-        """Check every field and convert it."""
-
-        def put(name: str, value: object) -> None:
-            object.__setattr__(self, name, value)
-
-        for name in ("north_up", "north_arrow", "scale_bar"):
-            put(name, validate.flag(name, getattr(self, name)))
-        if self.kind is not None:
-            validate.one_of("kind", self.kind, KINDS)
-        if self.reference is not None:
-            put("reference", validate.positive("reference", self.reference))
-        if self.pixel_m is not None:
-            put("pixel_m", validate.positive("pixel_m", self.pixel_m, "m"))
+        """Check every field, and convert those that are declared."""
+        validate.check_fields(self)
         if self.dynamic_range_db is not None:
-            put("dynamic_range_db", validate.dynamic_range_db(self.dynamic_range_db))
+            range_db = validate.dynamic_range_db(self.dynamic_range_db)
+            object.__setattr__(self, "dynamic_range_db", range_db)
         if self.colour_map is not None:
             validate.text("colour_map", self.colour_map)
         validate.instance("plan", self.plan, Plan, type(None))
@@ -79,13 +72,13 @@ class ExportOptions:
         unused = [name for name in self.given if name not in used]
         if unused:
             if unused[0] == "pixel_m" and "north_up" in used:
-                what += " without north_up"
-            raise ValueError(f"{unused[0]} must be left out, since it has no effect on {what}")
+                what += " without `north_up`"
+            raise ArgumentError(unused[0], f"be left out, since it has no effect on {what}")
 
     def _used(self, suffix: str) -> tuple[set[str], str]:
         """Return the options that have an effect on a format, and what the format is called."""
         if not suffix:
-            return {"dynamic_range_db", "colour_map"}, "a folder, as path is without a suffix"
+            return {"dynamic_range_db", "colour_map"}, "a folder, as `path` is without a suffix"
         if suffix in PICTURES:
             return _COLOURS | {"north_arrow", "scale_bar"}, suffix
         if suffix in netcdf.SUFFIXES:
@@ -96,7 +89,7 @@ class ExportOptions:
         used = _ORIGIN | {"kind", "north_up"}
         of_complex = {"beam"} if self.north_up else set()
         used |= {"8bit": _COLOURS, "complex": of_complex}.get(kind, {"reference"})
-        return self._with_pixel_m(used), f"{suffix} of kind {kind!r}"
+        return self._with_pixel_m(used), f"{suffix} with `kind={kind!r}`"
 
     def _used_by_heights(self, suffix: str) -> tuple[set[str], str]:
         """Return the same of a format of heights, whose numbers are neither levels nor complex."""

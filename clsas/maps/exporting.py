@@ -13,6 +13,7 @@ from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
 from clsas.engine.factorized.plan import Plan
 from clsas.files.sidecars import remove_sidecars
@@ -204,10 +205,8 @@ def export(
         isinstance(opened, Store) and bool(suffix) and bool(opened.layers)
     )
     if of_heights and suffix not in HEIGHT_SUFFIXES:
-        raise ValueError(
-            f"path must end in {' or '.join(HEIGHT_SUFFIXES)} for heights, got "
-            f"{validate.shown(str(path))}"
-        )
+        allowed = f"end in {' or '.join(HEIGHT_SUFFIXES)} for heights"
+        raise ArgumentError("path", allowed, validate.shown(str(path)))
     options.check_used(suffix, of_heights=of_heights)
     if suffix and suffix not in PICTURES:
         _write_data(path, _finished(opened, georeference), options, progress)
@@ -235,7 +234,7 @@ def check_name(name: str, path: Path) -> None:
     """
     last = path.name
     if last != ".." and (last.startswith(".") or last.endswith(".")):
-        raise ValueError(f"{name} must not begin or end with a dot, got {validate.shown(last)}")
+        raise ArgumentError(name, "not begin or end with a dot", validate.shown(last))
 
 
 def _opened(source: Image | Store | Heights | str | os.PathLike) -> Image | Store | Heights:
@@ -249,9 +248,8 @@ def _opened(source: Image | Store | Heights | str | os.PathLike) -> Image | Stor
 
     found = load(path)
     if not isinstance(found, Image | Heights):
-        raise ValueError(
-            f"source must contain an image or heights, but {path} has {type(found).__name__}"
-        )
+        given = f"{path} with `{type(found).__name__}`"
+        raise ArgumentError("source", "contain an image or heights", given)
     return found
 
 
@@ -304,12 +302,12 @@ def _check_map(source: Source, options: ExportOptions) -> None:
     """Raise ValueError for images that a GeoTIFF cannot show."""
     grid = source.grid
     if grid.points_m is not None:
-        raise ValueError("source must be on a plane or height map for a GeoTIFF, got points")
+        raise ArgumentError("source", "be on a plane or height map for a GeoTIFF", "points")
     if grid.georeference is None:
-        raise ValueError(
-            "source must have a georeference for a GeoTIFF, since a map needs a place on Earth: "
-            "give georeference (on the command line --origin and --heading-deg, or --crs), or form "
-            "the image by a scene with a table [georeference]"
+        raise ArgumentError(
+            "source",
+            "have a georeference for a GeoTIFF, since a map needs a place on Earth",
+            hint="give `georeference`, or form the image by a scene with a table [georeference]",
         )
     turned = Orientation.of((grid.shape[0], grid.shape[1]), grid.georeference.affine(grid))
     if options.kind == "complex" and geotiff.resamples(
@@ -318,7 +316,7 @@ def _check_map(source: Source, options: ExportOptions) -> None:
         _check_phase(grid, options.lines)
     if grid.height_m is not None and options.kind == "8bit":
         validate.warn(
-            "8-bit levels leave out the heights of the grid; the kind 'db' has them as second band"
+            "8-bit levels leave out the heights of the grid; `kind='db'` has them as second band"
         )
 
 
@@ -326,9 +324,11 @@ def _check_phase(grid: Grid, lines: RangeLines | None) -> None:
     """Raise an error if complex pixels cannot be resampled."""
     check_image(grid)
     if lines is None:
-        raise ValueError(
-            "lines must be given for complex pixels with north_up, since the phase between pixels "
-            "follows from them; without them, export the image rotated"
+        raise ArgumentError(
+            "lines",
+            "be given for complex pixels with `north_up`, since the phase between pixels follows "
+            "from them",
+            hint="without them, export the image rotated",
         )
     check_lines(lines, grid)
 

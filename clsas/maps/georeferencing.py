@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.extras import needed
 from clsas.engine.data.georeference import Georeference, checked_degrees
+from clsas.engine.data.validate import ArgumentError
 
 if TYPE_CHECKING:
     import pyproj
@@ -45,7 +46,7 @@ def geographic(place: Georeference, positions_m: ArrayLike) -> NDArray[np.float6
     )
     found = np.stack([latitude, longitude, place_m[..., 2]], axis=-1)
     if not np.isfinite(found).all():
-        raise ValueError(f"positions_m must lie within the map of {place}")
+        raise ArgumentError("positions_m", f"lie within the map of {place}")
     return found
 
 
@@ -59,7 +60,9 @@ def from_geographic(
     easting_m, northing_m = _transform(map_crs(place)).transform(longitude, latitude)
     place_m = np.stack([easting_m, northing_m, height], axis=-1)
     if not np.isfinite(place_m).all():
-        raise ValueError(f"latitude_deg and longitude_deg must lie within the map of {place}")
+        raise ArgumentError(
+            "latitude_deg", f"lie within the map of {place}, together with `longitude_deg`"
+        )
     _warn_of_missing_grid(place, np.stack([latitude, longitude], axis=-1))
     return place.from_map(place_m)
 
@@ -82,10 +85,8 @@ def _alike(*arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         return np.broadcast_arrays(*arrays)
     except ValueError:
         names = ("latitude_deg", "longitude_deg", "height_m")[: len(arrays)]
-        raise ValueError(
-            f"{', '.join(names)} must have the same shape, got "
-            f"{', '.join(str(each.shape) for each in arrays)}"
-        ) from None
+        shapes = ", ".join(str(each.shape) for each in arrays)
+        raise ArgumentError(", ".join(names), "have the same shape", shapes) from None
 
 
 def geographic_poses(
@@ -102,27 +103,24 @@ def geographic_poses(
     validate.instance("georeference", georeference, Georeference, type(None))
     latitude, longitude = checked_degrees(latitude_deg, longitude_deg, (None,))
     if len(longitude) != len(latitude):
-        raise ValueError(
-            f"longitude_deg must have shape ({len(latitude)}) like latitude_deg, "
-            f"got {longitude.shape}"
-        )
+        allowed = f"have shape ({len(latitude)},) like `latitude_deg`"
+        raise ArgumentError("longitude_deg", allowed, str(longitude.shape))
     height = validate.array("height_m", height_m, np.float64, latitude.shape, broadcast=True)
     heading = validate.array("heading_deg", heading_deg, np.float64, latitude.shape, broadcast=True)
     if np.abs(heading).max() > 360:
-        raise ValueError(
-            "heading_deg must be from -360 to 360 degrees, got "
-            f"{heading[np.abs(heading).argmax()]:g}"
-        )
+        worst = f"{heading[np.abs(heading).argmax()]:g}"
+        raise ArgumentError("heading_deg", "be from -360 to 360 degrees", worst)
     _check_headings(latitude, longitude, heading)
     frame = georeference or _georeference_of(latitude, longitude, height, heading)
     positions_m = frame.from_geographic(latitude, longitude, height)
     on_map = heading - frame.convergence_deg(latitude, longitude)
     lost = np.flatnonzero(~np.isfinite(positions_m.sum(axis=1) + on_map))
     if lost.size:
-        raise ValueError(
-            f"latitude_deg and longitude_deg must lie on one map, but those of ping {lost[0]}, "
-            f"{latitude[lost[0]]:g} and {longitude[lost[0]]:g}, are on another side of the Earth: "
-            "probably a wrong fix"
+        raise ArgumentError(
+            "latitude_deg",
+            f"lie on one map, together with `longitude_deg`, but those of ping {lost[0]}, "
+            f"{latitude[lost[0]]:g} and {longitude[lost[0]]:g}, are on another side of the Earth",
+            hint="probably a wrong fix",
         )
     of_x_axis = 90.0 if frame.heading_deg is None else frame.heading_deg
     yaw = np.radians((of_x_axis - on_map + 180) % 360 - 180)
@@ -145,10 +143,12 @@ def _check_headings(
         for angles in (np.radians(heading), heading)
     )
     if in_degrees > _MOST_DRIFT_DEG and in_radians < _AGREEMENT_DEG:
-        raise ValueError(
-            f"heading_deg must be in degrees, but the headings up to {np.abs(heading).max():.3g} "
-            f"are {in_degrees:.0f} degrees off the course of the track, and {in_radians:.0f} "
-            "degrees as radians: convert them with numpy.degrees"
+        raise ArgumentError(
+            "heading_deg",
+            f"be in degrees, but the headings up to {np.abs(heading).max():.3g} are "
+            f"{in_degrees:.0f} degrees off the course of the track, and {in_radians:.0f} degrees "
+            "as radians",
+            hint="convert them with `numpy.degrees`",
         )
 
 
@@ -210,29 +210,32 @@ def _known(name: str) -> pyproj.CRS:
         found = pyproj.CRS.from_user_input(name)
     except CRSError as error:
         reason = str(error).partition("(Internal Proj Error: ")[2].rstrip(")") or "not a CRS"
-        raise ValueError(
-            f"crs must be one that PROJ knows, such as 'EPSG:32632', got {validate.shown(name)} "
-            f"({reason})"
+        raise ArgumentError(
+            "crs",
+            "be one that PROJ knows, such as 'EPSG:32632'",
+            f"{validate.shown(name)} ({reason})",
         ) from None
     if not found.is_projected:
-        kind = "a geographic one" if found.is_geographic else "another kind"
-        raise ValueError(
-            f"crs must be a projection with easting and northing in metres, such as 'EPSG:32632', "
-            f"got {kind}: {validate.shown(name)}; for latitudes and longitudes use "
-            "Georeference.local"
+        kind = "a geographic one" if found.is_geographic else "of another kind"
+        raise ArgumentError(
+            "crs",
+            "be a projection with easting and northing in metres, such as 'EPSG:32632'",
+            f"{validate.shown(name)}, {kind}",
+            "for latitudes and longitudes use `Georeference.local`",
         )
     units = {axis.unit_name for axis in found.axis_info}
     if units - {"metre"}:
-        raise ValueError(
-            f"crs must be in metres, got {validate.shown(name)} in {', '.join(sorted(units))}"
-        )
+        given = f"{validate.shown(name)} in {', '.join(sorted(units))}"
+        raise ArgumentError("crs", "be in metres", given)
     # The order of the axes does not matter: coordinates are always given easting first.
     directions = [axis.direction for axis in found.axis_info if axis.direction not in _VERTICAL]
     if sorted(directions) != ["east", "north"]:
-        raise ValueError(
-            "crs must have axes that point east and north, got one whose axes point "
-            f"{' and '.join(directions)}: {validate.shown(name)}; use a local georeference "
-            "(latitude, longitude and heading), also near the poles, or UTM"
+        raise ArgumentError(
+            "crs",
+            "have axes that point east and north",
+            f"{validate.shown(name)}, whose axes point {' and '.join(directions)}",
+            "use a local georeference (latitude, longitude and heading), also near the poles, or "
+            "UTM",
         )
     return found
 

@@ -25,6 +25,7 @@ from clsas.engine.data.atomic import assembling
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.extras import needed
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.maps.agreement import LEAST_AGREEMENT, agreement
 from clsas.maps.bands import Band, bands_of
 from clsas.maps.carrier import Carrier
@@ -219,9 +220,11 @@ class _Export:
         finest_m = min(steps_m(self._affine))
         pixel_m = self._options.pixel_m or finest_m
         if pixel_m < finest_m / _MOST_FINER:
-            raise ValueError(
-                f"pixel_m must be at least the distance of the pixels over {_MOST_FINER}, "
-                f"{finest_m / _MOST_FINER:g} m, got {pixel_m:g} m"
+            raise ArgumentError(
+                "pixel_m",
+                f"be at least the distance of the pixels over {_MOST_FINER}, "
+                f"{finest_m / _MOST_FINER:g} m",
+                f"{pixel_m:g} m",
             )
         shape, affine = north_up(self._shape, self._affine, pixel_m)
         path = self._folder / "north_up.tif"
@@ -259,10 +262,12 @@ class _Export:
         except InexactError:
             agreed = agreement(collection, self._shape, *vectors_m, read)
             if agreed < LEAST_AGREEMENT:
-                raise ValueError(
-                    "lines and beam must be those that formed the image: its spatial frequencies "
-                    f"agree with theirs by {100 * agreed:.0f} %, where {100 * LEAST_AGREEMENT:.0f} "
-                    "% or more are expected"
+                raise ArgumentError(
+                    "lines",
+                    "be those that formed the image, with the same `beam`",
+                    hint="the image's spatial frequencies agree with theirs by "
+                    f"{100 * agreed:.0f} %, where {100 * LEAST_AGREEMENT:.0f} % or more are "
+                    "expected",
                 ) from None
             raise
         self._more_tags["INTERPOLATION_ERROR_DB"] = f"{interpolation.error_db:.12g}"

@@ -22,6 +22,7 @@ from scipy.sparse import csr_array
 
 from clsas.engine.data.fourier import gridding, gridding_gain, taps_for
 from clsas.engine.data.grid import Grid
+from clsas.engine.data.validate import ArgumentError
 from clsas.maps.carrier import Carrier
 from clsas.maps.map_grids import Affine
 from clsas.maps.resampling import averaged, lattice, steps_m
@@ -43,7 +44,7 @@ _SUM_ERROR_DB, _OVERSAMPLING = -80.0, 1.5  # of the non-uniform FFT: plain choic
 _PLACES_AT_ONCE = 1 << 13  # whose weights fit into caches
 
 
-class InexactError(ValueError):
+class InexactError(ArgumentError):
     """The error of interpolated pixels would exceed `MOST_ERROR_DB`."""
 
 
@@ -98,8 +99,10 @@ class Interpolation:
         best = good[0] if good else int(np.argmin(errors_db))
         if errors_db[best] > MOST_ERROR_DB:
             raise InexactError(
-                f"north_up would cause an error of up to {errors_db[best]:.1f} dB in complex "
-                f"pixels, more than {MOST_ERROR_DB:g} dB: {_remedy(carrier, steps_m(affine))}"
+                "north_up",
+                f"cause an error of at most {MOST_ERROR_DB:g} dB in complex pixels",
+                f"up to {errors_db[best]:.1f} dB",
+                _remedy(carrier, steps_m(affine)),
             )
         return cls(carrier, affine, onto, guards[best], errors_db[best])
 
@@ -192,14 +195,15 @@ def check_image(grid: Grid) -> None:
         If it is not on a plane, or too small.
     """
     if not grid.is_planar:
-        raise ValueError(
-            "north_up must be off for complex pixels of a height map, whose phase changes with the "
-            "height"
+        raise ArgumentError(
+            "north_up",
+            "be off for complex pixels of a height map, whose phase changes with the height",
         )
     if min(grid.shape) < (least := 2 * margin_of(_GUARDS[0]) + 2):
-        raise ValueError(
-            f"source must have at least {least} rows and columns for complex pixels with north_up, "
-            f"got {grid.shape[0]} x {grid.shape[1]}"
+        raise ArgumentError(
+            "source",
+            f"have at least {least} rows and columns for complex pixels with `north_up`",
+            f"{grid.shape[0]} x {grid.shape[1]}",
         )
 
 
@@ -262,11 +266,11 @@ def _error_db(power: NDArray[np.float64], guard: float) -> float:
 
 def _remedy(carrier: Carrier, given_m: tuple[float, float]) -> str:
     """Return what helps if the error is too large; distances of rows and of columns are given."""
-    instead = "form the image on the grid of Georeference.north_up"
+    instead = "form the image on the grid of `Georeference.north_up`"
     if (carrier.half_band <= _USED).all():
         return (
-            f"{instead}, since its beam ends abruptly, or lines and beam are not those that formed "
-            "the image"
+            f"{instead}, since its beam ends abruptly, or `lines` and `beam` are not those that "
+            "formed the image"
         )
     row_m, column_m = (
         step_m * min(_USED / half, 1)

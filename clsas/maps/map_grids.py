@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
+from clsas.engine.data.validate import ArgumentError
 from clsas.maps.georeferencing import geographic
 
 if TYPE_CHECKING:
@@ -36,9 +37,8 @@ def affine(place: Georeference, grid: Grid) -> Affine:
     validate.instance("grid", grid, Grid)
     right, down = _steps(place, grid)
     if _are_parallel(right, down):
-        raise ValueError(
-            "grid must not be vertical: seen from above, its rows and columns are parallel"
-        )
+        hint = "seen from above, its rows and columns are parallel"
+        raise ArgumentError("grid", "not be vertical", hint=hint)
     corner = place.to_map(grid.vectors_m[0])[:2] - (right + down) / 2
     return (
         *(float(right[0]), float(down[0]), float(corner[0])),
@@ -87,7 +87,7 @@ def north_up(place: Georeference, grid: Grid, pixel_m: float | None = None) -> G
     turn = affine(place, grid)
     origin_m, row_step_m, column_step_m = grid.vectors_m
     if grid.height_m is not None or row_step_m[2] or column_step_m[2]:
-        raise ValueError("grid must be a horizontal plane to be turned, got another one")
+        raise ArgumentError("grid", "be a horizontal plane to be turned")
     if pixel_m is None:
         pixel_m = min(math.hypot(turn[0], turn[3]), math.hypot(turn[1], turn[4]))
     pixel_m = validate.positive("pixel_m", pixel_m, "m")
@@ -97,10 +97,8 @@ def north_up(place: Georeference, grid: Grid, pixel_m: float | None = None) -> G
     ]
     across_m = max(sides_m)
     if pixel_m > across_m:
-        raise ValueError(
-            f"pixel_m must be at most the longer side of the grid, {across_m:.4g} m, got "
-            f"{pixel_m:.4g} m"
-        )
+        allowed = f"be at most the longer side of the grid, {across_m:.4g} m"
+        raise ArgumentError("pixel_m", allowed, f"{pixel_m:.4g} m")
     validate.memory("pixel_m", 8 * (sides_m[0] / pixel_m) * (sides_m[1] / pixel_m))
     left, bottom, rows, columns = cover(grid.shape, turn, pixel_m)
     first_m = place.from_map([(left + 0.5) * pixel_m, (bottom + 0.5) * pixel_m, 0.0])

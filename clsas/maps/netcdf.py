@@ -14,6 +14,7 @@ from clsas.engine.data.atomic import replacing
 from clsas.engine.data.extras import needed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
 from clsas.files.xarrays import GRID_MAPPING, grid_dims, to_xarray
 from clsas.maps.bands import bands_of
@@ -50,7 +51,7 @@ def write(path: Path, source: Source, tags: dict[str, Any]) -> None:
         import h5netcdf  # noqa: F401  xarray's message would not say how to install it
         import xarray  # noqa: F401
     if source.has_heights and source.grid.points_m is not None:
-        raise ValueError("source must be on a plane to have heights, got points")
+        raise ArgumentError("source", "be on a plane to have heights", "points")
     validate.memory("the pixels as netCDF", _BYTES * source.grid.size)
     data = _of_heights(source) if source.has_heights else _of_image(source)
     data = _described(data, source.grid, tags)
@@ -122,8 +123,8 @@ def _now() -> datetime:
     try:
         return datetime.fromtimestamp(int(given), UTC)
     except (ValueError, OverflowError, OSError):
-        raise ValueError(
-            f"{_EPOCH} must be a whole number of seconds since 1970, got {validate.shown(given)}"
+        raise ArgumentError(
+            _EPOCH, "be a whole number of seconds since 1970", validate.shown(given)
         ) from None
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from clsas.engine.data.validate import ArgumentError
 from clsas.maps.bands import Band
 from clsas.maps.map_grids import Affine, cover
 
@@ -55,9 +56,11 @@ def averaged(affine: Affine, onto: Affine) -> int:
     finest = min(steps_m(affine))
     count = max(math.ceil(max(steps_m(onto)) / finest - 1e-6), 1)
     if count > _MOST_AVERAGED:
-        raise ValueError(
-            f"pixel_m must be at most {_MOST_AVERAGED} times the distance of the pixels, "
-            f"{_MOST_AVERAGED * finest:g} m, got {max(steps_m(onto)):g} m"
+        raise ArgumentError(
+            "pixel_m",
+            f"be at most {_MOST_AVERAGED} times the distance of the pixels, "
+            f"{_MOST_AVERAGED * finest:g} m",
+            f"{max(steps_m(onto)):g} m",
         )
     return count
 

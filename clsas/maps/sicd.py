@@ -15,6 +15,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.extras import needed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
 from clsas.maps.collection import Collection, check_lines
 from clsas.maps.sicd_collection import Axis, time_and_axes, times_s, track_polynomials
@@ -62,10 +63,8 @@ def write(
     _check_range(lines, raster)
     collection = Collection.of(lines, beam)
     if not collection.band_hz[0] > 0:
-        raise ValueError(
-            "lines must have frequencies above 0 Hz with their carrier_hz for SICD, got "
-            f"{collection.band_hz[0]:.4g} Hz"
-        )
+        allowed = "have frequencies above 0 Hz with their `carrier_hz` for SICD"
+        raise ArgumentError("lines", allowed, f"{collection.band_hz[0]:.4g} Hz")
     tree = _document(sarkit.sicd, raster, collection, tags)
     security = sarkit.sicd.NitfSecurityFields(clas="U")
     metadata = sarkit.sicd.NitfMetadata(
@@ -104,33 +103,36 @@ def _checked(grid: Grid, lines: RangeLines | None, most_bytes: int) -> RangeLine
     """Return the lines; raise ValueError if SICD cannot describe an image or its lines."""
     if not grid.is_planar:
         got = "points" if grid.points_m is not None else "a height map"
-        raise ValueError(f"source must be on a plane for SICD, got {got}")
+        raise ArgumentError("source", "be on a plane for SICD", got)
     if grid.georeference is None:
-        raise ValueError(
-            "source must have a georeference for SICD, whose coordinates are fixed to the Earth: "
-            "give georeference (on the command line --origin and --heading-deg, or --crs)"
+        raise ArgumentError(
+            "source",
+            "have a georeference for SICD, whose coordinates are fixed to the Earth",
+            hint="give `georeference`",
         )
     if min(grid.shape) < 2 or 8 * grid.size > most_bytes:
-        raise ValueError(
-            "source must have at least 2 rows, 2 columns and at most "
-            f"{most_bytes // 8} pixels for SICD, got {grid.shape[0]} x {grid.shape[1]}"
+        raise ArgumentError(
+            "source",
+            f"have at least 2 rows, 2 columns and at most {most_bytes // 8} pixels for SICD",
+            f"{grid.shape[0]} x {grid.shape[1]}",
         )
     _, row_step_m, column_step_m = grid.vectors_m
     lengths = np.linalg.norm(row_step_m) * np.linalg.norm(column_step_m)
     if abs(row_step_m @ column_step_m) > _SKEW * lengths:
-        raise ValueError("source must have perpendicular rows and columns for SICD")
+        raise ArgumentError("source", "have perpendicular rows and columns for SICD")
     if lines is None:
-        raise ValueError(
-            "lines must be given for SICD, which describes track and frequencies of the radar"
-        )
+        allowed = "be given for SICD, which describes track and frequencies of the radar"
+        raise ArgumentError("lines", allowed)
     if abs(lines.sound_speed_m_s / speed_of_light - 1) > _LIGHT:
-        raise ValueError(
-            "lines must be those of a radar for SICD, whose waves have the speed of light, got "
-            f"{lines.sound_speed_m_s:g} m/s: export sonar images as a GeoTIFF of kind 'complex'"
+        raise ArgumentError(
+            "lines",
+            "be those of a radar for SICD, whose waves have the speed of light",
+            f"{lines.sound_speed_m_s:g} m/s",
+            "export sonar images as a GeoTIFF with `kind='complex'`",
         )
     check_lines(lines, grid)
     if len(lines.ping_starts) < 2:
-        raise ValueError("lines must have at least 2 pings for SICD")
+        raise ArgumentError("lines", "have at least 2 pings for SICD")
     if grid.georeference.vertical_datum is not None:
         validate.warn(
             f"heights above {grid.georeference.vertical_datum} are written as heights above the "
@@ -144,10 +146,8 @@ def _check_range(lines: RangeLines, raster: Raster) -> None:
     distance_m = np.linalg.norm(lines.phase_centres_m - raster.positions_m(raster.centre), axis=1)
     apart_m = np.linalg.norm(lines.tx_m - lines.rx_m, axis=1)
     if (apart_m > _SEPARATION * distance_m).any():
-        raise ValueError(
-            "lines must be monostatic for SICD, got transmitters and receivers up to "
-            f"{apart_m.max():.4g} m apart"
-        )
+        given = f"transmitters and receivers up to {apart_m.max():.4g} m apart"
+        raise ArgumentError("lines", "be monostatic for SICD", given)
 
 
 def _document(sicd: Any, raster: Raster, collection: Collection, tags: dict[str, Any]) -> Any:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.maps.collection import Collection
 from clsas.maps.sicd_raster import Raster, ecf_m
 from clsas.measures.resolution import half_power_width
@@ -87,10 +88,11 @@ def track_polynomials(
                 coefficients[: len(own), axis] = own
             coefficients[0] += middle_m
             return coefficients
-    raise ValueError(
-        "lines must come from one pass in the order of recording, since SICD describes the "
-        f"track by polynomials, which deviate from it by {deviation_m:.3g} m at a range of "
-        f"{range_m:.4g} m"
+    raise ArgumentError(
+        "lines",
+        "come from one pass in the order of recording, since SICD describes the track by "
+        "polynomials",
+        f"a track that deviates from them by {deviation_m:.3g} m at a range of {range_m:.4g} m",
     )
 
 
@@ -121,7 +123,7 @@ def time_and_axes(
     centre_m = raster.positions_m(raster.centre)
     _, weight, changes_m = collection.contributions(centre_m, raster.steps_m)
     if not weight.sum():
-        raise ValueError("lines must reach the middle of the image")
+        raise ArgumentError("lines", "reach the middle of the image")
     at_m = (np.array(used) - raster.centre) * lengths_m
     corners_m = (raster.corners - raster.centre) * lengths_m
     time = _fitted(at_m, np.array(times), _TIME * float(time_of_channels_s[-1]))
@@ -143,9 +145,10 @@ def time_and_axes(
         amplitude, edges = np.histogram(cycles, _BINS, weights=amplitude)
         width_m = half_power_width((edges[:-1] + edges[1:]) / 2, amplitude)
         if not np.isfinite(width_m):
-            raise ValueError(
-                "lines must resolve the middle of the image for SICD: those within the beam see it "
-                "from one direction only"
+            raise ArgumentError(
+                "lines",
+                "resolve the middle of the image for SICD",
+                hint="those within the beam see it from one direction only",
             )
         axes.append(
             Axis(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
+from clsas.engine.data.validate import ArgumentError
 from clsas.maps.georeferencing import geographic
 from clsas.maps.orientation import Orientation
 
@@ -56,7 +57,7 @@ class Raster:
         east_m, north_m, _ = towards_m
         distance_m = float(np.hypot(east_m, north_m))
         if distance_m <= _OVERHEAD * np.linalg.norm(towards_m):
-            raise ValueError("lines must look at the grid from the side, not from straight above")
+            raise ArgumentError("lines", "look at the grid from the side, not from straight above")
         # With the radar in the north, rows of a north-up map lead away from it.
         sine, cosine = east_m / distance_m, north_m / distance_m
         turned = (

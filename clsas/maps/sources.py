@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
+from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.result import Heights
 from clsas.mosaics.documents import read_document
 from clsas.mosaics.record import PatchIndex, Record
@@ -58,9 +59,8 @@ class Source:
         grid = found.grid
         if georeference is not None:
             if grid.georeference not in (None, georeference):
-                raise ValueError(
-                    f"georeference must be left out, since the source has one: {grid.georeference}"
-                )
+                allowed = f"be left out, since the source has one: {grid.georeference}"
+                raise ArgumentError("georeference", allowed)
             grid = replace(grid, georeference=georeference)
         if isinstance(found, Store):
             return cls(grid, None, found, found.records())
@@ -130,18 +130,21 @@ class Source:
         """Raise ValueError if patches of the store are missing or damaged."""
         patches = math.prod(self.counts)
         if self.store is not None and len(self.records) < patches:
-            raise ValueError(
-                f"source must be finished, but {len(self.records)} of the {patches} patches of "
-                f"{self.store.path} are, without damage: run clsas mosaic again with the same "
-                "inputs, which forms the others"
+            raise ArgumentError(
+                "source",
+                f"be finished, but {len(self.records)} of the {patches} patches of "
+                f"{self.store.path} are, without damage",
+                hint="run `clsas.mosaic` again with the same inputs, which forms the others",
             )
 
     def check_unchanged(self, name: str = "source") -> None:
         """Raise ValueError if patches of the store `name` were formed since the export began."""
         if self.store is not None and self.store.records() != self.records:
-            raise ValueError(
-                f"{name} must not change while it is exported, but patches of {self.store.path} "
-                "were formed meanwhile: repeat the export when the mosaic is finished"
+            raise ArgumentError(
+                name,
+                f"not change while it is exported, but patches of {self.store.path} were formed "
+                "meanwhile",
+                hint="repeat the export when the mosaic is finished",
             )
 
 

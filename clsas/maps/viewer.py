@@ -20,6 +20,7 @@ from clsas.engine.data.decibels import largest_amplitude
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
 from clsas.maps.frames import Frame, fitted_degrees, geographic_of, steps_of
 from clsas.maps.sources import Source
@@ -104,7 +105,7 @@ def write(
     names = validate.entries("names", names, "names of the images")[: len(sources)]
     names = [validate.text("every entry of names", name) for name in names]
     if len(names) < len(sources):
-        raise ValueError(f"names must have {len(sources)} entries, got {len(names)}")
+        raise ArgumentError("names", f"have {len(sources)} entries", str(len(names)))
     range_db = DYNAMIC_RANGE_DB
     if dynamic_range_db is not None:
         range_db = validate.dynamic_range_db(dynamic_range_db)
@@ -232,7 +233,7 @@ def _check_grids(grids: Sequence[Grid]) -> None:
     """Raise ValueError for grids that the page cannot show, or not on top of each other."""
     for name, grid in zip(("source", "against"), grids, strict=False):
         if grid.points_m is not None:
-            raise ValueError(f"{name} must be on a plane or height map for the viewer, got points")
+            raise ArgumentError(name, "be on a plane or height map for the viewer", "points")
     if len(grids) < 2:
         return
     one, other = grids
@@ -242,15 +243,12 @@ def _check_grids(grids: Sequence[Grid]) -> None:
         for mine, theirs, count in zip(one.vectors_m, other.vectors_m, (1, *one.shape), strict=True)
     )
     if one.shape != other.shape or most_m > _SAME * steps_m:
-        raise ValueError(
-            f"against must be on the grid of source, {one}, got {other}: form it on that grid"
-        )
+        allowed = f"be on the grid of `source`, {one}"
+        raise ArgumentError("against", allowed, str(other), "form it on that grid")
     places = [grid.georeference for grid in grids]
     if None not in places and places[0] != places[1]:
-        raise ValueError(
-            f"against must have the georeference of source, {places[0]}, got {places[1]}: form "
-            "both with the same one"
-        )
+        allowed = f"have the georeference of `source`, {places[0]}"
+        raise ArgumentError("against", allowed, str(places[1]), "form both with the same one")
 
 
 def _described(

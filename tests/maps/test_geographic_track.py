@@ -50,7 +50,7 @@ def test_the_bow_points_along_the_course(place):
 def test_headings_in_radians_and_swapped_angles_are_refused():
     latitude, longitude = course(250.0)
     time_s = np.arange(20.0)
-    with pytest.raises(ValueError, match=r"heading_deg must be in degrees.* numpy\.degrees"):
+    with pytest.raises(ValueError, match=r"heading_deg must be in degrees.* `numpy\.degrees`"):
         clsas.Track.from_geographic(latitude, longitude, 0.0, np.radians(250.0), time_s)
     clsas.Track.from_geographic(*course(3.0), 0.0, np.full(20, 3.0), time_s)  # as degrees right
     with pytest.raises(ValueError, match="probably swapped"):

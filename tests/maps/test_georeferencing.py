@@ -88,7 +88,7 @@ def test_a_single_row_is_as_wide_as_its_pixels():
     ("make", "message"),
     [
         (lambda: clsas.Georeference.projected("EPSG:99999"), "crs must be one that PROJ knows"),
-        (lambda: clsas.Georeference.projected("EPSG:4326"), "got a geographic one: 'EPSG:4326'"),
+        (lambda: clsas.Georeference.projected("EPSG:4326"), "got 'EPSG:4326', a geographic one"),
         (lambda: clsas.Georeference.projected("EPSG:2263"), "must be in metres"),
         (lambda: clsas.Georeference.projected("EPSG:2048"), "axes point west and south: "),
         (lambda: clsas.Georeference.projected("EPSG:3031"), "north and north: .*, or UTM$"),

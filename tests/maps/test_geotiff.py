@@ -411,15 +411,15 @@ def test_images_without_a_place_on_a_map_are_refused(tmp_path):
     unknown = clsas.Georeference(crs="EPSG:99999")
     path = tmp_path / "a.tif"
     for source, how, message in (
-        (nowhere, {}, "source must have a georeference .*--origin"),
+        (nowhere, {}, "source must have a georeference .*give `georeference`"),
         (nowhere, {"georeference": unknown}, "crs must be one that PROJ knows"),
         (image, {"georeference": UTM_NORTH}, "georeference must be left out"),
         (points, {}, "source must be on a plane or height map"),
         (clsas.Image(np.ones((3, 3), complex), upright), {}, "grid must not be vertical"),
         (image, {"kind": "complex", "beam": clsas.BeamWindow(9.0)}, "beam must be left out"),
         (image, {"kind": "complex", "reference": 1.0}, "reference must be left out"),
-        (image, {"colour_map": "gray"}, "colour_map must be left out, .* kind 'db'"),
-        (image, {"pixel_m": 1.0}, "pixel_m must be left out, .* without north_up"),
+        (image, {"colour_map": "gray"}, "colour_map must be left out, .* `kind='db'`"),
+        (image, {"pixel_m": 1.0}, "pixel_m must be left out, .* without `north_up`"),
         (image, {"north_up": True, "pixel_m": 100.0}, "pixel_m must be at most 16 times"),
         (image, {"north_up": True, "pixel_m": 1e300}, "pixel_m must be at most 16 times"),
         (image, {"kind": "8bit", "colour_map": "none such"}, "colour_map must be"),

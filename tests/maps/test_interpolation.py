@@ -126,7 +126,7 @@ def test_a_beam_that_ends_abruptly_states_its_error_or_is_refused(tmp_path):
     lines, grid = lines_of(place, "speckle"), grid_of(place, 0.0125)
     beam = clsas.BeamWindow(20.0)
     image = clsas.backproject(lines, grid, beam=beam, accuracy_db=-80)
-    with pytest.raises(ValueError, match="its beam ends abruptly, or lines and beam are not those"):
+    with pytest.raises(ValueError, match="its beam ends abruptly, or `lines` and `beam` are not"):
         resampled(image, tmp_path / "a.tif", lines=lines, beam=beam)
     assert list(tmp_path.iterdir()) == []
 
@@ -258,7 +258,9 @@ def test_lines_of_another_recording_are_recognized(kind, step_m, carrier_hz, tmp
     lines, grid = lines_of(place, kind), grid_of(place, step_m, "oblique")
     image = clsas.backproject(lines, grid, beam=BEAM, accuracy_db=-60)
     other = replace(lines, carrier_hz=carrier_hz)
-    with pytest.raises(ValueError, match="lines and beam must be those that formed the image: its"):
+    with pytest.raises(
+        ValueError, match="must be those that formed the image, with the same `beam`"
+    ):
         resampled(image, tmp_path / "a.tif", lines=other, beam=BEAM)
 
 
@@ -297,13 +299,13 @@ def test_what_cannot_be_resampled_is_refused(tmp_path):
         (image, {"lines": lines, "pixel_m": 1e300}, "pixel_m must be at most 16 times"),
         (
             image, {"lines": lines, "beam": BEAM},
-            r"north_up would cause an error of up to .* dB in complex pixels, more than -40 dB: "
-            r"form the image on the grid of Georeference.north_up, or with rows at most 0.01\d* m "
-            r"and columns at most 0.0\d* m apart \(they are 0.05 m and 0.05 m\)",
+            r"north_up must cause an error of at most -40 dB in complex pixels, got up to .* dB: "
+            r"form the image on the grid of `Georeference.north_up`, or with rows at most 0.01\d* "
+            r"m and columns at most 0.0\d* m apart \(they are 0.05 m and 0.05 m\)",
         ),
         (
             noise(grid_of(place, 0.01)), {"lines": lines, "beam": BEAM},
-            "lines and beam must be those that formed the image: its spatial",
+            "lines must be those that formed the image, with the same `beam`: the image's spatial",
         ),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):

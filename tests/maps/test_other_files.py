@@ -189,6 +189,6 @@ def test_pictures_without_a_place_stand_alone(tmp_path):
             clsas.export(image, tmp_path / name)
     clsas.save(tmp_path / "grid.h5", image.grid)
     with pytest.raises(
-        ValueError, match=r"source must contain an image or heights, but .*grid.h5 has Grid"
+        ValueError, match=r"source must contain an image or heights, got .*grid.h5 with `Grid`"
     ):
         clsas.export(tmp_path / "grid.h5", tmp_path / "b.tif")

@@ -346,7 +346,7 @@ def test_options_without_effect_are_refused(tmp_path):
         ValueError, match=r"kind must be left out, since it has no effect on \.nitf"
     ):
         clsas.export(image, tmp_path / "a.nitf", lines=lines, kind="complex")
-    with pytest.raises(ValueError, match=r"beam must be left out.*\.tif of kind 'db'"):
+    with pytest.raises(ValueError, match=r"beam must be left out.*\.tif with `kind='db'`"):
         clsas.export(image, tmp_path / "a.tif", beam=clsas.BeamWindow(1.0))
     with pytest.raises(TypeError, match="beam must be"):
         clsas.export(image, tmp_path / "a.nitf", lines=lines, beam=3.0)
