@@ -14,6 +14,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.beam import MOST_TRACK_PINGS, BeamWindow
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.simplify import shift_error
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.engine.exact.decide import BEST_ACCURACY_DB
 from clsas.engine.factorized.planner import TOLERANCE_DB, checked_pairs, tolerance_in_db
 from clsas.mosaics.documents import is_there, read_document
@@ -34,7 +35,8 @@ def checked_request(
         name: value for name, value in zip(REQUESTS, given, strict=True) if value is not None
     }
     if len(request) > 1:
-        raise ValueError(f"at most one of {', '.join(REQUESTS)} must be given, got {request}")
+        first, second, *_ = request
+        raise ArgumentError(second, f"be left out if `{first}` is given")
     tolerance_in_db(tolerance_db, tolerance_wavelengths)
     if accuracy_db is not None:
         validate.number("accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0)
@@ -54,7 +56,7 @@ def checked_growth(source: RangeLines | Path, follow_s: float | None) -> Growth 
     idle_s = validate.positive("follow_s", follow_s, "s")
     if isinstance(source, RangeLines) or not source.is_dir():
         got = "lines in memory" if isinstance(source, RangeLines) else repr(str(source))
-        raise ValueError(f"source must be a folder if follow_s is given, got {got}")
+        raise ArgumentError("source", "be a folder if `follow_s` is given", got)
     return Growth(source.resolve(), idle_s)
 
 
@@ -75,9 +77,11 @@ def beam_of_mosaic(
         return beam
     if grows or (store is not None and not has_ended(source)):
         if beam.normalise:
-            raise ValueError(
-                "beam must not normalise for a folder that may grow, since the scale depends on "
-                f"the number of all channels: put an empty file '{END}' into a complete folder"
+            raise ArgumentError(
+                "beam",
+                "not normalise for a folder that may grow, since the scale depends on the number "
+                "of all channels",
+                hint=f"put an empty file '{END}' into a complete folder",
             )
         return beam_of_growing(beam)
     if store is not None and is_there(store):
@@ -109,10 +113,10 @@ def warn_of_window(beam: BeamWindow, geometry: RangeLines, request: dict[str, An
     asked_db = request.get("accuracy_db") or tolerance_in_db(*ways) or TOLERANCE_DB
     if power > 10 ** (asked_db / 10):
         validate.warn(
-            "source may grow, or did when the mosaic began: the direction of the track is smoothed "
-            f"over {MOST_TRACK_PINGS} pings, whatever their number. The image may differ by "
-            f"{10 * np.log10(power):.0f} dB from that of the {len(geometry.ping_starts)} pings in "
-            "one file. Give track_pings for both, or put an empty file "
+            "`source` may grow, or did when the mosaic began: the direction of the track is "
+            f"smoothed over {MOST_TRACK_PINGS} pings, whatever their number. The image may differ "
+            f"by {10 * np.log10(power):.0f} dB from that of the {len(geometry.ping_starts)} pings "
+            "in one file. Give `track_pings` for both, or put an empty file "
             f"'{END}' into a complete folder before its mosaic begins"
         )
 
@@ -120,10 +124,12 @@ def warn_of_window(beam: BeamWindow, geometry: RangeLines, request: dict[str, An
 def check_client(client: object, source: object, store: object, device: object) -> None:
     """Raise TypeError or ValueError unless the other arguments can be used with a client."""
     if not hasattr(client, "get_executor"):
-        raise TypeError(f"client must be a distributed.Client, got {client!r}")
+        raise ArgumentTypeError("client", "be a `distributed.Client`", repr(client))
     if store is None:
-        raise ValueError("store must be given with a client, whose workers write to it")
+        raise ArgumentError("store", "be given with a client, whose workers write to it")
     if isinstance(source, RangeLines):
-        raise ValueError("source must be a path with a client, whose workers read from it")
+        raise ArgumentError("source", "be a path with a client, whose workers read from it")
     if device is not None:
-        raise ValueError("device must be left out with a client: every worker takes one itself")
+        raise ArgumentError(
+            "device", "be left out with a client", hint="every worker takes one itself"
+        )

@@ -13,6 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import (
     ENVIRONMENT_VARIABLE,
     Device,
@@ -44,7 +45,7 @@ def open_devices(request: Any) -> tuple[Device, ...]:
     """
     if isinstance(request, Sequence) and not isinstance(request, (str, bytes)):
         if not request:
-            raise ValueError("device must name at least one device, got an empty sequence")
+            raise ArgumentError("device", "name at least one device", "an empty sequence")
         found = tuple(open_device(each) for each in request)
     elif request is not None:
         found = (open_device(request),)
@@ -53,7 +54,7 @@ def open_devices(request: Any) -> tuple[Device, ...]:
     names = {device.info.index for device in found}
     if len(names) < len(found):
         named = ", ".join(device.info.label for device in found)
-        raise ValueError(f"device must name each device once, got {named}")
+        raise ArgumentError("device", "name each device once", named)
     return found
 
 

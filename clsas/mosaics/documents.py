@@ -19,6 +19,7 @@ from clsas.engine.data.digests import is_intact
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.reading import parse_json, read_bytes
+from clsas.engine.data.validate import ArgumentError
 from clsas.mosaics.levels import WINDOW, are_levels
 
 FORMAT = "clsas mosaic"
@@ -165,10 +166,10 @@ def check_inputs(inputs: Any, shape: Sequence[int] | None) -> None:
     parts, pixels = inputs.get("parts"), inputs.get("pixels")
     for name, each in (("parts", parts), (PARTS_OF_B, inputs.get(PARTS_OF_B, []))):
         if not isinstance(each, list):
-            raise ValueError(f"inputs must have a list {name!r}, got {validate.shown(each)}")
+            raise ArgumentError("inputs", f"have a list {name!r}", validate.shown(each))
     if not _is_shape(pixels) or (shape is not None and pixels != list(shape)):
         expected = "of two numbers" if shape is None else f"{list(shape)}, the shape of the grid"
-        raise ValueError(f"inputs must have 'pixels' {expected}, got {validate.shown(pixels)}")
+        raise ArgumentError("inputs", f"have 'pixels' {expected}", validate.shown(pixels))
 
 
 def _is_complete(attributes: dict[str, Any]) -> bool:

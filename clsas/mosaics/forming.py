@@ -18,6 +18,7 @@ from clsas.engine.data.coverage import reaches
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image, holds_any
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device
 from clsas.engine.factorized.plan import ExactImage, Plan
 from clsas.engine.factorized.planner import Request, planned, tolerance_in_db
@@ -103,8 +104,8 @@ class Job:
             beam = None if self.beam is None else beam_json(self.beam)
             found = open_visibility(self.files, beam)
         if found.survey.stamps != tuple(stamp for _, stamp in self.files):
-            raise ValueError(
-                "source must not change while a mosaic is formed, but a file of it did"
+            raise ArgumentError(
+                "source", "not change while a mosaic is formed, but a file of it did"
             )
         return found
 
@@ -147,13 +148,14 @@ def form_patch(job: Job, window: PatchWindow) -> tuple[Record, Image | None]:
     Raises
     ------
     ValueError
-        If the patch cannot be imaged; the message begins with its row and column.
+        If the patch cannot be imaged; a note says which patch it is.
     """
     try:
         device = process_device() if job.local is None else thread_device()
         record, image = _image(job, job.visibility(), window.grid, device)
     except ValueError as error:
-        raise ValueError(f"patch {window.row},{window.column}: {error}") from error
+        error.add_note(f"patch {window.row},{window.column}")
+        raise
     store = job.opened_store()
     if store is not None:
         place = (window.row, window.column, window.rows, window.columns)
@@ -238,10 +240,12 @@ def _check_memory(job: Job, lines: RangeLines, grid: Grid) -> None:
     """Raise ValueError if the lines and pixels of a patch alone exceed its memory."""
     patch_bytes = host_bytes(lines.channels, lines.length, grid.size)
     if patch_bytes >= job.memory_bytes:
-        raise ValueError(
-            f"memory_bytes must be more than {patch_bytes / 2**20:.1f} MiB for "
-            f"{grid.shape[0]} x {grid.shape[1]} pixels from {lines.channels} lines of "
-            f"{lines.length} samples, got {job.memory_bytes / 2**20:.1f} MiB: use smaller patches"
+        raise ArgumentError(
+            "memory_bytes",
+            f"be more than {patch_bytes / 2**20:.1f} MiB for {grid.shape[0]} x {grid.shape[1]} "
+            f"pixels from {lines.channels} lines of {lines.length} samples",
+            f"{job.memory_bytes / 2**20:.1f} MiB",
+            "use smaller patches",
         )
 
 

@@ -24,6 +24,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, first_two_banks
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device
 from clsas.interferometry import heights
 from clsas.interferometry.checks import check_grid, check_pair
@@ -189,9 +190,8 @@ def mosaic_heights(
         decided = _decide(banks, grid, request, devices[0])
     window_m = decided["window_m"]
     if patch_m is not None and patch_m < window_m:
-        raise ValueError(
-            f"patch_m must be at least the side of a window, {window_m:.3g} m, got {patch_m:g} m"
-        )
+        allowed = f"be at least the side of a window, {window_m:.3g} m"
+        raise ArgumentError("patch_m", allowed, f"{patch_m:g} m")
     inputs = _inputs(banks, grid, request) | decided
     opened.begin(inputs, grid, patch_shape, Window.of(grid, window_m).sides)
     request = replace(request, window_m=window_m)
@@ -229,8 +229,8 @@ def _warn_of_doubts(records: dict[PatchIndex, Record]) -> None:
             for (end, some), side in zip(of_ends.items(), sides, strict=True)
         ]
         validate.warn(
-            f"search_m may not contain the seabed: of {len(records)} patches, the banks agree best "
-            f"at {'; and at '.join(ends)}. Heights may be wrong by multiples of the height of "
+            f"`search_m` may not contain the seabed: of {len(records)} patches, the banks agree "
+            f"best at {'; and at '.join(ends)}. Heights may be wrong by multiples of the height of "
             f"ambiguity, {_span(beyond)}: search farther {' and '.join(sides)}"
         )
     small = {index: each for index, each in measured.items() if each["large_m"] is not None}
@@ -240,7 +240,7 @@ def _warn_of_doubts(records: dict[PatchIndex, Record]) -> None:
             f"of {len(records)} patches, {_in_words(list(small))}, even with their margins, are "
             f"smaller than the windows of up to {large_m:.2g} m that tell heights apart which "
             f"differ by the height of ambiguity, {_span(small)}, where the coherence is low: make "
-            "patch_m and the grid larger, or search_m smaller"
+            "`patch_m` and the grid larger, or `search_m` smaller"
         )
 
 
@@ -267,18 +267,18 @@ def _banks(a: Lines, b: Lines | None, beam: BeamWindow | None) -> tuple[Bank, Ba
         )
         for name, survey in (("a", first), ("b", second)):
             if survey.geometry.banks > 1:
-                raise ValueError(
-                    f"{name} must have the lines of one bank if both are given, got "
-                    f"{survey.geometry.banks} banks: leave b out, or take one by clsas convert "
-                    "--bank"
+                raise ArgumentError(
+                    name,
+                    "have the lines of one bank if `a` and `b` are given",
+                    f"{survey.geometry.banks} banks",
+                    "leave `b` out, or take one bank by `lines.bank(n)`",
                 )
         return Bank.of(first, None, beam), Bank.of(second, None, beam)
     source = _source("a", a)
     survey = open_survey(source if isinstance(source, RangeLines) else source.resolve())
-    try:
-        both = first_two_banks(survey.geometry.bank_numbers)
-    except ValueError as error:
-        raise ValueError(f"a {error}: give the other one as b") from None
+    if survey.geometry.banks < 2:
+        raise ArgumentError("a", "have at least 2 banks", "1", "give the other one as `b`")
+    both = first_two_banks(survey.geometry.bank_numbers)
     return Bank.of(survey, both[0], beam), Bank.of(survey, both[1], beam)
 
 
@@ -324,13 +324,15 @@ def _decide(
     middle = grid.window(*(_middle(count) for count in grid.shape))
     pair, known, silent = seen(banks, middle, request, device)
     if silent:
-        raise ValueError(
-            f"{silent[0]} must contain echoes, got samples that are all zero or not finite in the "
-            f"{known['channels']} channels that receive from the middle of the grid"
+        raise ArgumentError(
+            silent[0],
+            "contain echoes",
+            "samples that are all zero or not finite in the "
+            f"{known['channels']} channels that receive from the middle of the grid",
         )
     if pair is None:
-        raise ValueError(
-            "grid must lie where the lines reach it: no channel receives from its middle"
+        raise ArgumentError(
+            "grid", "lie where the lines reach it", hint="no channel receives from its middle"
         )
     window_m, window, large = heights.windows(pair, middle, request)
     margin = [

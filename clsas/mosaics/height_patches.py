@@ -111,12 +111,13 @@ class HeightsJob:
         Raises
         ------
         ValueError
-            If the patch cannot be imaged; the message begins with its row and column.
+            If the patch cannot be imaged; a note says which patch it is.
         """
         try:
             record, pixels, layers = self._measured(window, thread_device())
         except ValueError as error:
-            raise ValueError(f"patch {window.row},{window.column}: {error}") from error
+            error.add_note(f"patch {window.row},{window.column}")
+            raise
         self.opened_store().write(*window[1:], pixels, record, layers)
         return record, None
 

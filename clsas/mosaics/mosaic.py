@@ -26,6 +26,7 @@ from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Formed, Image
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
 from clsas.engine.device.device import Device
 from clsas.engine.signal.doubts import warn_before_imaging
@@ -150,7 +151,7 @@ class Mosaic:
         if self._run.client is not None:
             raise TypeError(
                 "a mosaic with a client cannot be pickled, since the connection belongs to this "
-                "process: call clsas.mosaic where it is needed, with the same source and store"
+                "process: call `clsas.mosaic` where it is needed, with the same source and store"
             )
         return self.__dict__
 
@@ -375,7 +376,7 @@ def mosaic(
     """
     validate.instance("grid", grid, Grid)
     if len(grid.shape) != 2:
-        raise ValueError(f"grid must have two axes for a mosaic, got shape {grid.shape}")
+        raise ArgumentError("grid", "have two axes for a mosaic", f"shape {grid.shape}")
     request = checked_request(tolerance_db, tolerance_wavelengths, stages, accuracy_db)
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)

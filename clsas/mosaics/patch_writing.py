@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.atomic import sync_folder
+from clsas.engine.data.validate import ArgumentError
 from clsas.mosaics.documents import check_own, read_document, write_attributes
 from clsas.mosaics.levels import WINDOW, layers_of, shadowed_of, stored_levels
 from clsas.mosaics.pyramid import Level, layer_levels, levels
@@ -62,10 +63,8 @@ class PatchValues:
             ("rows", "columns"), place, own, arrays.files.pixels.shape, strict=True
         ):
             if range(count)[validate.selection(name, given, ascending=True)] != range(count)[part]:
-                raise ValueError(
-                    f"{name} must be {part.start}:{part.stop} for patch {row},{column}, got "
-                    f"{validate.shown(given)}"
-                )
+                expected = f"{part.start}:{part.stop} for patch {row},{column}"
+                raise ArgumentError(name, f"be {expected}", validate.shown(given))
         shape = tuple(part.stop - part.start for part in own)
         pixels = validate.array("pixels", pixels, np.complex64, shape)
         validate.instance("record", record, Record)
@@ -73,9 +72,10 @@ class PatchValues:
         attributes = read_document(arrays.path)
         expected = (*layers_of(attributes), *shadowed_of(attributes))
         if set(layers) != set(expected):
-            raise ValueError(
-                f"layers must be {', '.join(expected) or 'left out'} for {arrays.path}, got "
-                f"{', '.join(layers) or 'none'}"
+            raise ArgumentError(
+                "layers",
+                f"be {', '.join(expected) or 'left out'} for {arrays.path}",
+                ", ".join(layers) or "none",
             )
         known = {name: _layer(name, values, shape) for name, values in layers.items()}
         return cls((row, column), pixels, known, record)
@@ -116,8 +116,9 @@ def _layer(name: str, values: NDArray[np.float32], shape: tuple[int, ...]) -> ND
     """Return a layer of a patch as float32; raise TypeError or ValueError unless it is one."""
     validate.instance(name, values, np.ndarray)
     if values.dtype.kind != "f" or values.shape != shape or np.isinf(values).any():
-        raise ValueError(
-            f"layers must have real numbers of shape {shape}, finite or NaN, got "
-            f"{validate.shown(values)} for {name}"
+        raise ArgumentError(
+            "layers",
+            f"have real numbers of shape {shape}, finite or NaN",
+            f"{validate.shown(values)} for {name}",
         )
     return values.astype(np.float32)

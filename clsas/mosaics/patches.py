@@ -10,6 +10,7 @@ from typing import NamedTuple, Self
 
 from clsas.engine.data import validate
 from clsas.engine.data.grid import Grid
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.mosaics.levels import aligned_side, factors_of
 from clsas.mosaics.record import PatchIndex
 from clsas.mosaics.visibility import SurveyVisibility
@@ -133,9 +134,12 @@ def choose_patch_shape(
         if needed <= memory_bytes:
             return height, width
         side //= 2
-    raise ValueError(
-        f"memory_bytes must be at least {needed / 2**20:.0f} MiB for the smallest patches, of "
-        f"{height} x {width} pixels, got {memory_bytes / 2**20:.3g} MiB: raise it or give patches"
+    raise ArgumentError(
+        "memory_bytes",
+        f"be at least {needed / 2**20:.0f} MiB for the smallest patches, of {height} x {width} "
+        "pixels",
+        f"{memory_bytes / 2**20:.3g} MiB",
+        "raise it or give `patches`",
     )
 
 
@@ -147,21 +151,24 @@ def patch_shape_of(patches: tuple[int, int], grid: Grid) -> tuple[int, int]:
     TypeError, ValueError
         If `patches` are not two whole numbers, or some patches would be empty.
     """
+    meaning = "(rows, columns) of patches"
     try:
-        given = validate.entries("patches", patches, "(rows, columns) of patches")
+        given = validate.entries("patches", patches, meaning)
         counts = tuple(validate.count("every entry of patches", n) for n in given)
     except TypeError:
-        raise TypeError(f"patches must be (rows, columns) of patches, got {patches!r}") from None
+        raise ArgumentTypeError("patches", f"be {meaning}", repr(patches)) from None
     if len(counts) != 2:
-        raise ValueError(f"patches must be (rows, columns) of patches, got {patches!r}")
+        raise ArgumentError("patches", f"be {meaning}", repr(patches))
     shape = []
     for count, pixels in zip(counts, grid.shape, strict=True):
         side = math.ceil(pixels / count)
         if math.ceil(pixels / side) != count:
             fewer = math.ceil(pixels / side)
-            raise ValueError(
-                f"patches must all have pixels: {count} patches of {side} are too many for "
-                f"{pixels} pixels, {fewer} are enough"
+            raise ArgumentError(
+                "patches",
+                "all have pixels",
+                f"{count} patches of {side} for {pixels} pixels",
+                f"{fewer} are enough",
             )
         shape.append(aligned_side(side, count, pixels, factors_of(grid.shape)[-1]))
     return shape[0], shape[1]

@@ -13,6 +13,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.threads import uninterrupted, wait
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device
 from clsas.mosaics.devices import device_threads
 from clsas.mosaics.patches import Layout, PatchWindow
@@ -242,5 +243,7 @@ def wait_for_first_file(growth: Growth) -> None:
     start, folder = time.monotonic(), growth.folder
     while not files_of(folder):
         if has_ended(folder) or time.monotonic() - start > growth.idle_s:
-            raise ValueError(f"source must contain range lines, but {folder} has no file *.h5")
+            raise ArgumentError(
+                "source", "contain range lines", f"{folder}, which has no file *.h5"
+            )
         time.sleep(POLL_S)

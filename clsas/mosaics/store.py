@@ -23,6 +23,7 @@ from clsas.engine.data.digests import grid_digest, with_digest
 from clsas.engine.data.extras import needed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
+from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.result import Heights
 from clsas.mosaics import stored_heights
 from clsas.mosaics.documents import (
@@ -416,13 +417,11 @@ class Store:
             If a file cannot be read.
         """
         if validate.text("name", name) not in self.layers:
-            raise ValueError(
-                f"name must be that of a layer of {self.path} "
-                f"({', '.join(self.layers) or 'none: it has no heights'}), got {name!r}"
-            )
+            known = ", ".join(self.layers) or "none: it has no heights"
+            raise ArgumentError("name", f"be that of a layer of {self.path} ({known})", repr(name))
         if validate.count("factor", factor) != 1:
             if name in SHADOWED:
-                raise ValueError(f"factor must be 1 for {name}, which has no levels, got {factor}")
+                raise ArgumentError("factor", f"be 1 for {name}, which has no levels", str(factor))
             factor = self._checked_factor(factor)
         return self._read(f"{factor}x/{name}" if factor > 1 else name, rows, columns)
 
@@ -608,8 +607,8 @@ class Store:
             if damaged := self._level_damage():
                 raise ValueError(f"{self.path} is damaged: {describe_arrays(damaged)}{REPAIR}")
             known = ", ".join(map(str, found)) or "none"
-            raise ValueError(
-                f"factor must be that of a level of {self.path} ({known}), got {factor}"
+            raise ArgumentError(
+                "factor", f"be that of a level of {self.path} ({known})", str(factor)
             )
         return factor
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.grid import Grid, without_heights
 from clsas.engine.data.image import Image
+from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.refinement import filled
 from clsas.interferometry.result import Heights
 from clsas.mosaics.documents import read_document
@@ -32,8 +33,8 @@ def check_heights(store: Store) -> None:
     """Raise ValueError if a store has no heights."""
     if not store.layers:
         raise ValueError(
-            f"{store.path} must be a mosaic of heights, as of clsas.mosaic_heights, got one of "
-            "images"
+            f"{store.path} must be a mosaic of heights, got one of images: `clsas.mosaic_heights` "
+            "makes one of heights"
         )
 
 
@@ -64,7 +65,7 @@ def overview_of(store: Store, most: int, rows: slice, columns: slice) -> Heights
     for name, given, count in zip(("rows", "columns"), (rows, columns), grid.shape, strict=True):
         pixels = range(count)[validate.selection(name, given, ascending=True)]
         if pixels.step != 1:
-            raise ValueError(f"{name} must have no step for an overview, got {pixels.step}")
+            raise ArgumentError(name, "have no step for an overview", str(pixels.step))
         first.append(pixels.start)
         last.append(pixels.stop)
     factor = 1

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from clsas.engine.data import validate
 from clsas.engine.data.digests import Without, digest
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.files.hdf5 import FileFormatError, read_geometry, read_samples
 
 END = "end"
@@ -237,7 +238,7 @@ def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
         return Survey(geometry, (source,), (0, source.channels), (source.length,), ((0, 0),))
     paths = files_of(source)
     if not paths:
-        raise ValueError(f"source must contain range lines, but {source} has no file *.h5")
+        raise ArgumentError("source", "contain range lines", f"{source}, which has no file *.h5")
     return open_files(paths)
 
 
@@ -286,7 +287,7 @@ def warn_of_order(survey: Survey) -> None:
             f"{wrong.size} of {files}, first {survey.files[first].name}, the next file begins "
             f"{steps_m[first]:.3g} m away, and another one {nearest_m[first]:.3g} m. Only names "
             "give the order of pings, which a beam follows. Name the files in the order of time, "
-            "or give the direction of the track, BeamWindow(along=...)"
+            "or give the direction of the track, `BeamWindow(along=...)`"
         )
 
 
@@ -313,9 +314,10 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
     known = 0 if before is None else len(before.parts)
     if before is not None and paths[:known] != before.files:
         changed = next(a for a, b in zip((*paths, None), before.files, strict=False) if a != b)
-        raise ValueError(
-            "source may only gain files whose names sort after the last one, "
-            f"{before.files[-1].name}, got {'fewer files' if changed is None else changed.name}"
+        raise ArgumentError(
+            "source",
+            f"only gain files whose names sort after the last one, {before.files[-1].name}",
+            "fewer files" if changed is None else changed.name,
         )
     stamps = [] if before is None else list(before.stamps)
     found = [] if before is None else [before.geometry]
@@ -327,23 +329,20 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
         lengths.append(length)
         begins.append(begins[-1] + geometry.channels)
         found.append(geometry)
+        where, equal = f"{path}:", "equal that of the survey's first file"
         for name in ("range_step_m", "carrier_hz", "sound_speed_m_s"):
             ours, theirs = getattr(geometry, name), getattr(found[0], name)
             if ours != theirs:
-                raise ValueError(
-                    f"{path}: {name} must equal that of the survey's first file, {theirs:g}, got "
-                    f"{ours:g}"
-                )
-        if geometry.georeference != found[0].georeference:
-            raise ValueError(
-                f"{path}: georeference must equal that of the survey's first file, "
-                f"{found[0].georeference}, got {geometry.georeference}"
-            )
+                raise ArgumentError(name, f"{equal}, {theirs:g}", f"{ours:g}", where=where)
+        ours, theirs = geometry.georeference, found[0].georeference
+        if ours != theirs:
+            raise ArgumentError("georeference", f"{equal}, {theirs}", str(ours), where=where)
         if geometry.sound_speed != found[0].sound_speed:
-            raise ValueError(f"{path}: sound_speed must equal that of the survey's first file")
+            raise ArgumentError("sound_speed", equal, where=where)
         different = geometry.per_channel.keys() ^ found[0].per_channel.keys()
         for name in different - {_LOOK}:
-            raise ValueError(f"{path}: {name} must be in all files of the survey or in none")
+            allowed = "be in all files of the survey or in none"
+            raise ArgumentError(name, allowed, where=where)
     if any(each.look_direction is None for each in found):  # unknown for some is unknown for all
         found = [replace(each, look_direction=None) for each in found]
     entries = sum(each.size for part in found for each in part.per_channel.values())

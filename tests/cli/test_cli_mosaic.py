@@ -252,7 +252,7 @@ def test_options_replace_the_scene(made, tmp_path):
         (["--idle-s", "-1", "--lines", "folder", "--follow"], 2, "'--idle-s': must be"),
         (["--accuracy-db", "3"], 2, "'--accuracy-db': must be"),
         (["--idle-s", "5"], 2, "--idle-s requires --follow"),
-        (["--idle-s", "0.1", "--lines", "folder", "--follow"], 1, "folder has no file"),
+        (["--idle-s", "0.1", "--lines", "folder", "--follow"], 1, "folder, which has no file"),
     ],
 )
 def test_errors_are_one_message(made, monkeypatch, args, code, message):

@@ -240,9 +240,9 @@ def test_one_warning_names_all_patches_that_miss_the_seabed(tmp_path):
 
     text = measure()
     assert text.startswith(
-        "search_m may not contain the seabed: of 6 patches, the banks agree best at its lower end "
-        "in 6 (0,0; 0,1; 1,0; 1,1; ...), where most of the seabed seems to lie below it. Heights "
-        "may be wrong by multiples of the height of ambiguity, 1."
+        "`search_m` may not contain the seabed: of 6 patches, the banks agree best at its lower "
+        "end in 6 (0,0; 0,1; 1,0; 1,1; ...), where most of the seabed seems to lie below it. "
+        "Heights may be wrong by multiples of the height of ambiguity, 1."
     )
     assert text.endswith(" m: search farther below")
     assert measure() == text  # of patches that were measured before
@@ -565,7 +565,7 @@ class TestBadInput:
     def test_lines(self, tmp_path):
         first, second = flat_banks()
         self.refused(tmp_path, r"a must have at least 2 .* got 1: give the other one", first, None)
-        self.refused(tmp_path, "same carrier_hz", first, replace(second, carrier_hz=90e3))
+        self.refused(tmp_path, "same `carrier_hz`", first, replace(second, carrier_hz=90e3))
         self.refused(tmp_path, "apart across the line of sight", first, first)
         both = replace(first, bank_numbers=np.arange(first.channels) % 2)
         self.refused(tmp_path, "a must have the lines of one bank", both, second)

@@ -233,7 +233,7 @@ def test_errors(folder, tmp_path):
         open_survey(folder)
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(ValueError, match=r"must contain range lines, but .*empty has no file"):
+    with pytest.raises(ValueError, match=r"must contain range lines, got .*empty, which has no"):
         open_survey(empty)
 
 
