@@ -63,8 +63,8 @@ class PatchValues:
             ("rows", "columns"), place, own, arrays.files.pixels.shape, strict=True
         ):
             if range(count)[validate.selection(name, given, ascending=True)] != range(count)[part]:
-                expected = f"{part.start}:{part.stop} for patch {row},{column}"
-                raise ArgumentError(name, f"be {expected}", validate.shown(given))
+                allowed = f"be {part.start}:{part.stop} for patch {row},{column}"
+                raise ArgumentError(name, allowed, validate.shown(given))
         shape = tuple(part.stop - part.start for part in own)
         pixels = validate.array("pixels", pixels, np.complex64, shape)
         validate.instance("record", record, Record)

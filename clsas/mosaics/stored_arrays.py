@@ -23,7 +23,7 @@ from clsas.mosaics.record import PatchIndex, describe_damage
 if TYPE_CHECKING:
     import zarr
 
-REPAIR = "; run clsas mosaic with the same inputs to repair it"
+REPAIR = "; run `clsas.mosaic` with the same inputs to repair it"
 """End of messages about damage."""
 
 

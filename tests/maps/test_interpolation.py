@@ -289,7 +289,7 @@ def test_what_cannot_be_resampled_is_refused(tmp_path):
     tiny = noise(grid.window(slice(0, 20), slice(0, 40)))
     far = replace(lines, first_range_m=900.0)
     for source, how, message in (
-        (image, {}, "lines must be given for complex pixels with north_up"),
+        (image, {}, "lines must be given for complex pixels with `north_up`"),
         (raised, {"lines": lines}, "north_up must be off for complex pixels of a height map"),
         (image, {"lines": replace(lines, georeference=local(1.0))}, "lines must have the georef"),
         (image, {"lines": lines.without_samples()}, "lines must have samples other than 0"),

@@ -305,7 +305,7 @@ def test_damaged_levels_that_mix_patches_are_computed_again(tmp_path):
     chunk.write_bytes(b"\1" + chunk.read_bytes()[1:])
     assert not store.damage()
     assert store.array_damage() == {"8x/amplitude": "its values do not match their checksum"}
-    with pytest.raises(ValueError, match=r"8x/amplitude: .*; run clsas mosaic"):
+    with pytest.raises(ValueError, match=r"8x/amplitude: .*; run `clsas\.mosaic`"):
         store.overview(11)
     with pytest.warns(clsas.ClsasWarning, match="these levels are computed again: 8x/amplitude"):
         store = begun(store.path, MIXED)
@@ -341,7 +341,7 @@ def test_a_damaged_record_of_levels_is_reported(tmp_path, patch_shape, kind):
     verified = CliRunner().invoke(main, ["mosaic", "--verify", "-o", str(store.path)])
     assert verified.exit_code == 1
     assert "levels: its record" in verified.output
-    with pytest.raises(ValueError, match=r"damaged: levels: its record .*; run clsas mosaic"):
+    with pytest.raises(ValueError, match=r"damaged: levels: its record .*; run `clsas\.mosaic`"):
         store.read_level(8)
     with pytest.warns(clsas.ClsasWarning, match="these levels are computed again: levels: its"):
         store = begun(store.path, patch_shape)

@@ -73,7 +73,7 @@ def test_any_bit_of_coordinates_and_heights_is_found(path, kept, name):
         store = clsas.Store.opened(path)
         assert list(store.array_damage()) == [name[: name.index("/")]]
         for read in (store.image, store.overview, lambda store=store: store.grid):
-            with pytest.raises(ValueError, match=r"is damaged.*run clsas mosaic .* to repair it"):
+            with pytest.raises(ValueError, match=r"is damaged.*run `clsas\.mosaic` .* repair it"):
                 read()
     assert verified(path, 1)[1]["damaged_arrays"]
 

@@ -4,6 +4,7 @@ import dataclasses
 import errno
 import json
 import os
+import pickle
 import re
 import shutil
 import signal
@@ -528,7 +529,8 @@ class TestResuming:
         wrong = clsas.mosaic(LINES, GRID, path, stages=[(64, 64)], patches=(2, 4))
         with pytest.raises(ValueError, match=r"^stages must leave a line and a pixel") as caught:
             list(wrong)
-        assert caught.value.__notes__ == ["patch 0,0"]
+        sent = pickle.loads(pickle.dumps(caught.value))  # as worker processes do
+        assert caught.value.__notes__ == sent.__notes__ == ["patch 0,0"]
         other = REQUEST | {"patches": (3, 4)}
         with pytest.raises(ValueError, match="or delete the store: it has no finished patch"):
             clsas.mosaic(LINES, GRID, path, **other)
