@@ -67,11 +67,8 @@ def check_grid(grid: Grid) -> None:
         raise ArgumentError("grid", "have at least 2 rows and 2 columns", f"{rows} x {columns}")
     normal = np.cross(*grid.vectors_m[1:])
     if abs(normal[2]) < 0.1 * float(np.linalg.norm(normal)):
-        raise ArgumentError(
-            "grid",
-            "be a plane that heights along z can raise",
-            f"a vertical one with steps of {grid.row_step_m} and {grid.column_step_m} m",
-        )
+        given = f"a vertical one with steps of {grid.row_step_m} and {grid.column_step_m} m"
+        raise ArgumentError("grid", "be a plane that heights along z can raise", given)
 
 
 def check_pair(a: RangeLines, b: RangeLines) -> None:
@@ -79,11 +76,8 @@ def check_pair(a: RangeLines, b: RangeLines) -> None:
     validate.instance("a", a, RangeLines)
     validate.instance("b", b, RangeLines)
     if a.channels != b.channels or len(a.ping_starts) != len(b.ping_starts):
-        raise ArgumentError(
-            "a and b",
-            "contain the same pings, with as many channels each",
-            f"{_pings(a)} and {_pings(b)}",
-        )
+        allowed = "contain the same pings, with as many channels each"
+        raise ArgumentError("a and b", allowed, f"{_pings(a)} and {_pings(b)}")
     for name, unit in (("carrier_hz", "Hz"), ("sound_speed_m_s", "m/s"), ("range_step_m", "m")):
         first, second = getattr(a, name), getattr(b, name)
         if not math.isclose(first, second, rel_tol=1e-9):
@@ -163,11 +157,8 @@ def check_geometry(
         )
     ambiguity_m = 2 * math.pi / usual_rad_m
     if high_m - low_m > _MOST_CYCLES * ambiguity_m:
-        raise UnmeasurableError(
-            "search_m",
-            f"span at most {_MOST_CYCLES:g} heights of ambiguity ({ambiguity_m:.3g} m each)",
-            f"{high_m - low_m:g} m",
-        )
+        allowed = f"span at most {_MOST_CYCLES:g} heights of ambiguity ({ambiguity_m:.3g} m each)"
+        raise UnmeasurableError("search_m", allowed, f"{high_m - low_m:g} m")
     _check_decorrelation(baseline, points_m, ambiguity_m, relative_band, least_coherence)
     return ambiguity_m
 
@@ -186,17 +177,11 @@ def _check_below(
     lowest_m = float(antennas_m[:, 2].min() - points_m[:, 2].max())
     highest_m = float(antennas_m[:, 2].max() - points_m[:, 2].min())
     if lowest_m > 0 and search_m[1] >= lowest_m:
-        raise UnmeasurableError(
-            "search_m",
-            f"end below the sonar, which is {lowest_m:.4g} m above the grid",
-            f"{search_m[1]:g} m",
-        )
+        allowed = f"end below the sonar, which is {lowest_m:.4g} m above the grid"
+        raise UnmeasurableError("search_m", allowed, f"{search_m[1]:g} m")
     if highest_m < 0 and search_m[0] <= highest_m:
-        raise UnmeasurableError(
-            "search_m",
-            f"begin above the sonar, which is {-highest_m:.4g} m below the grid",
-            f"{search_m[0]:g} m",
-        )
+        allowed = f"begin above the sonar, which is {-highest_m:.4g} m below the grid"
+        raise UnmeasurableError("search_m", allowed, f"{search_m[0]:g} m")
 
 
 def _check_ranges(

@@ -201,8 +201,5 @@ def noise_coherence(looks: NDArray | float, probability: float) -> NDArray[np.fl
 def check_looks(window_m: float, looks: float) -> None:
     """Raise UnmeasurableError if a window has too few looks to estimate a coherence."""
     if looks < LEAST_LOOKS:
-        raise UnmeasurableError(
-            "window_m",
-            f"contain at least {LEAST_LOOKS:g} independent samples of the images",
-            f"{window_m:g} m, which contains {looks:.1f}",
-        )
+        allowed = f"contain at least {LEAST_LOOKS:g} independent samples of the images"
+        raise UnmeasurableError("window_m", allowed, f"{window_m:g} m, which contains {looks:.1f}")

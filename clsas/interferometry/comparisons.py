@@ -65,11 +65,8 @@ def _checked_heights(known_height_m: ArrayLike, shape: tuple[int, int]) -> NDArr
         known_height_m = checked_level(known_height_m)
     given = np.asanyarray(known_height_m)
     if np.ma.isMaskedArray(given) or given.dtype.kind not in "iuf":
-        raise ArgumentTypeError(
-            name,
-            "be a real number or an array of real numbers, NaN where heights are not known",
-            validate.shown(known_height_m),
-        )
+        allowed = "be a real number or an array of real numbers, NaN where heights are not known"
+        raise ArgumentTypeError(name, allowed, validate.shown(known_height_m))
     if given.shape not in ((), shape):
         allowed = f"be a number or have the shape of the heights, {shape}"
         raise ArgumentError(name, allowed, str(given.shape))

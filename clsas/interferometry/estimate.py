@@ -88,17 +88,11 @@ def _incomparable(comparison: Comparison, given: str) -> ArgumentError:
     equations = comparison.equations_at(np.zeros(2))
     some = equations.usable
     if not some.any():
-        return ArgumentError(
-            given,
-            "share places with the valid heights",
-            hint=f"no valid height lies at {comparison.what}",
-        )
+        allowed = "share places with the valid heights"
+        return ArgumentError(given, allowed, hint=f"no valid height lies at {comparison.what}")
     typical_m = float(np.median(np.abs(equations.residual_m[some])))
-    return ArgumentError(
-        given,
-        "lie close enough to the heights for errors of the pair to explain the difference",
-        f"{typical_m:.3g} m",
-    )
+    allowed = "lie close enough to the heights for errors of the pair to explain the difference"
+    return ArgumentError(given, allowed, f"{typical_m:.3g} m")
 
 
 def _unobservable(

@@ -248,11 +248,8 @@ def _checked_other(
     except ArgumentError as error:
         raise error.within("other:") from None
     if not math.isclose(low.carrier_hz, a.carrier_hz, rel_tol=1e-9):
-        raise ArgumentError(
-            "other",
-            "be lines of the same sonar, with the same `carrier_hz`",
-            f"{low.carrier_hz:.9g} and {a.carrier_hz:.9g} Hz",
-        )
+        allowed = "be lines of the same sonar, with the same `carrier_hz`"
+        raise ArgumentError("other", allowed, f"{low.carrier_hz:.9g} and {a.carrier_hz:.9g} Hz")
     return low, high, found
 
 

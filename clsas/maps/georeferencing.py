@@ -210,11 +210,8 @@ def _known(name: str) -> pyproj.CRS:
         found = pyproj.CRS.from_user_input(name)
     except CRSError as error:
         reason = str(error).partition("(Internal Proj Error: ")[2].rstrip(")") or "not a CRS"
-        raise ArgumentError(
-            "crs",
-            "be one that PROJ knows, such as 'EPSG:32632'",
-            f"{validate.shown(name)} ({reason})",
-        ) from None
+        allowed = "be one that PROJ knows, such as 'EPSG:32632'"
+        raise ArgumentError("crs", allowed, f"{validate.shown(name)} ({reason})") from None
     if not found.is_projected:
         kind = "a geographic one" if found.is_geographic else "of another kind"
         raise ArgumentError(

@@ -200,11 +200,8 @@ def check_image(grid: Grid) -> None:
             "be off for complex pixels of a height map, whose phase changes with the height",
         )
     if min(grid.shape) < (least := 2 * margin_of(_GUARDS[0]) + 2):
-        raise ArgumentError(
-            "source",
-            f"have at least {least} rows and columns for complex pixels with `north_up`",
-            f"{grid.shape[0]} x {grid.shape[1]}",
-        )
+        allowed = f"have at least {least} rows and columns for complex pixels with `north_up`"
+        raise ArgumentError("source", allowed, f"{grid.shape[0]} x {grid.shape[1]}")
 
 
 def margin_of(guard: float) -> int:

@@ -105,17 +105,11 @@ def _checked(grid: Grid, lines: RangeLines | None, most_bytes: int) -> RangeLine
         got = "points" if grid.points_m is not None else "a height map"
         raise ArgumentError("source", "be on a plane for SICD", got)
     if grid.georeference is None:
-        raise ArgumentError(
-            "source",
-            "have a georeference for SICD, whose coordinates are fixed to the Earth",
-            hint="give `georeference`",
-        )
+        allowed = "have a georeference for SICD, whose coordinates are fixed to the Earth"
+        raise ArgumentError("source", allowed, hint="give `georeference`")
     if min(grid.shape) < 2 or 8 * grid.size > most_bytes:
-        raise ArgumentError(
-            "source",
-            f"have at least 2 rows, 2 columns and at most {most_bytes // 8} pixels for SICD",
-            f"{grid.shape[0]} x {grid.shape[1]}",
-        )
+        allowed = f"have at least 2 rows, 2 columns and at most {most_bytes // 8} pixels for SICD"
+        raise ArgumentError("source", allowed, f"{grid.shape[0]} x {grid.shape[1]}")
     _, row_step_m, column_step_m = grid.vectors_m
     lengths = np.linalg.norm(row_step_m) * np.linalg.norm(column_step_m)
     if abs(row_step_m @ column_step_m) > _SKEW * lengths:

@@ -72,11 +72,8 @@ class PatchValues:
         attributes = read_document(arrays.path)
         expected = (*layers_of(attributes), *shadowed_of(attributes))
         if set(layers) != set(expected):
-            raise ArgumentError(
-                "layers",
-                f"be {', '.join(expected) or 'left out'} for {arrays.path}",
-                ", ".join(layers) or "none",
-            )
+            allowed = f"be {', '.join(expected) or 'left out'} for {arrays.path}"
+            raise ArgumentError("layers", allowed, ", ".join(layers) or "none")
         known = {name: _layer(name, values, shape) for name, values in layers.items()}
         return cls((row, column), pixels, known, record)
 
@@ -116,9 +113,6 @@ def _layer(name: str, values: NDArray[np.float32], shape: tuple[int, ...]) -> ND
     """Return a layer of a patch as float32; raise TypeError or ValueError unless it is one."""
     validate.instance(name, values, np.ndarray)
     if values.dtype.kind != "f" or values.shape != shape or np.isinf(values).any():
-        raise ArgumentError(
-            "layers",
-            f"have real numbers of shape {shape}, finite or NaN",
-            f"{validate.shown(values)} for {name}",
-        )
+        allowed = f"have real numbers of shape {shape}, finite or NaN"
+        raise ArgumentError("layers", allowed, f"{validate.shown(values)} for {name}")
     return values.astype(np.float32)

@@ -314,11 +314,8 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
     known = 0 if before is None else len(before.parts)
     if before is not None and paths[:known] != before.files:
         changed = next(a for a, b in zip((*paths, None), before.files, strict=False) if a != b)
-        raise ArgumentError(
-            "source",
-            f"only gain files whose names sort after the last one, {before.files[-1].name}",
-            "fewer files" if changed is None else changed.name,
-        )
+        allowed = f"only gain files whose names sort after the last one, {before.files[-1].name}"
+        raise ArgumentError("source", allowed, "fewer files" if changed is None else changed.name)
     stamps = [] if before is None else list(before.stamps)
     found = [] if before is None else [before.geometry]
     lengths = [] if before is None else list(before.lengths)
