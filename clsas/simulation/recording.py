@@ -29,6 +29,7 @@ from clsas.engine.data.fourier import EDGE_PRODUCT, gridding_gain, smooth_edge, 
 from clsas.engine.data.system import PASSBAND
 from clsas.engine.data.threads import in_threads
 from clsas.engine.data.track import Channels
+from clsas.engine.data.validate import ArgumentError
 from clsas.simulation.paths import Paths, PointBlock
 from clsas.simulation.patterns import interpolation_matrix
 from clsas.simulation.refraction import MOST_FOCUS
@@ -168,9 +169,10 @@ def _add(
         points, amplitudes, legs = points[kept], amplitudes[kept], legs.at(kept)
     touching = min(legs.out_m.min(), legs.back_m.min()) < _TOUCHING_M
     if (paths.spreading or patterns) and touching:
-        raise ValueError(
-            f"scene must have no point on an element with spreading or element patterns, "
-            f"got one on an element of channel {channel}"
+        raise ArgumentError(
+            "scene",
+            "have no point on an element with spreading or element patterns",
+            f"one on an element of channel {channel}",
         )
     sines: list[NDArray] = []
     if patterns is not None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.data.track import Channels
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.water.ray_tables import (
     TIMES,
     USUAL,
@@ -158,7 +159,7 @@ class BlockRays:
         at_z = float(np.broadcast_to(antenna_z_m, distance_m.shape)[nearest])
         place = float(distance_m[nearest]), at_z, float(self.z_m[nearest])
         why = shadow(self.profile, *place)
-        raise ValueError(f"scene must have no point without a ray: {why}")
+        raise ArgumentError("scene", "have no point without a ray", hint=why)
 
 
 def _legs(out: _Leg, back: _Leg) -> Legs:

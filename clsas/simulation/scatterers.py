@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from clsas.engine.data.validate import ArgumentError
 from clsas.simulation.height_field import HeightField
 
 _TILE_M = 2.0  # side of the tiles that are kept or left out as a whole, depending on the beam
@@ -52,9 +53,8 @@ def draw_scatterers(
     order = np.argsort(tile, kind="stable")
     cells = np.repeat(order, counts.ravel()[order])
     if not cells.size:
-        raise ValueError(
-            f"density_m2 must put at least one scatterer on the seabed, got {density_m2:g} per m2"
-        )
+        allowed = "put at least one scatterer on the seabed"
+        raise ArgumentError("density_m2", allowed, f"{density_m2:g} per m2")
     row, column = np.divmod(cells, counts.shape[1])
     u, v = random.random((2, len(cells)))
     h = surface.heights_m

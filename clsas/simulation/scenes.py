@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.validate import ArgumentError, Count, Number
 from clsas.simulation.height_field import BentRays, HeightField
 from clsas.simulation.refraction import Sightlines
 from clsas.simulation.scatterers import Scatterers, draw_scatterers
@@ -210,33 +211,28 @@ class Seabed:
     y_m: tuple[float, float]
     heights_m: NDArray[np.float64]
     texture: NDArray[np.float64] = 1.0  # type: ignore[assignment]
-    density_m2: float = 600.0
-    seed: int = 0
-    floor_db: float = -50.0
+    density_m2: Annotated[float, Number("per m2", above=0.0, help="Density of scatterers.")] = 600.0
+    seed: Annotated[int, Count(0, help="Seed of positions and amplitudes.")] = 0
+    floor_db: Annotated[
+        float, Number("dB", least=-200.0, most=-10.0, help="Floor of the two-way element pattern.")
+    ] = -50.0
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""
+        validate.check_fields(self)
         for name in ("x_m", "y_m"):
             object.__setattr__(self, name, checked_extent(name, getattr(self, name)))
         heights = validate.array("heights_m", self.heights_m, np.float64, (None, None))
         if min(heights.shape) < 2:
-            raise ValueError(
-                f"heights_m must have at least 2 rows and 2 columns, got {heights.shape}"
-            )
+            allowed = "have at least 2 rows and 2 columns"
+            raise ArgumentError("heights_m", allowed, str(heights.shape))
         texture = validate.array("texture", self.texture, np.float64, None)
         texture = np.broadcast_to(texture, heights.shape) if texture.ndim == 0 else texture
         texture = validate.array("texture", texture, np.float64, heights.shape)
         if texture.min() < 0:
-            raise ValueError(f"texture must be at least 0, got {texture.min():g}")
-        fields = {
-            "heights_m": heights,
-            "texture": texture,
-            "density_m2": validate.positive("density_m2", self.density_m2, "per m2"),
-            "seed": validate.count("seed", self.seed, least=0),
-            "floor_db": validate.number("floor_db", self.floor_db, "dB", least=-200.0, most=-10.0),
-        }
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
+            raise ArgumentError("texture", "be at least 0", f"{texture.min():g}")
+        object.__setattr__(self, "heights_m", heights)
+        object.__setattr__(self, "texture", texture)
         with np.errstate(over="ignore", invalid="ignore"):
             area_m2 = self._surface.cell_areas_m2.sum()
         validate.memory("density_m2", 100 * self.density_m2 * area_m2)
@@ -291,9 +287,8 @@ class Seabed:
         try:
             np.broadcast_shapes(x_m.shape, y_m.shape)
         except ValueError:
-            raise ValueError(
-                f"x_m and y_m must broadcast, got shapes {x_m.shape} and {y_m.shape}"
-            ) from None
+            shapes = f"shapes {x_m.shape} and {y_m.shape}"
+            raise ArgumentError("x_m", "broadcast with `y_m`", shapes) from None
         return self._surface.height_m(x_m, y_m)
 
     def lit(self, points_m: ArrayLike, eye_m: ArrayLike) -> NDArray[np.bool_]:
@@ -384,5 +379,5 @@ def checked_extent(name: str, value: ArrayLike) -> tuple[float, float]:
     """Return `value` as (first, last) in metres; raises ValueError unless they ascend."""
     first, last = validate.array(name, value, np.float64, (2,)).tolist()
     if not first < last:
-        raise ValueError(f"{name} must be first < last in m, got ({first:g}, {last:g})")
+        raise ArgumentError(name, "be first < last in m", (first, last))
     return first, last

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from clsas.engine.data import validate
+from clsas.engine.data.validate import ArgumentError
 from clsas.simulation.scenes import Seabed, checked_extent
 
 _MOST_BOULDERS = 100_000  # boulders of about 1 m2 each, many times the default patch of 2560 m2
@@ -198,10 +199,8 @@ class _Sand(NamedTuple):
         heading = math.radians(validate.number("heading_deg", heading_deg, "degrees"))
         for value, extent in zip(position, (self.x_m, self.y_m), strict=True):
             if not extent[0] <= value <= extent[1]:
-                raise ValueError(
-                    f"position_m must lie on the patch, x {self.x_m} m and y {self.y_m} m, "
-                    f"got {tuple(position.tolist())} m"
-                )
+                allowed = f"lie on the patch, x {self.x_m} m and y {self.y_m} m"
+                raise ArgumentError("position_m", allowed, f"{tuple(position.tolist())} m")
         rows, columns = self.heights.shape
         east = np.linspace(*self.x_m, columns) - position[0]
         north = np.linspace(*self.y_m, rows)[:, None] - position[1]

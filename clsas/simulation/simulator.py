@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +14,7 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.sound_speed import SoundSpeed, check_reaches
 from clsas.engine.data.system import PASSBAND, Sonar
 from clsas.engine.data.track import Channels, Pointing, Track, channels
+from clsas.engine.data.validate import ArgumentError, Count, Flag, Number
 from clsas.engine.signal.compression import Window, compress
 from clsas.engine.signal.compression import check_options as check_compression
 from clsas.engine.signal.echoes import Echoes
@@ -163,8 +165,8 @@ def simulate(
         patterns = ElementPatterns(sonar, (pointing or Pointing.broadside()).axes(track))
         look = np.repeat(patterns.axes[:, 1], sonar.receivers, axis=0)
     elif pointing is not None:
-        why = "the sonar's elements have no sizes" if element_pattern else "element_pattern is off"
-        raise ValueError(f"pointing must be left out: {why}")
+        why = "the elements have no sizes" if element_pattern else "`element_pattern` is off"
+        raise ArgumentError("pointing", "be left out", hint=why)
     pulse, rate, sound = sonar.pulse, sonar.sample_rate_hz, sonar.sound_speed_m_s
     geometry = channels(sonar, track, motion_in_flight=motion_in_flight)
     if phase_centres:
@@ -210,29 +212,26 @@ def simulate(
 def check_options(
     *,
     pointing: Pointing | None = None,
-    spreading: bool = False,
-    motion_in_flight: bool = False,
-    element_pattern: bool = True,
-    phase_centres: bool = False,
+    spreading: Annotated[bool, Flag(help="Apply 1/(R_tx R_rx).")] = False,
+    motion_in_flight: Annotated[bool, Flag(help="Move receivers while sound travels.")] = False,
+    element_pattern: Annotated[bool, Flag(help="Apply the elements' patterns.")] = True,
+    phase_centres: Annotated[bool, Flag(help="Place antennas at the phase centres.")] = False,
     range_m: ArrayLike | None = None,
-    snr_db: float | None = None,
-    seed: int = 0,
+    snr_db: Annotated[
+        float | None,
+        Number("dB", least=-200.0, most=300.0, help="Largest echo relative to the noise."),
+    ] = None,
+    seed: Annotated[int, Count(0, help="Seed of the noise.")] = 0,
     sound_speed: SoundSpeed | None = None,
 ) -> None:
     """Raise TypeError or ValueError for options that `simulate` refuses for every survey."""
+    validate.check_declared(check_options, locals())
     validate.instance("pointing", pointing, Pointing, type(None))
     validate.instance("sound_speed", sound_speed, SoundSpeed, type(None))
-    validate.flag("spreading", spreading)
-    validate.flag("motion_in_flight", motion_in_flight)
-    validate.flag("element_pattern", element_pattern)
-    validate.flag("phase_centres", phase_centres)
     if range_m is not None:
         near, far = validate.array("range_m", range_m, np.float64, (2,))
         if not 0 <= near < far:
-            raise ValueError(f"range_m must be 0 <= near < far in m, got ({near:g}, {far:g})")
-    if snr_db is not None:
-        validate.number("snr_db", snr_db, "dB", least=-200.0, most=300.0)
-    validate.count("seed", seed, least=0)
+            raise ArgumentError("range_m", "be 0 <= near < far in m", (near, far))
 
 
 def check_size(sonar: Sonar, track: Track, range_m: ArrayLike | None = None) -> None:
@@ -347,7 +346,8 @@ def simulate_lines(
     _check_heights(sound_speed, antennas, parts)
     paths = Paths(parts, antennas, sound, sound_speed=sound_speed)
     if (first_range_m is None) != (length is None):
-        raise ValueError("first_range_m and length must be given together or not at all")
+        allowed = "be given together with `length` or not at all"
+        raise ArgumentError("first_range_m", allowed)
     # The receiver's filter needs a guard band. If there is none, record at twice the rate.
     every = 1 if oversampling * PASSBAND >= 1 else 2
     rate = every * float(oversampling) * band
@@ -425,7 +425,7 @@ def _add_noise(samples: NDArray[np.complex64], snr_db: float, seed: int) -> None
     """Add white noise relative to the strongest sample, in place."""
     peak = np.max([np.abs(line).max() for line in samples])
     if peak == 0:
-        raise ValueError(f"snr_db must be left out without an echo: {NO_ECHO}")
+        raise ArgumentError("snr_db", "be left out without an echo", hint=NO_ECHO)
     # Standard deviation of the real and of the imaginary part.
     deviation = np.float32(peak * 10 ** (-snr_db / 20) / np.sqrt(2))
     random = np.random.default_rng(int(seed))
