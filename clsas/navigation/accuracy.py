@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import validate
+from clsas.engine.data.validate import ArgumentError
 
 _LEAST_DEVIATION = 1e-9  # smallest standard deviation accepted, metres or radians
 _MOST_DEVIATION_M = 1e3
@@ -57,10 +58,8 @@ class Accuracy:
             checked = validate.array(name, value, np.float64, (pings,), broadcast=True)
             if checked.min() < _LEAST_DEVIATION or checked.max() > most:
                 outside = checked.min() if checked.min() < _LEAST_DEVIATION else checked.max()
-                raise ValueError(
-                    f"{name} must be from {_LEAST_DEVIATION:g} to {most:.4g} {unit}, "
-                    f"got {outside:g} {unit}"
-                )
+                allowed = f"be from {_LEAST_DEVIATION:g} to {most:.4g} {unit}"
+                raise ArgumentError(name, allowed, f"{outside:g} {unit}")
             deviations.append(checked)
         return cls(np.stack(deviations, axis=1), correlation_pings)
 
@@ -75,6 +74,6 @@ def check_plausible(states: NDArray[np.float64], accuracy: Accuracy) -> None:
         ]
         validate.warn(
             f"the {name} found is {ratio[worst]:.3g} times the accuracy given for the navigation "
-            f"({option}), rms over the pings. Check {option}, side and element_length_m, and run "
-            "`clsas inspect`, which detects samples with the wrong sign of phase"
+            f"(`{option}`), rms over the pings. Check `{option}`, `side` and `element_length_m`, "
+            "and run `clsas inspect`, which detects samples with the wrong sign of phase"
         )

@@ -25,6 +25,7 @@ from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.forming import form, scene_of_plan
 from clsas.engine.imaging import plan
@@ -263,9 +264,11 @@ class _Focus:
         for name, gradient in zip(names, found.gradient, strict=True):
             change = math.sqrt(float(np.sum(weights * gradient**2)) / total)
             if weights.any() and change < _LEAST_GRADIENT:
-                raise ValueError(
-                    f"unknowns must change the range to the responses, but {name} of 1 m changes "
-                    f"it by {change:.2g} m rms; at least {_LEAST_GRADIENT:g} m is needed"
+                raise ArgumentError(
+                    "unknowns",
+                    "change the range to the responses by at least "
+                    f"{_LEAST_GRADIENT:g} m rms per metre",
+                    f"{name}, which changes it by {change:.2g} m",
                 )
         if len(names) == 1:
             return
@@ -274,10 +277,12 @@ class _Focus:
         correlation = normal / np.maximum(np.outer(scale, scale), 1e-300)
         condition = float(np.linalg.cond(correlation))
         if not condition < _MOST_CONDITION:
-            raise ValueError(
-                f"unknowns {', '.join(names)} cannot be distinguished: all responses see the sonar "
-                f"from nearly the same direction (condition number {condition:.3g}, at most "
-                f"{_MOST_CONDITION:g})"
+            raise ArgumentError(
+                "unknowns",
+                "be distinguishable",
+                names,
+                "all responses see the sonar from nearly the same direction (condition number "
+                f"{condition:.3g}, at most {_MOST_CONDITION:g})",
             )
 
     def result(self) -> Autofocus:

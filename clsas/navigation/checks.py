@@ -9,10 +9,11 @@ import numpy as np
 from clsas.engine.data import validate
 from clsas.engine.data.lines import RangeLines, band_wavelength_m, banks_of, is_about_zero
 from clsas.engine.data.pings import Transmissions
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.interpolation import Readout
 
 _MOST_OVERSAMPLING = 64.0  # limits the range resolution of lines that are almost constant
-_REMEDY = "lines.without_still_pings() drops them"
+_REMEDY = "`lines.without_still_pings()` drops them"
 
 
 def mean_wavelength_m(readout: Readout) -> float:
@@ -25,9 +26,10 @@ def mean_wavelength_m(readout: Readout) -> float:
     """
     lines, centre = readout.lines, readout.spectrum.centre
     if is_about_zero(lines, centre):
-        raise ValueError(
-            "carrier_hz must be that of the lines, unless their samples still have their carrier; "
-            f"got {lines.carrier_hz:g} Hz, and samples whose band is about 0 Hz"
+        raise ArgumentError(
+            "carrier_hz",
+            "be that of the lines, unless their samples still have their carrier",
+            f"{lines.carrier_hz:g} Hz, and samples whose band is about 0 Hz",
         )
     return band_wavelength_m(lines, centre)
 
@@ -42,7 +44,7 @@ def checked_unknowns(unknowns: Sequence[str], allowed: Sequence[str]) -> tuple[s
     """Return the names of unknowns; refuse none at all, repeated ones and those not allowed."""
     names = validate.named("unknowns", unknowns, allowed)
     if not names or len(set(names)) < len(names):
-        raise ValueError(f"unknowns must be one or several of {tuple(allowed)}, got {names}")
+        raise ArgumentError("unknowns", f"be one or several of {tuple(allowed)}", names)
     return names
 
 
@@ -61,9 +63,11 @@ def first_bank(lines: RangeLines) -> RangeLines:
     bank = lines.bank(number)
     pings, of_bank = len(lines.ping_starts), len(bank.ping_starts)
     if of_bank != pings:
-        raise ValueError(
-            f"lines must have channels of every bank in every ping, but only {of_bank} of {pings} "
-            f"pings have some of bank {number}. Correct one bank alone: lines.bank({number})"
+        raise ArgumentError(
+            "lines",
+            "have channels of every bank in every ping",
+            f"some of bank {number} in only {of_bank} of {pings} pings",
+            f"correct one bank alone, `lines.bank({number})`",
         )
     return bank
 
@@ -95,29 +99,27 @@ def check_navigation(lines: RangeLines, least_pings: int, purpose: str, *, may_s
     pings = Transmissions.of(lines.tx_m, lines.rx_m)
     positions = len(lines.ping_starts)
     if positions < least_pings:
-        got = f"got {positions}"
+        got = str(positions)
         if pings.count > positions:
             got = (
-                f"got {pings.count} transmissions from {positions} position"
+                f"{pings.count} transmissions from {positions} position"
                 f"{'s' * (positions > 1)}: positions are missing, or the platform stood still"
             )
         elif positions == 1:
-            got = "got one (all channels share one transmitter position)"
-        raise ValueError(f"lines must have at least {least_pings} pings for {purpose}, {got}")
+            got = "one (all channels share one transmitter position)"
+        raise ArgumentError("lines", f"have at least {least_pings} pings for {purpose}", got)
     if pings.count > positions:
         repeated = np.flatnonzero(~np.isin(pings.starts[:-1], lines.ping_starts))
         many = f"{len(repeated)} pings repeat" if len(repeated) > 1 else "1 ping repeats"
         fault = f"{many} the position of the ping before (the first is ping {repeated[0]})"
         if not may_stand:
-            raise ValueError(
-                f"lines must have pings at different positions for {purpose}, but {fault}; "
-                f"{_REMEDY}"
-            )
+            allowed = f"have pings at different positions for {purpose}"
+            raise ArgumentError("lines", allowed, hint=f"{fault}; {_REMEDY}")
         validate.warn(f"{fault}: they are corrected as one ping with it; {_REMEDY}")
     turns = pings.turns
     if turns.size:
         validate.warn(
             f"the track turns back {turns.size} time{'s' * (turns.size > 1)} (first after ping "
             f"{turns[0]}): pings may be out of order. They are used in the order of the lines; "
-            "lines.select(order) sorts them"
+            "`lines.select(order)` sorts them"
         )

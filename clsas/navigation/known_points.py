@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.track import Track
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.interpolation import Readout
 from clsas.navigation.calibration_result import UNITS, Calibration
 from clsas.navigation.checks import checked_unknowns
@@ -128,9 +129,11 @@ def calibrate_track(
     """
     validate.instance("lines", lines, RangeLines)
     if lines.sound_speed is not None:
-        raise ValueError(
-            "lines must not have sound_speed: ranges of known points determine a constant speed. "
-            "Calibrate replace(lines, sound_speed=None), near the sonar, and add the profile then"
+        raise ArgumentError(
+            "lines",
+            "have no `sound_speed`",
+            hint="ranges of known points determine a constant speed; calibrate near the sonar, "
+            "without the profile, and add it then",
         )
     points = validate.array("points_m", points_m, np.float64, (None, 3))
     names = checked_unknowns(unknowns, UNKNOWNS)
@@ -156,8 +159,8 @@ def calibrate_track(
             "the measured ranges of the points differ from those of the corrected lines by "
             f"{reprs.quantity(result.misfit_m, 'm')} rms in addition to the noise, which is more "
             "than a third of a range resolution cell. Positions of points or track are off by as "
-            f"much, or search_m ({search_m:.3g} m) is so large that reflectors are mistaken for "
-            "each other"
+            f"much, or `search_m` ({search_m:.3g} m) is so large that reflectors are mistaken "
+            "for each other"
         )
     step()
     return result
@@ -186,18 +189,19 @@ def _axes(lines: RangeLines, names: tuple[str, ...], track: Track | None) -> NDA
         validate.instance("track", track, Track)
         pings = int(ping[-1]) + 1
         if track.pings != pings:
-            raise ValueError(
-                f"track must have a pose for each of the {pings} pings of lines, got {track.pings}"
-            )
+            allowed = f"have a pose for each of the {pings} pings of lines"
+            raise ArgumentError("track", allowed, track.pings)
         return track.rotations.as_matrix()[ping].transpose(2, 0, 1)
     if not set(names) & set(UNKNOWNS[2:]):
         return np.zeros((3, lines.channels, 3))
     try:
         return displacement_axes(lines, ("surge", "sway", "heave"))[:, ping]
     except ValueError as error:
-        raise ValueError(
-            "track must be given for a lever arm, with the platform's attitude, which does not "
-            f"follow from the positions of lines ({error})"
+        raise ArgumentError(
+            "track",
+            "be given for a lever arm, with the platform's attitude, which does not follow from "
+            "the positions of lines",
+            hint=str(error),
         ) from error
 
 
@@ -210,10 +214,12 @@ def _check_within(model: Model, search_m: float) -> None:
     counts = inside.sum(axis=0)
     worst = int(np.argmin(counts))
     if counts[worst] < min(_LEAST_SEEN, lines.channels):
-        raise ValueError(
-            f"points_m must lie where lines have samples, but point {worst} is at ranges from "
-            f"{expected_m[:, worst].min():.6g} to {expected_m[:, worst].max():.6g} m, and lines "
-            f"extend from {lines.first_range_m.min():.6g} to {lines.last_range_m.max():.6g} m"
+        raise ArgumentError(
+            "points_m",
+            "lie where lines have samples, at ranges from "
+            f"{lines.first_range_m.min():.6g} to {lines.last_range_m.max():.6g} m",
+            f"point {worst} at ranges from {expected_m[:, worst].min():.6g} to "
+            f"{expected_m[:, worst].max():.6g} m",
         )
 
 
@@ -261,7 +267,7 @@ def _check_seen(result: Calibration, snr: NDArray[np.float64], search_m: float) 
     between = np.array([_between(np.isfinite(each)) for each in result.residual_m.T])
     missing = np.flatnonzero((result.seen < _LEAST_SEEN) | (result.seen < _LEAST_SHARE * between))
     criterion = (
-        f"Echoes must exceed the noise by {10 * math.log10(LEAST_SNR):g} dB in at least "
+        f"echoes must exceed the noise by {10 * math.log10(LEAST_SNR):g} dB in at least "
         f"{_LEAST_SEEN} channels, and in {100 * _LEAST_SHARE:g} % of the channels between the "
         f"first and the last of them, within {search_m:.3g} m of the expected range"
     )
@@ -272,14 +278,16 @@ def _check_seen(result: Calibration, snr: NDArray[np.float64], search_m: float) 
         )
     )
     if len(missing) == snr.shape[1]:
-        raise ValueError(
-            f"points_m must be seen, but no point is. {criterion}; those of point {counts} do, "
-            f"which noise alone may reach. The largest is {snr.max():.3g} times the noise. Check "
-            "positions, sound speed and search_m"
+        raise ArgumentError(
+            "points_m",
+            "be seen",
+            "none that is",
+            f"{criterion}; those of point {counts} do, which noise alone may reach. The largest is "
+            f"{snr.max():.3g} times the noise. Check positions, sound speed and `search_m`",
         )
     if len(missing):
         validate.warn(
-            f"{len(missing)} of {snr.shape[1]} points are not seen, and only the others are used. "
+            f"{len(missing)} of {snr.shape[1]} points are not seen, and only the others are used: "
             f"{criterion}; those of point {counts} do"
         )
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.track import Track
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.compression import compress
 from clsas.engine.signal.echoes import Echoes
 from clsas.engine.water.ray_delays import at_speed
@@ -247,7 +248,7 @@ def micronavigate(
     validate.progress(progress)
     names = validate.named("unknowns", unknowns, UNKNOWNS)
     if "sway" not in names:
-        raise ValueError(f"unknowns must include 'sway', got {names}")
+        raise ArgumentError("unknowns", "include 'sway'", names)
     check_navigation(lines, 2, "micronavigation", may_stand=False)
     array_lines = first_bank(lines)
     if lines.sound_speed is not None:
@@ -345,18 +346,20 @@ def _check_coherence(found: Displacements) -> None:
     few = int(found.sparse.sum())
     if count - without - few < max(1, _LEAST_SHARE * count):
         if few > without:
-            raise ValueError(
-                "lines must have echoes from all over a seabed to measure yaw, but in "
-                f"{few} of {count} pairs of pings they come from about "
-                f"{np.median(found.echoes):.1f} reflectors; at least {LEAST_ECHOES:g} are needed. "
-                'Use more range, leave out yaw with unknowns=("sway",), or use clsas.autofocus'
+            raise ArgumentError(
+                "lines",
+                f"have echoes of at least {LEAST_ECHOES:g} reflectors, from all over a seabed, to "
+                "measure yaw",
+                f"about {np.median(found.echoes):.1f} in {few} of {count} pairs of pings",
+                "use more range, leave out yaw with `unknowns=('sway',)`, or use `clsas.autofocus`",
             )
-        raise ValueError(
-            f"lines must be coherent from ping to ping, but {without} of {count} pairs of pings "
-            "are not: their coherence is at most "
-            f"{found.coherence[~found.coherent].max():.2f} in any window, and at least "
-            f"{found.least_coherence.min():.2f} is needed to distinguish echoes from noise. "
-            "Check range_m, and the advance from ping to ping in the navigation"
+        raise ArgumentError(
+            "lines",
+            f"have a coherence of at least {found.least_coherence.min():.2f} from ping to ping, "
+            "which distinguishes echoes from noise",
+            f"at most {found.coherence[~found.coherent].max():.2f} in any window of {without} of "
+            f"{count} pairs of pings",
+            "check `range_m`, and the advance from ping to ping in the navigation",
         )
     if without:
         validate.warn(

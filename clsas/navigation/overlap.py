@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 
 _MOST_APART = 0.5
 """Largest distance along the array, in spacings of the array, at which two phase centres are
@@ -53,14 +54,14 @@ class Array:
         starts = np.append(lines.ping_starts, lines.channels)
         counts = np.diff(starts)
         if len(counts) < 2:
-            raise ValueError(
-                "lines must have at least 2 pings, got one (all channels share one transmitter "
-                "position)"
-            )
+            got = "one (all channels share one transmitter position)"
+            raise ArgumentError("lines", "have at least 2 pings", got)
         if counts.min() < 2:
-            raise ValueError(
-                f"every ping of lines must have at least 2 receivers, got {counts.min()} in ping "
-                f"{counts.argmin()}: without overlapping phase centres use clsas.autofocus"
+            raise ArgumentError(
+                "lines",
+                "have at least 2 receivers in every ping",
+                f"{counts.min()} in ping {counts.argmin()}",
+                "without overlapping phase centres, use `clsas.autofocus`",
             )
         centres_m = lines.phase_centres_m
         reference_m = lines.ping_centres_m
@@ -68,9 +69,10 @@ class Array:
         forward[:, 2] = 0.0
         length_m = np.linalg.norm(forward, axis=1)
         if length_m.min() <= 0:
-            raise ValueError(
-                "the receivers of every ping must have different horizontal positions, got a "
-                f"horizontal extent of 0 m in ping {length_m.argmin()}"
+            raise ArgumentError(
+                "lines",
+                "have receivers at different horizontal positions in every ping",
+                f"a horizontal extent of 0 m in ping {length_m.argmin()}",
             )
         forward /= length_m[:, None]
         # Receivers may be numbered from either end, so the advance decides which way is forward.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.navigation.advance import surge
 from clsas.navigation.correlation import Correlator
 from clsas.navigation.directions import ALL, MIDDLE
@@ -216,11 +217,12 @@ class _Passes:
             pairs = overlap(corrected, array, ping, self.correlator.live)
             if not pairs.pairs:
                 sway_m, yaw_rad = self.moved[ping]
-                raise ValueError(
-                    "lines must have pings that overlap after correction, but no phase centres of "
-                    f"pings {ping} and {ping + 1} overlap with the {sway_m:.3g} m of sway and "
-                    f"{math.degrees(yaw_rad):.3g} degrees of yaw found between them. Check "
-                    f"range_step_m, {self.lines.range_step_m:g} m, and range_m"
+                raise ArgumentError(
+                    "lines",
+                    "have pings that overlap after correction",
+                    f"no common phase centres of pings {ping} and {ping + 1} with the {sway_m:.3g} "
+                    f"m of sway and {math.degrees(yaw_rad):.3g} degrees of yaw found between them",
+                    f"check `range_step_m`, {self.lines.range_step_m:g} m, and `range_m`",
                 )
             geometry = PairGeometry.of(corrected, array, pairs, self.correlator.swath)
             found[ping] = surge(self.correlator, geometry, array.spacing_m, self.half_width)
@@ -275,11 +277,12 @@ class _Passes:
         if found[fewest].pairs < LEAST_PAIRS:
             advance_m = np.linalg.norm(np.diff(array.reference_m[fewest : fewest + 2], axis=0))
             along_m = lines.phase_centres_m[array.channels(fewest)] @ array.forward[fewest]
-            raise ValueError(
-                f"lines must have at least {LEAST_PAIRS} phase centres that overlap from ping to "
-                f"ping, got {found[fewest].pairs} between pings {fewest} and {fewest + 1}: the "
-                f"array advances by {advance_m:.3g} m, and its phase centres extend over "
-                f"{np.ptp(along_m):.3g} m. Without overlap, use clsas.autofocus"
+            raise ArgumentError(
+                "lines",
+                f"have at least {LEAST_PAIRS} phase centres that overlap from ping to ping",
+                f"{found[fewest].pairs} between pings {fewest} and {fewest + 1}",
+                f"the array advances by {advance_m:.3g} m, and its phase centres extend over "
+                f"{np.ptp(along_m):.3g} m. Without overlap, use `clsas.autofocus`",
             )
         return found
 

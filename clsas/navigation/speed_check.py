@@ -44,7 +44,7 @@ def check_speed(passage: Passage, found: Contributions, moved_m: NDArray[np.floa
         "the correction found is a parabola along the track, and a wrong sound speed may be the "
         f"cause: {given_m_s / (1 + error):.5g} m/s, {100 * abs(error):.2g} % {side} than the "
         f"{given_m_s:.5g} m/s of the lines, explains it without any bend of the track. Check the "
-        "sound speed, for instance with clsas.calibrate_track"
+        "sound speed, for instance with `clsas.calibrate_track`"
     )
 
 

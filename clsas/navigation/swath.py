@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.navigation.overlap import Array
 
@@ -98,16 +99,16 @@ def _checked_ranges(lines: RangeLines, range_m: tuple[float, float] | None) -> t
     else:
         near_m, far_m = map(float, validate.array("range_m", range_m, np.float64, (2,)))
     if not nearest_m <= near_m < far_m <= farthest_m:
-        raise ValueError(
-            f"range_m must lie within the ranges that all channels have, {nearest_m:.6g} to "
-            f"{farthest_m:.6g} m, with the nearest first, got ({near_m:.6g}, {far_m:.6g})"
+        raise ArgumentError(
+            "range_m",
+            f"lie within the ranges that all channels have, {nearest_m:.6g} to {farthest_m:.6g} m, "
+            "with the nearest first",
+            (near_m, far_m),
         )
     least_m = _LEAST_WINDOW * lines.range_step_m
     if far_m - near_m < least_m:
-        raise ValueError(
-            f"range_m must be at least {_LEAST_WINDOW} samples long, {least_m:.4g} m, "
-            f"got {far_m - near_m:.4g} m"
-        )
+        allowed = f"be at least {_LEAST_WINDOW} samples long, {least_m:.4g} m"
+        raise ArgumentError("range_m", allowed, f"{far_m - near_m:.4g} m")
     return near_m, far_m
 
 
@@ -115,9 +116,11 @@ def _checked_seabed(lines: RangeLines, seabed_z_m: float, near_m: float) -> floa
     seabed_z_m = validate.number("seabed_z_m", seabed_z_m, "m")
     height_m = float(np.abs(lines.phase_centres_m[:, 2] - seabed_z_m).max())
     if height_m >= near_m:
-        raise ValueError(
-            f"seabed_z_m must differ from the height of the sonar by less than the nearest range, "
-            f"{near_m:.4g} m, so that rays reach the seabed, got a difference of {height_m:.4g} m"
+        raise ArgumentError(
+            "seabed_z_m",
+            f"differ from the height of the sonar by less than the nearest range, {near_m:.4g} m, "
+            "so that rays reach the seabed",
+            f"a difference of {height_m:.4g} m",
         )
     return seabed_z_m
 
@@ -125,9 +128,8 @@ def _checked_seabed(lines: RangeLines, seabed_z_m: float, near_m: float) -> floa
 def _checked_lengths(element_length_m: float | tuple[float, float]) -> tuple[float, float]:
     given = validate.array("element_length_m", element_length_m, np.float64, None).ravel()
     if not 1 <= given.size <= 2 or given.min() <= 0:
-        raise ValueError(
-            "element_length_m must be one or two lengths above 0 m, got "
-            f"{validate.shown(element_length_m)}"
+        raise ArgumentError(
+            "element_length_m", "be one or two lengths above 0 m", validate.shown(element_length_m)
         )
     return float(given[0]), float(given[-1])
 
@@ -138,15 +140,19 @@ def check_sizes(lines: RangeLines, array: Array, swath: Swath, wavelength_m: flo
     length_m, farthest_m = float(np.ptp(centres_m @ array.forward[0])), float(swath.edges_m[-1])
     least_m, most_m = _SHORTEST_ARRAY * wavelength_m, _LONGEST_ARRAY * farthest_m
     if not least_m <= length_m <= most_m:
-        raise ValueError(
-            f"the phase centres of a ping must extend over {least_m:.3g} to {most_m:.3g} m (half a "
-            f"wavelength to {_LONGEST_ARRAY:g} times the farthest range), got {length_m:.3g} m: "
-            "are the positions of lines in metres?"
+        raise ArgumentError(
+            "lines",
+            f"have phase centres that extend over {least_m:.3g} to {most_m:.3g} m in a ping (half "
+            f"a wavelength to {_LONGEST_ARRAY:g} times the farthest range)",
+            f"{length_m:.3g} m",
+            "are their positions in metres?",
         )
     least_m, most_m = _SHORTEST_ELEMENT * wavelength_m, 2 * length_m
     for each_m in swath.element_length_m or ():
         if not least_m <= each_m <= most_m:
-            raise ValueError(
-                f"element_length_m must be from {least_m:.3g} m (a twentieth of a wavelength) to "
-                f"{most_m:.3g} m (twice the length of the array), got {each_m:.3g} m"
+            raise ArgumentError(
+                "element_length_m",
+                f"be from {least_m:.3g} m (a twentieth of a wavelength) to {most_m:.3g} m (twice "
+                "the length of the array)",
+                f"{each_m:.3g} m",
             )

@@ -268,14 +268,14 @@ def test_unknowns_that_cannot_be_distinguished():
     scene = clsas.PointTargets(at, np.ones(20))
     lines = clsas.compress(clsas.simulate(SONAR, clsas.Track.straight(*course), scene))
     grid = clsas.Grid.plane(x=(1.5, 6.5, 320), y=(17.9, 18.1, 16))
-    with pytest.raises(ValueError, match="sway, heave cannot be distinguished"):
+    with pytest.raises(ValueError, match=r"distinguishable, got \('sway', 'heave'\)"):
         autofocus(lines, grid, unknowns=("sway", "heave"))
 
 
 @pytest.mark.slow
 def test_an_unknown_that_changes_no_range():
     _, nominal = recorded(points(), np.zeros(PINGS))
-    with pytest.raises(ValueError, match="heave of 1 m changes it by"):
+    with pytest.raises(ValueError, match="got heave, which changes it by"):
         autofocus(nominal, GRID, unknowns="heave")
     with pytest.raises(TypeError, match="unknowns must be one or several"):
         autofocus(nominal, GRID, unknowns=3)

@@ -66,7 +66,7 @@ def test_a_ping_without_the_first_bank_is_refused():
     lines = clsas.compress(clsas.simulate(sonar, clsas.Track.straight(*course), point))
     some = np.ones(lines.channels, bool)
     some[64:80] = False  # the third ping's first bank
-    with pytest.raises(ValueError, match=r"only 4 of 5 pings have some of bank 0.*lines.bank\(0\)"):
+    with pytest.raises(ValueError, match=r"bank 0 in only 4 of 5 pings: .*`lines.bank\(0\)`"):
         clsas.micronavigate(lines.select(some))
 
 

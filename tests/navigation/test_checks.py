@@ -61,7 +61,7 @@ REFUSED = {
     "repeated": (
         lambda lines: lines.select(channels_of(np.r_[0:4, 3:12])),
         r"1 ping repeats the position of the ping before \(the first is ping 4\); "
-        r"lines\.without_still_pings\(\) drops them",
+        r"`lines\.without_still_pings\(\)` drops them",
     ),
     "without overlap": (
         lambda lines: array_lines(30),

@@ -90,6 +90,6 @@ def test_corrections_that_leave_no_overlap_are_refused():
         carrier_hz=100e3, bandwidth_hz=20e3, first_range_m=25.0, length=800,
     )  # fmt: skip
     with pytest.raises(
-        ValueError, match=r"no phase centres of .* overlap .* Check range_step_m, 100 m"
+        ValueError, match=r"no common phase centres of .* check `range_step_m`, 100 m"
     ):
         clsas.micronavigate(replace(lines, range_step_m=100.0))

@@ -62,5 +62,5 @@ def test_calibration_is_for_a_constant_speed():
     course = (0, 0, -4), (0.05, 0, 0), 20, 1.0
     target = clsas.PointTargets([[0.5, 20, -12]], [1])
     lines = navigated(sonar, course, target, (20, 23), np.zeros(20))
-    with pytest.raises(ValueError, match="lines must not have sound_speed"):
+    with pytest.raises(ValueError, match="lines must have no `sound_speed`"):
         clsas.calibrate_track(lines, [[0.5, 20, -12]])
