@@ -24,6 +24,7 @@ from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines, some_channels
 from clsas.engine.data.sound_speed import SoundSpeed, check_reaches
 from clsas.engine.data.threads import in_threads
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.water.rays import rays
 
 WORST = 5
@@ -205,7 +206,7 @@ def _check(image: Image, lines: RangeLines, beam: BeamWindow | None) -> None:
     validate.instance("beam", beam, BeamWindow, type(None))
     placed(lines, image.grid)
     if beam is not None and beam.shape == "inverse" and not lines.carrier_hz:
-        raise ValueError("carrier_hz must be above 0 for a beam of shape 'inverse'")
+        raise ArgumentError("carrier_hz", "be above 0 for a beam of shape 'inverse'")
     farthest_m = float(np.abs([lines.first_range_m, lines.last_range_m]).max())
     validate.phase(lines.carrier_hz, lines.sound_speed_m_s, farthest_m)
     if lines.sound_speed is not None:

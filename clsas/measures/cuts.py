@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs
 from clsas.engine.data.grid import Axis
+from clsas.engine.data.validate import ArgumentError
 
 _LOBES = 10  # side lobes on each side that count in the ISLR
 _UPSAMPLING = 32  # points of a cut per pixel
@@ -136,10 +137,11 @@ class _Flank:
 
         minima = signal.argrelmin(power)[0]
         if len(minima) < 2 or power[: minima[0] + 1].min() > 0.5:
-            raise ValueError(
-                f"no whole side lobe at {where} within the image (or extent_m): choose a larger "
-                "image or extent_m; the point is too close to the border, or the peak does not "
-                "belong to a point"
+            raise ArgumentError(
+                "image",
+                f"contain a whole side lobe at {where} (within `extent_m`)",
+                hint="choose a larger image or `extent_m`; the point is too close to the border, "
+                "or the peak does not belong to a point",
             )
         first, second, last = minima[0], minima[1], minima[: _LOBES + 1][-1]
         below = int(np.argmax(power < 0.5))

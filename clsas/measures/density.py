@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from clsas.engine.data import decibels, reprs, validate
 from clsas.engine.data.lines import RangeLines, banks_of
 from clsas.engine.data.pings import STILL, Transmissions, means
+from clsas.engine.data.validate import ArgumentError
 from clsas.inspection.sampling import course
 
 _LOCAL = 11  # steps that are averaged to find the local course, as for turns of a track
@@ -151,10 +152,10 @@ def density_weights(lines: RangeLines) -> NDArray[np.float64]:
     """
     validate.instance("lines", lines, RangeLines)
     if lines.bank_numbers is None:
-        return _of_bank(lines, "")
+        return _of_bank(lines)
     weights = np.empty(lines.channels)
     for number in banks_of(lines.bank_numbers):
-        weights[lines.bank_numbers == number] = _of_bank(lines.bank(number), f"bank {number}: ")
+        weights[lines.bank_numbers == number] = _of_bank(lines.bank(number), f"bank {number}")
     return weights
 
 
@@ -163,21 +164,23 @@ def noise_penalty_db(weights: NDArray[np.float64]) -> float:
     return decibels.in_db(float(np.mean(weights**2) / np.mean(weights) ** 2))
 
 
-def _of_bank(lines: RangeLines, prefix: str) -> NDArray[np.float64]:
-    """Return the weights of one bank, [channels]; `prefix` is that of messages."""
+def _of_bank(lines: RangeLines, bank: str = "") -> NDArray[np.float64]:
+    """Return the weights of one bank, [channels], which messages call `bank`."""
     pings = Transmissions.of(lines.tx_m, lines.rx_m)
     try:
         along_m = _along_m(lines, pings)
-    except ValueError as error:
-        raise ValueError(f"{prefix}{error}") from None
+    except ArgumentError as error:
+        if bank:
+            error.add_note(bank)
+        raise
     lengths_m = lengths(along_m, pings.usual_step_m)
     weights: NDArray[np.float64] = lengths_m / lengths_m.mean()
     penalty_db = noise_penalty_db(weights)
     if penalty_db > _MUCH_NOISE_DB:
         validate.warn(
-            f"{prefix}weights raise the noise by {penalty_db:.1f} dB, since phase centres crowd in "
-            "parts of the track. If the platform stood still there, use "
-            "lines.without_still_pings()"
+            f"weights{f' of {bank}' if bank else ''} raise the noise by {penalty_db:.1f} dB, since "
+            "phase centres crowd in parts of the track. If the platform stood still there, use "
+            "`lines.without_still_pings()`"
         )
     return weights
 
@@ -205,15 +208,13 @@ def _along_m(lines: RangeLines, pings: Transmissions) -> NDArray[np.float64]:
 
 def _check_moving(pings: Transmissions, receivers_m: NDArray[np.float64]) -> None:
     """Raise ValueError unless the receivers move from ping to ping, [pings, 3]."""
-    needed = "lines must come from receivers that move along a track"
+    needed = "come from receivers that move along a track"
     if pings.count == 1:
-        raise ValueError(f"{needed}: there is a single ping")
+        raise ArgumentError("lines", needed, "a single ping")
     moved_m = float(np.ptp(receivers_m, axis=0).max(initial=0.0))
     if len(receivers_m) < 2 or moved_m <= STILL * pings.usual_step_m:
-        raise ValueError(
-            f"{needed}: the receivers of {pings.count} pings move by "
-            f"{reprs.quantity(moved_m, 'm')} in all. Receivers that stay in place need no weights"
-        )
+        got = f"{pings.count} pings whose receivers move by {reprs.quantity(moved_m, 'm')} in all"
+        raise ArgumentError("lines", needed, got, "receivers that stay in place need no weights")
 
 
 def _courses(moves_m: NDArray[np.float64], numbers: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -229,12 +230,14 @@ def _courses(moves_m: NDArray[np.float64], numbers: NDArray[np.int64]) -> NDArra
     advance_m = np.linalg.norm(mean_m, axis=1)
     least = int(np.argmin(advance_m / path_m))
     if advance_m[least] < _LEAST_STRAIGHT * path_m[least]:
-        raise ValueError(
-            "lines must come along a track that advances: around ping "
-            f"{numbers[least]}, {local} steps of {reprs.quantity(float(path_m[least]), 'm')} on "
-            f"average advance by {reprs.quantity(float(local * advance_m[least]), 'm')} together. "
-            "Sort pings by time, smooth noisy positions, or select passes in opposite directions "
-            "one by one"
+        raise ArgumentError(
+            "lines",
+            "come along a track that advances",
+            f"{local} steps of {reprs.quantity(float(path_m[least]), 'm')} on average around ping "
+            f"{numbers[least]} that advance by "
+            f"{reprs.quantity(float(local * advance_m[least]), 'm')} together",
+            "sort pings by time, smooth noisy positions, or select passes in opposite directions "
+            "one by one",
         )
     between = mean_m / advance_m[:, None]
     courses = np.concatenate([between[:1], between[:-1] + between[1:], between[-1:]])

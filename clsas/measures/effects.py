@@ -25,6 +25,7 @@ from clsas.engine.data.simplify import APART, MOTION, REFRACTION, RELIEF
 from clsas.engine.data.surface import surface_of
 from clsas.engine.data.system import Sonar, element_pattern
 from clsas.engine.data.track import Pointing, Track
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import sines
 from clsas.engine.signal.ambiguity import ends_error
 from clsas.engine.signal.spectrum import measure_spectrum
@@ -101,16 +102,15 @@ class Survey:
         validate.flag("element_pattern", self.element_pattern)
         validate.flag("ends", self.ends)
         if self.lines.banks > 1:
-            raise ValueError(
-                f"lines must be of one bank, got {self.lines.banks}: assess lines.bank(0), with "
-                "sonar.bank(0)"
-            )
+            hint = "use `lines.bank(0)`, with that bank of the sonar"
+            raise ArgumentError("lines", "be of one bank", self.lines.banks, hint)
         if self.sonar is None or self.track is None:
             return
         if self.sonar.receivers * self.track.pings != self.lines.channels:
-            raise ValueError(
-                f"sonar and track must have the channels of the lines, {self.lines.channels}, got "
-                f"{self.sonar.receivers} receivers and {self.track.pings} pings"
+            raise ArgumentError(
+                "sonar and track",
+                f"have the channels of the lines, {self.lines.channels}",
+                f"{self.sonar.receivers} receivers and {self.track.pings} pings",
             )
 
     @property

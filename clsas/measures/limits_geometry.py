@@ -20,6 +20,7 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import some_channels
 from clsas.engine.data.system import Sonar
 from clsas.engine.data.track import Pointing, Track, channels
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import sines
 from clsas.engine.signal.compression import Window
 from clsas.engine.signal.compression import check_options as check_compression
@@ -62,15 +63,14 @@ class Survey:
         if self.range_m is not None:
             near_m, far_m = validate.array("range_m", self.range_m, np.float64, (2,)).tolist()
             if not 0 <= near_m < far_m:
-                raise ValueError(
-                    f"range_m must be 0 <= nearest < farthest in m, got ({near_m:g}, {far_m:g})"
-                )
+                allowed = "be 0 <= nearest < farthest in m"
+                raise ArgumentError("range_m", allowed, (near_m, far_m))
             object.__setattr__(self, "range_m", (near_m, far_m))
         check_compression(window=self.window)
         for name in ("element_pattern", "motion_in_flight"):
             object.__setattr__(self, name, validate.flag(name, getattr(self, name)))
         if self.distance_m == 0:
-            raise ValueError("grid must not have its middle at a phase centre of the track")
+            raise ArgumentError("grid", "not have its middle at a phase centre of the track")
 
     @property
     def element_m(self) -> float | None:

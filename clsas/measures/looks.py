@@ -13,6 +13,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.digests import digest
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
+from clsas.engine.data.validate import ArgumentError
 
 
 def multilook(images: Image | Sequence[Image], *, window_m: float | None = None) -> Image:
@@ -69,7 +70,8 @@ def multilook(images: Image | Sequence[Image], *, window_m: float | None = None)
     looks = _checked(images)
     grid = looks[0].grid
     if len(looks) == 1 and window_m is None:
-        raise ValueError("window_m must be given for a single image, or images be several looks")
+        allowed = "be given for a single image, or `images` be several looks"
+        raise ArgumentError("window_m", allowed)
     size = None if window_m is None else window_pixels(grid, window_m)
     validate.memory("images", 32 * grid.size)
     largest = max(float(np.abs(look.pixels).max()) for look in looks) or 1.0
@@ -90,12 +92,12 @@ def _checked(images: Image | Sequence[Image]) -> list[Image]:
         return [images]
     looks = validate.entries("images", images, "an Image, or a sequence of them")
     if not looks:
-        raise ValueError("images must have at least one image, got none")
+        raise ArgumentError("images", "have at least one image", "none")
     for look in looks:
         validate.instance("every entry of images", look, Image)
     digests = {digest(look.grid) for look in looks}
     if len(digests) > 1:
-        raise ValueError(f"images must have one grid, got {len(digests)} different ones")
+        raise ArgumentError("images", "have one grid", f"{len(digests)} different ones")
     return looks
 
 
@@ -109,16 +111,15 @@ def window_pixels(grid: Grid, window_m: float) -> tuple[int, int]:
         grid.
     """
     if grid.points_m is not None:
-        raise ValueError("window_m must be left out: the images have points, not rows and columns")
+        hint = "the images have points, not rows and columns"
+        raise ArgumentError("window_m", "be left out", hint=hint)
     window_m = validate.positive("window_m", window_m, "m")
     counts = []
     for step_m, count in zip(grid.vectors_m[1:], grid.shape, strict=True):
         step = float(np.linalg.norm(step_m))
         if window_m > count * step:
-            raise ValueError(
-                f"window_m must be at most the extent of the grid, {count * step:.4g} m, got "
-                f"{window_m:g} m"
-            )
+            allowed = f"be at most the extent of the grid, {count * step:.4g} m"
+            raise ArgumentError("window_m", allowed, f"{window_m:g} m")
         counts.append(2 * math.floor(window_m / step / 2) + 1)
     return counts[0], counts[1]
 

@@ -13,6 +13,7 @@ from clsas.engine.data import reprs, validate
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Axis, Grid
 from clsas.engine.data.image import Image
+from clsas.engine.data.validate import ArgumentError
 from clsas.measures.cuts import Cut, measure_cut
 
 _SEARCH = 10  # pixels around the given position in which the peak is searched
@@ -131,9 +132,8 @@ def measure_point(
     for axis in axes:
         if len(axis.places_m) < 3:
             side = axis.name.removeprefix("along ")
-            raise ValueError(
-                f"image must have 3 or more pixels along {side}, got {len(axis.places_m)}"
-            )
+            allowed = f"have 3 or more pixels along {side}"
+            raise ArgumentError("image", allowed, len(axis.places_m))
     dx, dy = across.step_m, upward.step_m
     if extent_m is not None:
         validate.number("extent_m", extent_m, "m", least=max(abs(dx), abs(dy)))
@@ -161,8 +161,8 @@ def measure_point(
     if highest_db > 0:
         validate.warn(
             f"the peak near ({near_m[0]:.9g}, {near_m[1]:.9g}) m is {highest_db:.1f} dB lower than "
-            "a side lobe of it: give a position closer to the point or a larger search_m, or "
-            "exclude other targets with extent_m"
+            "a side lobe of it: give a position closer to the point or a larger `search_m`, or "
+            "exclude other targets with `extent_m`"
         )
     return response
 
@@ -182,32 +182,34 @@ def _find_peak(
         count, index = len(axis.places_m), (at - axis.places_m[0]) / axis.step_m
         if not -0.5 <= index <= count - 0.5:
             ends = sorted((axis.places_m[0], axis.places_m[-1]))
-            raise ValueError(
-                f"near must be inside the image: {axis.name} from {ends[0]:g} to {ends[1]:g} m, "
-                f"got {at:g} m"
-            )
+            allowed = f"be inside the image, {axis.name} from {ends[0]:g} to {ends[1]:g} m"
+            raise ArgumentError("near", allowed, f"{at:g} m")
         search = _SEARCH if search_m is None else search_m / abs(axis.step_m)
         nearest = int(np.clip(round(index), 0, count - 1))
         first = max(math.ceil(index - search), 0)
         windows.append(slice(min(first, nearest), max(math.floor(index + search), nearest) + 1))
     columns, rows = windows
+    around = f"({near_m[0]:g}, {near_m[1]:g}) m"
     amplitude = np.abs(pixels[rows, columns])
     row, column = np.unravel_index(amplitude.argmax(), amplitude.shape)
     if amplitude[row, column] == 0:
-        raise ValueError(f"image is zero around near = ({near_m[0]:g}, {near_m[1]:g}) m")
+        raise ArgumentError("near", "be where the image is not zero", around)
     row, column = int(row) + rows.start, int(column) + columns.start
     for axis, index in zip(axes, (column, row), strict=True):
         if not 0 < index < len(axis.places_m) - 1:
-            raise ValueError(
-                f"the peak near ({near_m[0]:g}, {near_m[1]:g}) m lies at the border of the image "
-                f"({axis.name} = {axis.places_m[index]:g} m): a larger image is needed"
+            raise ArgumentError(
+                "image",
+                f"extend beyond the peak near {around}",
+                f"a peak at its border, {axis.name} = {axis.places_m[index]:g} m",
             )
     if np.abs(pixels[row - 1 : row + 2, column - 1 : column + 2]).max() > np.abs(
         pixels[row, column]
     ):
-        raise ValueError(
-            f"there is no peak around near = ({near_m[0]:g}, {near_m[1]:g}) m, only the flank of "
-            "one outside the search: give a position closer to the point or a larger search_m"
+        raise ArgumentError(
+            "near",
+            "have a peak around it",
+            f"{around} with only the flank of one outside the search",
+            "give a position closer to the point or a larger `search_m`",
         )
     return row, column
 
@@ -216,10 +218,8 @@ def on_axes(grid: Grid, axes: tuple[Axis, Axis], near: Sequence[float]) -> NDArr
     """Return the coordinates on the axes, in metres, of two numbers or of a position."""
     position_m = validate.array("near", near, np.float64, None)
     if not np.all(np.abs(position_m) <= validate.FARTHEST_M):
-        raise ValueError(
-            f"near must lie within {validate.FARTHEST_M:g} m of the origin, got "
-            f"{validate.shown(near)}"
-        )
+        allowed = f"lie within {validate.FARTHEST_M:g} m of the origin"
+        raise ArgumentError("near", allowed, validate.shown(near))
     if position_m.shape != (3,):
         return validate.array("near", position_m, np.float64, (2,))
     origin_m, row_step_m, column_step_m = grid.vectors_m

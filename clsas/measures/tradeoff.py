@@ -18,6 +18,7 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.image_error import relative_error_db
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.engine.factorized.filters import ALIGN_TAPS, APERTURE_TAPS
@@ -148,9 +149,8 @@ def tradeoff(
 
     reference = form_exactly(lines, grid, accuracy_db=REFERENCE_DB, beam=beam, device=device)
     if not reference.pixels.any():
-        raise ValueError(
-            "grid must lie where the lines have echoes: the exact image is zero everywhere"
-        )
+        hint = "the exact image is zero everywhere"
+        raise ArgumentError("grid", "lie where the lines have echoes", hint=hint)
     step()
     rows = []
     for each in candidates:  # the first run builds the kernels, and its image is measured

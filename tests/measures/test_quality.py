@@ -153,7 +153,7 @@ def test_a_plane_in_depth_is_measured():
         np.testing.assert_allclose((got.x_m, got.y_m, got.z_m), at_m, atol=1e-3 * DX)
         assert got.azimuth.resolution_m == pytest.approx(flat.azimuth.resolution_m, rel=1e-6)
         assert got.range.resolution_m == pytest.approx(flat.range.resolution_m, rel=1e-6)
-    with pytest.raises(ValueError, match="near must be inside the image: z from"):
+    with pytest.raises(ValueError, match="near must be inside the image, z from"):
         measure_point(image, (at_m[0], 50.0))
 
 
@@ -207,24 +207,24 @@ def test_takes_the_greatest_pixel_within_the_search():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"near": (AT[0], 0.0)}, r"near must be inside the image: y from -40 to .* m, got 0 m"),
-        ({"near": (0.0, AT[1])}, r"near must be inside the image: x from .* m, got 0 m"),
+        ({"near": (AT[0], 0.0)}, r"near must be inside the image, y from -40 to .* m, got 0 m"),
+        ({"near": (0.0, AT[1])}, r"near must be inside the image, x from .* m, got 0 m"),
         ({"near": (np.nan, AT[1])}, "near must be finite"),
         ({"near": AT[0]}, r"near must have shape \(2\)"),
-        ({"pixels": np.zeros(GRID.shape, complex)}, r"image is zero around near"),
+        ({"pixels": np.zeros(GRID.shape, complex)}, r"near must be where the image is not zero"),
         (
             {"pixels": point(at=(X[0], AT[1])), "near": (X[0], AT[1])},
-            "at the border of the image .x =",
+            "beyond the peak near .* got a peak at its border, x =",
         ),
         (
             {"pixels": point(at=(AT[0], Y[-1])), "near": (AT[0], Y[-1])},
-            "at the border of the image .y =",
+            "beyond the peak near .* got a peak at its border, y =",
         ),
         (
             {"pixels": point(at=(X[2], AT[1])), "near": (X[2], AT[1])},
-            "no whole side lobe at smaller",
+            "must contain a whole side lobe at smaller",
         ),
-        ({"extent_m": 0.011}, "no whole side lobe"),
+        ({"extent_m": 0.011}, "must contain a whole side lobe"),
         ({"extent_m": 1e-9}, r"extent_m must be finite and >= 0\.01 m, got 1e-09"),
         ({"extent_m": 0}, r"extent_m must be finite and >= 0\.01 m, got 0"),
         ({"search_m": -1}, "search_m must be finite and > 0 m"),

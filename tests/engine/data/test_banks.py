@@ -169,7 +169,7 @@ def test_two_banks_cancel_in_one_image_off_the_grid():
 
 
 def test_assessments_are_of_one_bank(lines):
-    with pytest.raises(ValueError, match=r"one bank, got 2: assess lines.bank\(0\)"):
+    with pytest.raises(ValueError, match=r"one bank, got 2: use `lines.bank\(0\)`"):
         clsas.assess(lines, GRID)
     survey = clsas.survey_lines(SONAR, TRACK, GRID)
     assert survey.banks == 2
