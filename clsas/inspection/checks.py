@@ -76,8 +76,8 @@ def check_order(recording: Recording) -> Iterator[Finding]:
     if recording.pings.disordered:
         message += ". Gaps are not searched for in such a track"
     remedy = (
-        "sort the pings by time with lines.select(order), or smooth noisy positions; image passes "
-        "in opposite directions separately"
+        "sort the pings by time with `lines.select(order)`, or smooth noisy positions; image "
+        "passes in opposite directions separately"
     )
     yield Finding("order", message, float(turns.size), 0.0, remedy, tuple(turns.tolist()))
 
@@ -95,7 +95,7 @@ def check_halts(recording: Recording) -> Iterator[Finding]:
             f"advanced by less than {STILL:g} of the usual {measured(pings.usual_step_m, 'm')}. "
             "The equal echoes of these pings add up and hide the scene"
         )
-        remedy = "lines.without_still_pings(), or clsas convert --without-still-pings FILE OUTPUT"
+        remedy = "drop them with `lines.without_still_pings()`"
         yield Finding("still_pings", message, float(still.size), 0.0, remedy, tuple(still.tolist()))
 
 
@@ -153,8 +153,8 @@ def check_advance(recording: Recording) -> Iterator[Finding]:
             limit += f", and a ping of {receivers:g} receivers spans {measured(array_m, 'm')}"
         limit += ": this is too little for an aperture"
         remedy = (
-            "check units: positions in metres (not kilometres), carrier_hz in Hz (not kHz). If the "
-            "platform is as slow as that, keep every nth ping with lines.select(...)"
+            "check units: positions in metres (not kilometres), `carrier_hz` in Hz (not kHz). If "
+            "the platform is as slow as that, keep every nth ping with `lines.select(...)`"
         )
     elif usual_m > last_range_m > 0:
         limit_m, limit = last_range_m, f"more than the last range of {measured(last_range_m, 'm')}"
@@ -180,7 +180,7 @@ def check_dead(recording: Recording) -> Iterator[Finding]:
         f"{_of_channels(dead)} dead: at least {-DEAD_DB:.0f} dB below the median channel "
         f"(weakest: {weakest}){_in_every_ping(dead, recording.receivers)}"
     )
-    remedy = "leave them out: lines.select(...) with the others, or lines.weighted(...) with 0"
+    remedy = "leave them out: `lines.select(...)` with the others, or `lines.weighted(...)` with 0"
     if dead.all():
         message = f"all {dead.size} channels are silent"
         remedy = "check the recorder, and how its samples were read"
@@ -200,7 +200,7 @@ def check_clipping(recording: Recording) -> Iterator[Finding]:
     )
     remedy = (
         "record with less gain. In an existing recording, leave these channels out "
-        "(lines.select), or silence what overdrives them, such as the transmission"
+        "(`lines.select(...)`), or silence what overdrives them, such as the transmission"
     )
     where = tuple(np.flatnonzero(clipped).tolist())
     yield Finding("clipped_channels", message, float(worst), float(LEAST_CLIPPED), remedy, where)
@@ -228,11 +228,11 @@ def check_offset(recording: Recording) -> Iterator[Finding]:
         return
     part = lines.select(some_channels(lines.channels))
     remove_mean = (
-        "subtract each channel's mean before compression; lines.without_background() also removes "
-        "a constant that is the same in all pings"
+        "subtract each channel's mean before compression; `lines.without_background()` also "
+        "removes a constant that is the same in all pings"
     )
     least = measured(4 * rate_hz / lines.length, "Hz")
-    high_pass = f"lines.high_passed(hz) with a cutoff of at least {least}, and below the band"
+    high_pass = f"`lines.high_passed(hz)` with a cutoff of at least {least}, and below the band"
     constants = [("the lines", 0.0, remove_mean if lines.carrier_hz else high_pass)]
     if 0 < lines.carrier_hz < rate_hz / 2:
         constants.append(("the recorded signal", -lines.carrier_hz / rate_hz, high_pass))
@@ -257,7 +257,7 @@ def check_background(recording: Recording) -> Iterator[Finding]:
             f"{100 * limit:.2g} %. Direct arrivals, ringing, an offset, or a reflector at constant "
             "range can cause this"
         )
-        remedy = 'lines.without_background("median")'
+        remedy = "remove it with `lines.without_background('median')`"
         yield Finding("background", message, decibels.in_db(share), CONSTANT_DB, remedy)
 
 
@@ -273,8 +273,8 @@ def check_ends(recording: Recording) -> Iterator[Finding]:
         )
         fiftieth_m = (lines.length - 1) * lines.range_step_m / 50
         remedy = (
-            f"lines.tapered_ends({fiftieth_m:.2g}) fades a fiftieth of the lines at each end; keep "
-            "the grid inside the rest"
+            f"fade a fiftieth of the lines at each end with `lines.tapered_ends` ({fiftieth_m:.2g} "
+            "m), and keep the grid inside the rest"
         )
         yield Finding("ends", message, found_db, _ENDS_DB, remedy)
 
@@ -288,7 +288,7 @@ def check_oversampling(recording: Recording) -> Iterator[Finding]:
             "fills the whole sampled band, and its edges may be aliased"
         )
         remedy = (
-            "sample more finely, or compress with a smaller bandwidth_hz. Noise without a signal "
+            "sample more finely, or compress with a smaller `bandwidth_hz`. Noise without a signal "
             "fills the band as well"
         )
         yield Finding("oversampling", message, oversampling, least, remedy)
@@ -305,8 +305,8 @@ def check_band(recording: Recording) -> Iterator[Finding]:
             f"{measured(carrier_hz, 'Hz')}, and so reaches below 0 Hz"
         )
         remedy = (
-            "check units: range_step_m in metres (not millimetres or samples), carrier_hz in "
-            "Hz (not kHz), sound_speed_m_s in m/s"
+            "check units: `range_step_m` in metres (not millimetres or samples), `carrier_hz` in "
+            "Hz (not kHz), `sound_speed_m_s` in m/s"
         )
         yield Finding("band", message, width_hz, 2 * carrier_hz, remedy)
 
@@ -340,7 +340,7 @@ def check_first_range(recording: Recording) -> Iterator[Finding]:
         message = f"the lines begin at {first_m:.6g} m and end at {last_m:.6g} m: {limit}"
         remedy = (
             "check the time of the first sample, which must be in seconds, not in samples; "
-            "first_range_m is half the sound speed times it"
+            "`first_range_m` is half the sound speed times it"
         )
         yield Finding("range_offset", message, first_m, limit_m, remedy)
         return
@@ -420,8 +420,8 @@ def check_phase_sign(recording: Recording) -> Iterator[Finding]:
         "intensity over the squared mean, along the track)"
     )
     remedy = (
-        "conjugate the samples: dataclasses.replace(lines, samples=lines.samples.conj()), or read "
-        "phase histories with sign=+1"
+        "conjugate the samples, as `dataclasses.replace(lines, samples=lines.samples.conj())` "
+        "does, or read phase histories with `sign=+1`"
     )
     yield Finding("phase_sign", message, sign.ratio, CLEAR, remedy)
 

@@ -21,6 +21,7 @@ from clsas.engine.data.lines import RangeLines, banks_of
 from clsas.engine.data.lines import wavelength_m as carrier_wavelength_m
 from clsas.engine.data.system import Sonar
 from clsas.engine.data.track import Track, channels
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 
 SLACK = 0.01
 """Relative excess of a spacing that is tolerated: a sway of centimetres changes it a little."""
@@ -100,19 +101,14 @@ def check_sampling(
     """
     if isinstance(sonar, RangeLines):
         if track is not None and grid is not None:
-            raise TypeError(
-                "track must be left out with range lines, which have their own: "
-                f"check_sampling(lines, grid); got {type(track).__name__}"
-            )
+            allowed = "be left out with range lines, which have their own"
+            got = type(track).__name__
+            raise ArgumentTypeError("track", allowed, got, "call `check_sampling(lines, grid)`")
         grid, track = track if grid is None else grid, None  # type: ignore[assignment]
         if grid is None and beam is None and element_length_m is None:
-            raise ValueError("one of grid, beam and element_length_m must be given with lines")
+            raise ArgumentError("grid", "be given with lines, or `beam` or `element_length_m`")
     else:
-        if not isinstance(sonar, Sonar):
-            raise TypeError(
-                f"sonar must be of type Sonar, got {type(sonar).__name__}; RangeLines may be given "
-                "instead: check_sampling(lines, grid)"
-            )
+        validate.instance("sonar", sonar, Sonar, RangeLines)
         validate.instance("track", track, Track)
         validate.instance("grid", grid, Grid)
     if sonar.banks > 1:
@@ -195,7 +191,7 @@ def _spacing_limit(
     elif survey.carrier_hz:
         wavelength = carrier_wavelength_m(survey)
     else:
-        raise ValueError("wavelength_m must be given for lines with carrier_hz 0")
+        raise ArgumentError("wavelength_m", "be given for lines with `carrier_hz` 0")
     if element_length_m is None and isinstance(survey, Sonar):
         element_length_m = survey.element_length_m
     if element_length_m is not None:
@@ -283,7 +279,7 @@ def _check_spacing(found: Spacing, ranges: NDArray | None) -> list[Finding]:
             spacing,
             limit,
             "survey more slowly, ping faster or use a narrower beam; for lines that are already "
-            "recorded, image with a beam (beam=clsas.BeamWindow) that leaves grating lobes out",
+            "recorded, image with a beam that leaves grating lobes out",
         )
     ]
 

@@ -45,11 +45,11 @@ def _slips(step_m: float, sound_speed_m_s: float) -> list[Slip]:
     """Return the slips that are considered, the most common first."""
     half_speed = sound_speed_m_s / 2
     return [
-        Slip("first_range_m seems to be a time in seconds, not half the sound speed times it",
+        Slip("`first_range_m` seems to be a time in seconds, not half the sound speed times it",
              first=half_speed),
         Slip("the time of the first sample seems to be in milliseconds, not in seconds",
              first=1e-3),
-        Slip("first_range_m seems to be in samples, not in metres", first=step_m),
+        Slip("`first_range_m` seems to be in samples, not in metres", first=step_m),
         Slip("the time of the first sample seems to be in samples, not in seconds",
              first=step_m / half_speed),
         Slip("ranges seem to be in millimetres, not in metres", 1e-3, 1e-3),

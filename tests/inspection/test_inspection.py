@@ -385,7 +385,7 @@ def test_spacing_against_beam_grid_and_element(lines):
     assert found["along_track_spacing"].limit == 0.03
 
 
-@pytest.mark.parametrize("words", ["first_range_m seems to be in samples", "milliseconds"])
+@pytest.mark.parametrize("words", ["`first_range_m` seems to be in samples", "milliseconds"])
 def test_slips_of_the_first_range_are_named(lines, words):
     scale = 1000 if words == "milliseconds" else 1 / lines.range_step_m
     found = clsas.inspect(replace(lines, first_range_m=scale * lines.first_range_m), GRID)

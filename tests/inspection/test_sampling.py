@@ -182,7 +182,7 @@ def test_bad_arguments(call, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({}, "one of grid, beam and element_length_m must be given with lines"),
+        ({}, "grid must be given with lines, or `beam` or `element_length_m`"),
         ({"grid": 3}, "grid must be of type Grid, got int"),
         ({"beam": 20.0}, "beam must be of type BeamWindow, got float"),
         (
@@ -190,7 +190,7 @@ def test_bad_arguments(call, message):
             "element_length_m must be finite and > 0 m, got 0",
         ),
         ({"grid": GRID, "wavelength_m": -1}, "wavelength_m must be finite and > 0 m, got -1"),
-        ({"grid": GRID}, "wavelength_m must be given for lines with carrier_hz 0"),
+        ({"grid": GRID}, "wavelength_m must be given for lines with `carrier_hz` 0"),
     ],
 )
 def test_arguments_beside_lines(arguments, message):
@@ -202,8 +202,8 @@ def test_arguments_beside_lines(arguments, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((None, track(WIDE, 0.5), GRID), "sonar must be of type Sonar, got NoneType"),
-        (("a", None, GRID), r"must be of type Sonar, got str; RangeLines may be given instead"),
+        ((None, track(WIDE, 0.5), GRID), "sonar must be of type Sonar or RangeLines, got NoneType"),
+        (("a", None, GRID), r"sonar must be of type Sonar or RangeLines, got str"),
         ((WIDE, GRID, GRID), "track must be of type Track, got Grid"),
         (
             (lines_of(WIDE, track(WIDE, 0.5)), track(WIDE, 0.5), GRID),
