@@ -303,7 +303,7 @@ def _samples(lines: RangeLines) -> Iterator[Finding]:
     largest = float(np.abs(part).max())
     if not largest or part.shape[1] < LEAST_FIXES:
         return
-    part = part / np.float32(largest)
+    part = (part / np.float64(largest)).astype(np.complex64)  # float32 overflows for denormals
     if not part.imag.any() and part.real.min() < 0 < part.real.max():
         yield Finding(
             "real_samples",

@@ -99,8 +99,8 @@ def data(folder: Path) -> dict[str, Call]:
         "density_weights": Call(clsas.density_weights, {"lines": lines}),
         "Image": Call(
             clsas.Image,
-            {"pixels": np.array(image.pixels), "grid": grid},
-            accepts={"pixels": ("an Image",)},
+            {"pixels": np.array(image.pixels), "grid": grid, "formed": image.formed},
+            accepts={"pixels": ("an Image",), "formed": ("None",)},
         ),
         "Image.db": Call(image.db, {"reference": 2.0}, accepts={"reference": ("None",)}),
         "Image.plot": Call(image.plot, {"axes": axes()}, accepts={"axes": ("None",)}),

@@ -329,6 +329,7 @@ def test_what_may_be_lost_is_made_use_of(tolerance_db):
     assert tolerance_db - 0.8 <= chosen.predicted_error_db <= tolerance_db
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("factor", [0.0, 1e-44, 1e-40, 1e-30, 1e30])
 def test_samples_of_any_size_are_planned_for(factor):
     lines, grid = over(around(0, 40))
