@@ -11,12 +11,12 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, read_levels, read_scene
+from clsas.cli.inputs import load, read_levels, read_plan, read_scene
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, ORIGIN, File, Output, keep_out
 from clsas.cli.view import Folder, size_of
 from clsas.cli.wording import command
-from clsas.engine.data import reading, validate
+from clsas.engine.data import validate
 from clsas.files.hdf5 import read_geometry
 from clsas.maps import sicd
 from clsas.maps.encoding import KINDS
@@ -125,7 +125,7 @@ def export(
         keep_out("OUTPUT", output, "the store", source)
     known: dict[str, Any] = {}
     if plan_path is not None:
-        known["plan"] = _plan(plan_path)
+        known["plan"] = read_plan(plan_path)
     if lines_path is not None:
         known["lines"] = (
             load(lines_path, clsas.RangeLines)
@@ -152,18 +152,6 @@ def export(
 def _needs_band(suffix: str, kind: str | None, north_up: bool) -> bool:
     """Return whether an export depends on the band of the lines, which their samples show."""
     return suffix in sicd.SUFFIXES or (kind == "complex" and north_up)
-
-
-def _plan(path: Path) -> clsas.Plan:
-    """Return the plan in a file; raise ValueError that names the option and the file."""
-    wanted = f"--plan {printable(path)} must be a plan of `clsas plan --json --filters`"
-    try:
-        return clsas.Plan.from_json(reading.read_bytes(path).decode())
-    except UnicodeDecodeError:
-        raise ValueError(f"{wanted}, but it is not text") from None
-    except ValueError as error:
-        reason = str(error).removeprefix("text must be a plan as of Plan.to_json: ")
-        raise ValueError(f"{wanted}: {reason}") from None
 
 
 def _beam(path: Path) -> clsas.BeamWindow:

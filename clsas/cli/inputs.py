@@ -11,8 +11,10 @@ import click
 import clsas
 from clsas.cli.outputs import warn
 from clsas.cli.parameters import keep_apart, need_matplotlib, written_to
-from clsas.engine.data import validate
+from clsas.cli.wording import error_message
+from clsas.engine.data import reading, validate
 from clsas.engine.data.lines import first_two_banks
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.factorized.planner import TOLERANCE_DB
 from clsas.files import scene_files as config
 from clsas.files.scene_files import SceneFile
@@ -33,8 +35,8 @@ def load(path: Path, *kinds: type) -> Any:
         clsas.Image: " (clsas image makes it)",
         clsas.Heights: " (clsas heights makes them)",
     }
-    wanted = " or ".join(f"{kind.__name__}{hint.get(kind, '')}" for kind in kinds)
-    raise ValueError(f"{path} must hold {wanted}, got {type(obj).__name__}")
+    wanted = " or ".join(f"`{kind.__name__}`{hint.get(kind, '')}" for kind in kinds)
+    raise ValueError(f"{path} must hold {wanted}, got `{type(obj).__name__}`")
 
 
 def load_heights(path: Path) -> clsas.Heights:
@@ -59,8 +61,9 @@ def load_lines(
         return lines
     try:
         return lines.bank(bank)
-    except ValueError as error:
-        raise ValueError(f"{path}: {str(error).replace('number', '--bank', 1)}") from None
+    except ArgumentError as error:
+        error.add_note(str(path))
+        raise
 
 
 def load_banks(
@@ -75,6 +78,17 @@ def load_banks(
         return lines, first_two_banks(lines.bank_numbers)
     except ValueError as error:
         raise ValueError(f"{path} {error}" + (f": {remedy}" if remedy else "")) from None
+
+
+def read_plan(path: Path) -> clsas.Plan:
+    """Return the plan in a file of `clsas plan --json --filters`."""
+    try:
+        return clsas.Plan.from_json(reading.read_bytes(path).decode())
+    except ValueError as error:
+        reason = error.hint if isinstance(error, ArgumentError) else "it is not text"
+        raise ValueError(
+            f"{path} must be a plan of `clsas plan --json --filters`: {reason}"
+        ) from None
 
 
 def read_scene(path: Path) -> SceneFile:
@@ -155,12 +169,12 @@ def read_beam(described: SceneFile, given: dict[str, Any]) -> clsas.BeamWindow |
     try:
         changed = replace(beam, **changes) if beam is not None else clsas.BeamWindow(**changes)
         if "element_length_m" in changes and changed.shape != "inverse":
-            raise ValueError(
+            raise click.UsageError(
                 f"--element-length-m requires --beam-shape inverse, got {changed.shape}"
             )
         return changed
-    except ValueError as error:  # the scene's own beam was checked when it was read
-        raise click.UsageError(str(error)) from error
+    except ArgumentError as error:  # the scene's own beam was checked when it was read
+        raise click.UsageError(error_message(error)) from error
 
 
 def read_levels(
@@ -180,8 +194,8 @@ def read_levels(
         need_matplotlib()
         try:
             check_colour_map(colour_map)
-        except ValueError as error:
-            raise click.UsageError(str(error).replace("colour_map", "--colour-map")) from error
+        except ArgumentError as error:
+            raise click.UsageError(error_message(error)) from error
     return {name: value for name, value in given.items() if value is not None}
 
 

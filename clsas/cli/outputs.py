@@ -63,12 +63,12 @@ def report(as_json: bool, text: str, **results: Any) -> None:
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Print a text with control characters escaped; to standard error if `err`.
+    """Print a text in the words of the command line, escaped; to standard error if `err`.
 
     Pass names of files, and words read from them, through `printable` first: otherwise their line
     breaks could look like messages of clsas.
     """
-    click.echo(validate.escaped(text), err=err)
+    click.echo(validate.escaped(in_options(text)), err=err)
 
 
 def printable(name: object) -> str:
@@ -78,7 +78,7 @@ def printable(name: object) -> str:
 
 def warn(message: str) -> None:
     """Print a warning."""
-    say(f"Warning: {printable(in_options(message))}", err=True)
+    say(f"Warning: {printable(message)}", err=True)
 
 
 def print_json(results: Any, indent: int | None = 2) -> None:

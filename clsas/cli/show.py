@@ -10,11 +10,11 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import read_levels
+from clsas.cli.inputs import read_levels, read_plan
 from clsas.cli.outputs import printable, report
 from clsas.cli.parameters import POSITION, File, Output, keep_out, need_matplotlib
 from clsas.cli.wording import command
-from clsas.engine.data import reading, validate
+from clsas.engine.data import validate
 from clsas.files.formats import SUFFIXES
 from clsas.plot.canvas import SUFFIXES as PICTURES
 
@@ -141,20 +141,14 @@ def _read(path: Path) -> Shown:
     with path.open("rb") as opened:
         is_json = opened.read(64).lstrip().startswith(_JSON)
     if is_json:
-        try:
-            return clsas.Plan.from_json(reading.read_bytes(path).decode())
-        except ValueError as error:
-            reason = str(error).removeprefix("text must be a plan as of Plan.to_json: ")
-            raise ValueError(
-                f"{path} must be a plan of `clsas plan --json --filters`: {reason}"
-            ) from None
+        return read_plan(path)
     if path.suffix.lower() == ".toml":
         raise ValueError(
             f"{path} is a scene, which has nothing to draw yet: clsas simulate {path} -o ECHOES.H5"
         )
     found = clsas.load(path)
     if isinstance(found, clsas.Grid):
-        raise ValueError(f"{path} must hold an image, range lines or echoes, got only a Grid")
+        raise ValueError(f"{path} must hold an image, range lines or echoes, got only a grid")
     return found
 
 

@@ -21,11 +21,15 @@ _RUNNING = "clsas.cli.running"  # key of the running command's context among tho
 # Parameters of commands that stand for an argument of the library with another name. The first one
 # that the command has is used.
 _PARAMETERS = {
+    "a": ("first_file",),
+    "b": ("second_file",),
     "beam": ("scene_path",),
     "cutoff_hz": ("high_pass_hz",),
     "follow_s": ("follow",),
+    "found": ("heights_file",),
     "georeference": ("crs",),
     "height_m": ("origin",),
+    "image": ("image_file",),
     "images": ("source",),
     "latitude_deg": ("origin",),
     "length_m": ("taper_m",),
@@ -33,9 +37,11 @@ _PARAMETERS = {
     "longitude_deg": ("origin",),
     "memory_bytes": ("memory_mib",),
     "number": ("bank",),
+    "path": ("output",),
     "plan": ("plan_path",),
     "points_m": ("points",),
     "shape": ("beam_shape",),
+    "source": ("source", "lines_path"),
     "width_deg": ("beam_deg",),
     "yaw_sd_rad": ("yaw_sd_deg",),
 }
@@ -55,6 +61,8 @@ _WORDS = {
     "Image": "an image",
     "Interferogram": "an interferogram",
     "Plan": "a plan",
+    "Georeference.local": "--origin",
+    "Georeference.projected": "--crs",
     "RangeLines": "range lines",
     "Store": "a mosaic",
     "a and b": "the two banks",
@@ -63,6 +71,7 @@ _WORDS = {
     "clsas.autofocus": "clsas focus",
     "clsas.backproject": "--exact",
     "clsas.calibrate_track": "clsas known-points",
+    "clsas.compress": "clsas compress",
     "clsas.heights": "clsas heights",
     "clsas.micronavigate": "clsas navigate",
     "clsas.mosaic": "clsas mosaic",
@@ -106,18 +115,19 @@ def error_message(error: BaseException) -> str:
     running = _running()
     if running is None or not isinstance(error, ArgumentError) or error.where:
         return in_options(str(error))  # a file keeps its own words
-    return in_options(error.sentence(_worded(error.argument, running), _typed(error.given)))
+    argument = _worded(error.argument, running) or error.argument
+    return in_options(error.sentence(argument, _typed(error.given)))
 
 
 def in_options(text: str) -> str:
     """Return a message with words of the running command for what stands in backticks.
 
-    Names of arguments become options, and names of functions commands.
+    Names of arguments become options, and names of functions commands. Other code stays.
     """
     running = _running()
     if running is None:
         return text
-    return re.sub(r"`([^`\n]+)`", lambda code: _worded(code[1], running), text)
+    return re.sub(r"`([^`\n]+)`", lambda code: _worded(code[1], running) or code[0], text)
 
 
 def _running() -> click.Context | None:
@@ -125,16 +135,28 @@ def _running() -> click.Context | None:
     return context.meta.get(_RUNNING) if context is not None else None
 
 
-def _worded(code: str, running: click.Context) -> str:
+def _worded(code: str, running: click.Context) -> str | None:
     """Return a command's words for an argument, one with its value, a function or a class."""
     options = _options(running)
-    name, _, value = code.partition("=")
-    if name in options:
-        return f"{options[name]} {_typed(ast.literal_eval(value))}" if value else options[name]
+    if words := options.get(code) or _WORDS.get(code):
+        return words
     if bank := re.fullmatch(r"lines\.bank\((\w+)\)", code):
         has_bank = any(param.name == "bank" for param in running.command.params)
         return f"{'--bank' if has_bank else 'clsas convert --bank'} {bank[1]}"
-    return _WORDS.get(code, code)
+    name = re.split(r"\W", code, maxsplit=1)[0]
+    rest = code[len(name) :]  # such as "=(-1, 1)", or " stop" of an axis
+    if name not in options:
+        return None
+    is_value = rest.startswith("=")
+    return f"{options[name]} {_typed(_evaluated(rest[1:]))}" if is_value else options[name] + rest
+
+
+def _evaluated(text: str) -> Any:
+    """Return the value of a literal, or else its text."""
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        return text
 
 
 def _typed(value: Any) -> str:
