@@ -146,12 +146,11 @@ def _worded(code: str, running: click.Context) -> str | None:
     if bank := re.fullmatch(r"lines\.bank\((\w+)\)", code):
         has_bank = any(param.name == "bank" for param in running.command.params)
         return f"{'--bank' if has_bank else 'clsas convert --bank'} {bank[1]}"
-    name = re.split(r"\W", code, maxsplit=1)[0]
-    rest = code[len(name) :]  # such as "=(-1, 1)", or " stop" of an axis
-    if name not in options:
-        return None
-    is_value = rest.startswith("=")
-    return f"{options[name]} {_typed(_evaluated(rest[1:]))}" if is_value else options[name] + rest
+    name, value = code.split("=", 1) if "=" in code else (code, "")
+    if name in options:
+        return f"{options[name]} {_typed(_evaluated(value))}"
+    name, *part = re.split(r"(?=[ \[])", code, maxsplit=1)  # such as "x stop" or "stages[0]"
+    return options[name] + "".join(part) if name in options else None
 
 
 def _evaluated(text: str) -> Any:

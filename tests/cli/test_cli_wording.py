@@ -130,6 +130,7 @@ def test_every_kind_of_name_is_translated():
         ("`beam` is an option, the beam is not", "--beam is an option, the beam is not"),
         ("`number` must be 0", "--bank must be 0"),
         ("use `lines.bank(2)`", "use --bank 2"),
+        ("`scene.select(...)` is no option", "`scene.select(...)` is no option"),
         ("the key search_m and `other` stay", "the key search_m and `other` stay"),
         ("`search_m\n`", "`search_m\n`"),
     ]:
