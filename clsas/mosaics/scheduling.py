@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 POLL_S = 0.5
 """Seconds between searches for new files of a survey: a plain choice."""
+
+_MOST_ON_CLUSTER = 1000  # patches submitted at once: enough for any cluster, few to wait for
 
 Formed = tuple[PatchIndex, Record, Image | None]
 
@@ -111,9 +114,9 @@ class Run:
         """Largest number of patches that are submitted at once.
 
         In this process it is one more than there are workers, since finished patches stay in memory
-        until they are taken. A cluster returns only records, so all patches are submitted at once.
+        until they are taken. A cluster returns only records.
         """
-        return len(self.layout) if self.client is not None else self.workers + 1
+        return _MOST_ON_CLUSTER if self.client is not None else self.workers + 1
 
     def executor(self) -> Executor:
         """Return the threads of this process, or the workers of the cluster."""
@@ -168,15 +171,15 @@ class _GrowingSurvey:
             growth.at_end(self.visibility.survey.geometry)
         return grown or self.has_ended
 
-    def ready(self, todo: Sequence[PatchIndex]) -> list[PatchIndex]:
+    def ready(self, todo: Iterable[PatchIndex]) -> deque[PatchIndex]:
         """Return the patches whose channels have all been recorded, in the given order."""
         if self.has_ended:
-            return list(todo)
+            return deque(todo)
         settled = self.visibility.settled
         if settled < 1:
-            return []
+            return deque()
         layout = self._run.layout
-        return [i for i in todo if self.visibility.has_passed(layout.window(i).grid, settled)]
+        return deque(i for i in todo if self.visibility.has_passed(layout.window(i).grid, settled))
 
 
 def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Formed, None, None]:
@@ -186,17 +189,18 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Form
     the caller stops early, patches that have been started are still completed in the store.
     """
     survey, layout, store = _GrowingSurvey(run), run.layout, run.job.store
-    todo = [index for index in layout.indices() if index not in finished]
+    todo = dict.fromkeys(index for index in layout.indices() if index not in finished)
     # For every patch, the number of channels in the survey when it was last formed or checked.
     known = {index: record.survey_channels for index, record in finished.items()}
+    checked = survey.channels  # when all patches were last checked
     executor = run.executor()
     running: dict[Future, PatchIndex] = {}
     try:
         ready = survey.ready(todo)
         while True:
-            for index in ready[: max(run.most_running - len(running), 0)]:
-                ready.remove(index)
-                todo.remove(index)
+            while ready and len(running) < run.most_running:
+                index = ready.popleft()
+                del todo[index]
                 with uninterrupted():
                     job = run.job.on(survey.visibility, run.client is None)
                     running[executor.submit(job.form, layout.window(index))] = index
@@ -206,6 +210,7 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Form
                 return
             timeout_s = None if survey.has_ended and running else POLL_S
             done = wait(running or [Future()], timeout_s)
+            latest = [index for future, index in running.items() if future in done]
             for future in [future for future in running if future in done]:
                 with uninterrupted():
                     index = running.pop(future)
@@ -214,13 +219,17 @@ def form_patches(run: Run, finished: dict[PatchIndex, Record]) -> Generator[Form
                     finished[index] = record
                 yield index, record, image
             news = survey.update()
-            # Form patches again if channels that were added later contribute to them.
-            for index in set(known) - set(running.values()) - set(todo):
-                grid = layout.window(index).grid
-                if survey.visibility.any_channel_from(known[index], grid):
-                    todo.append(index)
+            # Form patches again if channels that were added later contribute to them. A patch that
+            # is running is checked when it is finished.
+            busy = set(running.values())
+            for index in known if survey.channels > checked else latest:
+                if known[index] >= survey.channels or index in busy or index in todo:
+                    continue
+                if survey.visibility.any_channel_from(known[index], layout.window(index).grid):
+                    todo[index] = None
                     news = True
                 known[index] = survey.channels
+            checked = survey.channels
             if news:
                 ready = survey.ready(todo)
     finally:

@@ -34,7 +34,9 @@ from clsas.engine.factorized import planner
 from clsas.mosaics import scheduling
 from clsas.mosaics.devices import claim_device
 from clsas.mosaics.documents import read_document
-from clsas.mosaics.forming import open_visibility, stamped_files
+from clsas.mosaics.forming import Job, open_visibility, stamped_files
+from clsas.mosaics.patches import Layout
+from clsas.mosaics.record import Record
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import END, open_survey
 from clsas.mosaics.visibility import SurveyVisibility
@@ -54,6 +56,15 @@ def exact():
 def file(tmp_path):
     clsas.save(tmp_path / "lines.h5", LINES)
     return tmp_path / "lines.h5"
+
+
+def test_work_grows_as_the_number_of_patches(monkeypatch):
+    count = mock.Mock(side_effect=Layout.window)
+    monkeypatch.setattr(Layout, "window", lambda *arguments: count(*arguments))
+    monkeypatch.setattr(Job, "form", lambda *_: (Record(1, LINES.channels), None))
+    formed = clsas.mosaic(LINES, GRID, accuracy_db=-40, patches=(20, 20))
+    assert len(list(formed)) == 400
+    assert count.call_count == 2 * 400  # when a patch is submitted, and when it is handed out
 
 
 @pytest.mark.slow
