@@ -22,6 +22,7 @@ from clsas.engine.data import reading, validate
 from clsas.engine.data.fourier import fourier_series
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.system import Pulse
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.compression import Window, check_options, compress
 from clsas.engine.signal.echoes import Echoes
 from clsas.files import hdf5
@@ -262,7 +263,7 @@ def _microphones(path: Path, there: list[int], channels: Sequence[int] | None) -
     given = validate.entries("channels", channels, "whole numbers of microphones")
     numbers = [validate.count("every entry of channels", number) for number in given]
     if not numbers or not set(numbers) <= set(there):
-        raise ValueError(f"channels must be among {there}, got {validate.shown(channels)}")
+        raise ArgumentError("channels", f"be among {there}", validate.shown(channels))
     return numbers
 
 

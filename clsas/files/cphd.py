@@ -29,6 +29,7 @@ from clsas.engine.signal.compression import Window, check_options
 from clsas.engine.signal.phase_history import from_phase_history
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked_positions
+from clsas.files.tables import located
 
 SPEED, ORIGIN = "clsas.sound_speed_m_s", "clsas.origin_m"
 """Names of the collection parameters with which a CPHD file describes sonar data."""
@@ -132,8 +133,8 @@ def read_cphd(
             tree = sarkit.ElementWrapper(reader.metadata.xmltree.getroot())
             there = [each["Identifier"] for each in tree["Data"].findall("Channel")]
             reference = tree["Channel"]["RefChId"]
-        if channel is not None and channel not in there:
-            raise ValueError(f"channel must be one of {there}, got {validate.shown(channel)}")
+        if channel is not None:
+            validate.one_of("channel", channel, there)
         with _defects(path):
             name = reference if channel is None else channel
             _check_sizes(tree, name, header)
@@ -152,10 +153,8 @@ def read_cphd(
                 np.conj(signal, out=signal)
             look = _look_direction(tree, vectors, collection)
     if collection.domain == "FX":
-        try:
+        with located(f"{path}:"):
             lines = _lines_of_fx(signal, vectors, collection, window, oversampling)
-        except (TypeError, ValueError) as error:
-            raise type(error)(f"{path}: {error}") from None
     else:
         with _defects(path):
             lines = _lines_of_toa(signal, vectors, collection)
@@ -396,7 +395,6 @@ def _lines_of_fx(
     scale = collection.frequency_scale
     sampled_hz = signal.shape[1] * vectors["SCSS"]
     occupied = float(np.max((vectors["FX2"] - vectors["FX1"]) / sampled_hz))
-    oversampling = validate.oversampling(oversampling)
     return from_phase_history(
         signal,
         first_frequency_hz=scale * vectors["SC0"].astype(np.float64),

@@ -15,6 +15,7 @@ from scipy.constants import speed_of_light
 from clsas.engine.data import validate
 from clsas.engine.data.atomic import replacing
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.files.cphd import LOOK, ORIGIN, PLACE, SPEED, sarkit_cphd
 
 SUFFIXES = (".cphd",)
@@ -94,16 +95,16 @@ def write_cphd(path: str | os.PathLike, lines: RangeLines) -> None:
     validate.suffix("path", path, *SUFFIXES)
     validate.instance("lines", lines, RangeLines)
     if lines.rx_velocity_m_s is not None:
-        raise ValueError(
-            "lines must not have rx_velocity_m_s: CPHD cannot describe motion during flight"
+        raise ArgumentError(
+            "lines",
+            "have no `rx_velocity_m_s`",
+            hint="CPHD cannot describe motion during flight",
         )
     if lines.banks > 1:
-        raise ValueError(
-            f"lines must be of one bank, got {lines.banks}: write lines.bank(0) and the others to "
-            "files of their own"
-        )
+        hint = "write `lines.bank(0)` and the others to files of their own"
+        raise ArgumentError("lines", "be of one bank", lines.banks, hint)
     if lines.sound_speed is not None:
-        raise ValueError("lines must not have sound_speed: CPHD assumes straight rays")
+        raise ArgumentError("lines", "have no `sound_speed`", hint="CPHD assumes straight rays")
     origin_m = np.rint(lines.phase_centres_m.mean(axis=0))
     origin_m *= np.abs(origin_m).max() > _NEAR_M
     vectors, signal = _vectors(lines, origin_m)

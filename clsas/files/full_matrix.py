@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.compression import Window
 from clsas.engine.signal.full_matrix import from_full_matrix
 from clsas.files import matlab
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked
+from clsas.files.tables import located
 
 FIELDS = ("time_data", "time", "tx", "rx", "array")
 
@@ -81,9 +83,8 @@ def full_matrix_lines(
         raise FileFormatError(f"{os.fspath(path)} must contain array as a structure")
     if sound_speed_m_s is None:
         if "ph_velocity" not in capture:
-            raise ValueError(
-                f"sound_speed_m_s must be given, since {os.fspath(path)} has no ph_velocity"
-            )
+            allowed = f"be given, since {os.fspath(path)} has no ph_velocity"
+            raise ArgumentError("sound_speed_m_s", allowed)
         sound_speed_m_s = float(matlab.numbers(path, capture, "ph_velocity", 0))
     x_m = matlab.numbers(path, array, "el_xc", 1)
     others = [
@@ -106,7 +107,7 @@ def full_matrix_lines(
             f"{len(time_s)} by {len(tx)}, got {samples.shape[::-1]}"
         )
     carrier_hz = float(matlab.numbers(path, array, "centre_freq", 0))
-    try:
+    with located(f"{os.fspath(path)}:"):
         lines = from_full_matrix(
             samples,
             np.stack([x_m, *others], axis=-1),
@@ -118,6 +119,4 @@ def full_matrix_lines(
             window=window,
             oversampling=oversampling,
         )
-    except (TypeError, ValueError) as error:
-        raise type(error)(f"{os.fspath(path)}: {error}") from None
     return checked(path, lines)

@@ -11,11 +11,13 @@ from scipy.constants import speed_of_light
 
 from clsas.engine.data import validate
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.compression import Window
 from clsas.engine.signal.phase_history import from_phase_history
 from clsas.files import matlab
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked_positions
+from clsas.files.tables import located
 
 FIELDS = ("fp", "freq", "x", "y", "z", "r0")
 _LOWEST_HZ = 1e6  # waves of 300 m: radars that look through ice or ground begin at 1 to 10 MHz
@@ -100,8 +102,9 @@ def phase_history_lines(
             f"{len(reference)} and {len(frequency)} for fp [{count} frequencies, {pulses} pulses]"
         )
     antenna_m = np.stack(antenna, axis=-1).astype(np.float64)
-    try:
-        first_hz, step_hz = _in_hz(path, *_equal_steps(frequency), count, reference)
+    first, step = _equal_steps(path, frequency)
+    with located(f"{os.fspath(path)}:"):
+        first_hz, step_hz = _in_hz(path, first, step, count, reference)
         lines = from_phase_history(
             samples,
             first_frequency_hz=first_hz,
@@ -113,18 +116,16 @@ def phase_history_lines(
             window=window,
             oversampling=oversampling,
         )
-    except (TypeError, ValueError) as error:
-        raise type(error)(f"{os.fspath(path)}: {error}") from None
     return checked_positions(path, lines)
 
 
-def _equal_steps(frequency: NDArray) -> tuple[float, float]:
+def _equal_steps(path: str | os.PathLike, frequency: NDArray) -> tuple[float, float]:
     """Return the first of the frequencies and their step, which are equal except for rounding."""
     exact = np.linspace(float(frequency[0]), float(frequency[-1]), len(frequency))
     step = float(exact[-1] - exact[0]) / max(len(exact) - 1, 1)
     rounding = 2 * _rounding(frequency) + 1e-3 * abs(step)
     if not step > 0 or not np.abs(exact - frequency).max() <= rounding:
-        raise FileFormatError("must contain freq in equal, ascending steps")
+        raise FileFormatError(f"{os.fspath(path)} must contain freq in equal, ascending steps")
     return float(exact[0]), step
 
 
@@ -148,10 +149,8 @@ def _in_hz(
                 "front of the antenna. Store freq in Hz"
             )
             return first * unit, step * unit
-    raise ValueError(
-        f"freq must be in Hz, got {first:g} to {last:g}: no radar images below 1 MHz. It may be in "
-        "MHz or GHz"
-    )
+    hint = "no radar images below 1 MHz. It may be in MHz or GHz"
+    raise ArgumentError("freq", "be in Hz", f"{first:g} to {last:g}", hint)
 
 
 def _reference_m(reference: NDArray, antenna_m: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -39,6 +39,6 @@ def checked_positions(path: str | os.PathLike, lines: RangeLines) -> RangeLines:
         validate.warn(
             f"{os.fspath(path)}: the track turns back {turns.size} "
             f"time{'s' * (turns.size > 1)} (first after ping {turns[0]}), so pings may be out of "
-            "order. They are in the order of the file; lines.select(order) sorts them"
+            "order. They are in the order of the file; `lines.select(order)` sorts them"
         )
     return lines

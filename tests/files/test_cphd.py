@@ -270,7 +270,7 @@ def test_a_point_of_a_foreign_file_focuses_in_phase(name, tmp_path):
 def test_channels_are_chosen_by_name(tmp_path):
     foreign(tmp_path / "pass.cphd")
     assert read_cphd(tmp_path / "pass.cphd", channel="1").channels == 47
-    with pytest.raises(ValueError, match=r"channel must be one of \['1'\], got 'HH'"):
+    with pytest.raises(ValueError, match="channel must be one of '1', got 'HH'"):
         read_cphd(tmp_path / "pass.cphd", channel="HH")
     with pytest.raises(ValueError, match=r"window must be 'none' or"):
         read_cphd(tmp_path / "pass.cphd", window="nonsense")
@@ -278,7 +278,7 @@ def test_channels_are_chosen_by_name(tmp_path):
 
 def test_lines_that_cphd_cannot_hold_are_refused(tmp_path):
     lines = replace(sonar_lines(), rx_velocity_m_s=[1.0, 0, 0])
-    with pytest.raises(ValueError, match="lines must not have rx_velocity_m_s"):
+    with pytest.raises(ValueError, match="lines must have no `rx_velocity_m_s`"):
         clsas.save(tmp_path / "lines.cphd", lines)
     with pytest.raises(TypeError, match="obj must be of type RangeLines"):
         clsas.save(tmp_path / "grid.cphd", GRID)

@@ -43,7 +43,6 @@ FARTHEST_M = 1e9
 """Largest distance from antennas to pixels, and largest coordinate of a simulated point. Up to it
 squares of distances stay within float32, and float64 resolves ranges to 1e-7 m."""
 _MOST_COUNT = 2**63 - 1
-_MOST_OVERSAMPLING = 1e4  # arbitrary, far beyond what improves any interpolation
 _MOST_CYCLES = 1e10  # of phase, which float64 still resolves to 1e-6 of a cycle
 
 # Size of allocations below which memory is not checked. Asking the system for its free memory takes
@@ -370,11 +369,6 @@ def sides(name: str, value: object) -> tuple[int, int]:
         raise ArgumentError(name, "be (rows, columns)", shown(value))
     rows, columns = (count(f"every side of {name}", side) for side in given)
     return rows, columns
-
-
-def oversampling(value: float) -> float:
-    """Return an oversampling factor, checked; raises TypeError or ValueError as `number` does."""
-    return number("oversampling", value, least=1.0, most=_MOST_OVERSAMPLING)
 
 
 def selection(name: str, value: object, *, ascending: bool = False) -> slice:
