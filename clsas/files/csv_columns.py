@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import reading, validate
+from clsas.engine.data.validate import ArgumentError
 
 
 def read_columns(
@@ -46,9 +47,8 @@ def read_columns(
                 values.extend([float(value) for _, value in zip(names, row, strict=True)])
             except ValueError:
                 got = validate.shown(",".join(row))
-                raise ValueError(
-                    f"{path}: line {reader.line_num} must be {len(names)} numbers, got {got}"
-                ) from None
+                line, where = f"line {reader.line_num}", f"{path}:"
+                raise ArgumentError(line, f"be {len(names)} numbers", got, where=where) from None
     except csv.Error as error:
         raise ValueError(f"{path}: line {reader.line_num} is not CSV: {error}") from None
     if not values:

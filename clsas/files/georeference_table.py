@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.validate import ArgumentError
 from clsas.files.tables import Table, located
 
 
@@ -31,9 +32,9 @@ class GeoreferenceTable(Table):
         with located("[georeference]"):
             if self.crs is not None:
                 if local:
-                    raise ValueError(f"crs and {min(local)} exclude each other")
+                    raise ArgumentError(min(local), "be left out with `crs`")
                 return Georeference.projected(self.crs, vertical_datum=self.vertical_datum)
             for name in ("latitude_deg", "longitude_deg", "heading_deg"):
                 if getattr(self, name) is None:
-                    raise ValueError(f"missing key {name!r} (or 'crs' of a map projection)")
+                    raise ArgumentError(name, "be given, or `crs` of a map projection")
             return Georeference(**{"height_m": 0.0} | given)

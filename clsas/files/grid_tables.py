@@ -8,6 +8,7 @@ from typing import Annotated
 from pydantic import Field
 
 from clsas.engine.data.grid import Grid
+from clsas.engine.data.validate import ArgumentError
 from clsas.files.height_files import read_heights
 from clsas.files.tables import Table, Vector, located
 
@@ -50,9 +51,8 @@ class GridTable(Table):
         """
         with located("[grid]"):
             plane = self._plane()
-        if self.height_file is None:
-            return plane
-        with located("[grid] height_file"):
+            if self.height_file is None:
+                return plane
             return plane.with_height(read_heights(folder / self.height_file, plane.shape))
 
     def _plane(self) -> Grid:
@@ -61,14 +61,16 @@ class GridTable(Table):
         oriented = given & set(_ORIENTED)
         along_axes = given & {*_ALONG_AXES, "z_m"}
         if oriented and along_axes:
-            raise ValueError(
-                f"{min(along_axes)} and {min(oriented)} exclude each other: give x, y and z_m for "
-                "a horizontal plane, or origin_m, row_step_m, column_step_m and shape for any"
+            raise ArgumentError(
+                min(along_axes),
+                f"be left out with `{min(oriented)}`",
+                hint="give `x`, `y` and `z_m` for a horizontal plane, or `origin_m`, `row_step_m`, "
+                "`column_step_m` and `shape` for any",
             )
         for name in _ORIENTED if oriented else _ALONG_AXES:
             if getattr(self, name) is None:
-                other = "" if oriented else " (or 'origin_m', 'row_step_m', ... of a slanted plane)"
-                raise ValueError(f"missing key {name!r}{other}")
+                other = "" if oriented else ", or `origin_m`, `row_step_m`, ... of a slanted plane"
+                raise ArgumentError(name, f"be given{other}")
         if self.x is not None and self.y is not None:
             return Grid.plane(self.x.build(), self.y.build(), self.z_m)
         assert self.origin_m is not None  # all four have been checked

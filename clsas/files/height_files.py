@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import reading, validate
+from clsas.engine.data.validate import ArgumentError
 
 SUFFIXES = (".csv", ".npy")
 """Suffixes of files of heights."""
@@ -34,23 +35,24 @@ def read_heights(path: str | os.PathLike, shape: tuple[int, ...]) -> NDArray[np.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"must end in {' or '.join(SUFFIXES)}, got {str(path)!r}")
+        raise ArgumentError("height_file", f"end in {' or '.join(SUFFIXES)}", repr(str(path)))
     try:
         reading.check_ordinary(path)
         heights = _from_csv(path) if path.suffix.lower() == ".csv" else _from_npy(path)
     except OSError as error:
-        raise ValueError(f"must be readable: {error.strerror or error}: {path}") from None
+        hint = f"{error.strerror or error}: {path}"
+        raise ArgumentError("height_file", "be readable", hint=hint) from None
     if heights.shape != tuple(shape):
-        raise ValueError(
-            f"must hold {' x '.join(map(str, shape))} heights (rows x columns of the grid), got "
-            f"{' x '.join(map(str, heights.shape)) or 'one'} in {path}"
-        )
+        got = f"{' x '.join(map(str, heights.shape)) or 'one'} in {path}"
+        allowed = f"hold {' x '.join(map(str, shape))} heights (rows x columns of the grid)"
+        raise ArgumentError("height_file", allowed, got)
     if heights.dtype.kind not in "iuf":
-        raise ValueError(f"must hold real numbers, got {heights.dtype} in {path}")
+        raise ArgumentError("height_file", "hold real numbers", f"{heights.dtype} in {path}")
     validate.memory(str(path), 8 * heights.size)
     heights = np.array(heights, np.float64)  # a mapped array is read here
     if not np.isfinite(heights).all():
-        raise ValueError(f"must hold finite heights, got NaN or infinity in {path}")
+        got = f"NaN or infinity in {path}"
+        raise ArgumentError("height_file", "hold finite heights", got)
     return heights
 
 
@@ -63,7 +65,8 @@ def _from_csv(path: Path) -> NDArray:
     except ValueError as error:  # UnicodeDecodeError too
         # What follows the semicolon is advice for callers of NumPy.
         reason = str(error).partition(";")[0]
-        raise ValueError(f"must hold numbers separated by commas: {reason}: {path}") from None
+        allowed = "hold numbers separated by commas"
+        raise ArgumentError("height_file", allowed, hint=f"{reason}: {path}") from None
 
 
 def _from_npy(path: Path) -> NDArray:
@@ -71,4 +74,5 @@ def _from_npy(path: Path) -> NDArray:
     try:
         return np.lib.format.open_memmap(path, mode="r")
     except (ValueError, EOFError, OverflowError):
-        raise ValueError(f"must be an intact NumPy file of numbers: {path}") from None
+        allowed = "be an intact NumPy file of numbers"
+        raise ArgumentError("height_file", allowed, hint=str(path)) from None

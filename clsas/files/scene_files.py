@@ -24,6 +24,7 @@ from clsas.engine.data.track import Track
 from clsas.engine.data.version import __version__
 from clsas.files.mistakes import explain
 from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS, SceneTables
+from clsas.files.tables import located
 from clsas.simulation.scenes import Scene
 
 _MOST_MISTAKES = 20  # listed in one message: a plain choice, which fits on a screen
@@ -119,7 +120,7 @@ def parse_scene(text: bytes, *, name: str, folder: Path) -> SceneFile:
             raise ValueError(f"{name}: an HDF5 file, not a scene file") from None
         raise ValueError(f"{name}: not a TOML file: {error}") from None
     try:
-        return SceneFile(name=name, **SceneTables.model_validate(tables).build(folder))
+        model = SceneTables.model_validate(tables)
     except ValidationError as error:
         mistakes = explain(error, tables, SceneTables)
         lines = [f"{name}: {line}" for line in mistakes[:_MOST_MISTAKES]]
@@ -128,8 +129,8 @@ def parse_scene(text: bytes, *, name: str, folder: Path) -> SceneFile:
         raise ValueError("\n  ".join(lines)) from None
     except RecursionError:
         raise ValueError(f"{name}: tables or lists are nested too deeply") from None
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: {error}") from None
+    with located(f"{name}:"):
+        return SceneFile(name=name, **model.build(folder))
 
 
 def simulation_digest(text: bytes, folder: Path) -> str:

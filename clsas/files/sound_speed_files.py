@@ -8,6 +8,7 @@ from pathlib import Path
 
 from clsas.engine.data import validate
 from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.data.validate import ArgumentError
 from clsas.files.csv_columns import read_columns
 from clsas.files.mistakes import suggestion
 from clsas.files.tables import located
@@ -62,7 +63,5 @@ def _check_names(path: Path, names: list[str]) -> None:
                 f"{path}: unknown column {validate.shown(name)}{suggestion(name, known)}"
             )
     if sorted(names) not in (sorted(_MEASURED), sorted(_DERIVED)):
-        raise ValueError(
-            f"{path} must have the columns {', '.join(_MEASURED)} or {', '.join(_DERIVED)}, got "
-            f"{', '.join(names)}"
-        )
+        allowed = f"be {', '.join(_MEASURED)} or {', '.join(_DERIVED)}"
+        raise ArgumentError("columns", allowed, ", ".join(names), where=f"{path}:")

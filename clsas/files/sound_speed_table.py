@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.data.validate import ArgumentError
 from clsas.files.sound_speed_files import read_sound_speed
 from clsas.files.tables import Table, located
 
@@ -31,12 +32,12 @@ class SoundSpeedTable(Table):
         ValueError
             If keys are missing or exclude each other, or the values are not those of a profile.
         """
+        given = self.model_fields_set - {"surface_z_m"}
+        if given not in _WAYS:
+            ways = "; or ".join(", ".join(sorted(way)) for way in _WAYS)
+            got = ", ".join(sorted(given)) or "none"
+            raise ArgumentError("[sound_speed]", f"have the keys {ways}", got)
         with located("[sound_speed]"):
-            given = self.model_fields_set - {"surface_z_m"}
-            if given not in _WAYS:
-                ways = "; or ".join(", ".join(sorted(way)) for way in _WAYS)
-                got = ", ".join(sorted(given)) or "none"
-                raise ValueError(f"must have the keys {ways}; got {got}")
             surface = {"surface_z_m": self.surface_z_m}
             if self.file is not None:
                 return read_sound_speed(folder / self.file, **surface)

@@ -14,6 +14,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.system import Pulse, Sonar, line_array, stacked
 from clsas.engine.data.track import Motion, Track
+from clsas.engine.data.validate import ArgumentError
 from clsas.files.tables import Table, Vector, located
 from clsas.files.track_files import read_track
 
@@ -35,7 +36,7 @@ class PulseTable(Table):
             code = self.code if isinstance(self.code, str) else tuple(self.code)
             return Pulse(self.carrier_hz, self.bandwidth_hz, self.duration_s, code, self.taper)
         if isinstance(self.code, str):
-            raise ValueError("missing key 'bandwidth_hz' (only a phase code determines it)")
+            raise ArgumentError("bandwidth_hz", "be given", hint="only a phase code determines it")
         return Pulse.phase_code(
             self.carrier_hz, self.duration_s, tuple(self.code), taper=self.taper
         )
@@ -65,11 +66,11 @@ class SonarTable(Table):
             if self.preset is not None:
                 others = sorted(self.model_fields_set - {"preset"})
                 if others:
-                    raise ValueError(f"preset must be the only key, got also {', '.join(others)}")
+                    raise ArgumentError("preset", "be the only key", f"also {', '.join(others)}")
                 validate.one_of("preset", self.preset, PRESETS)
                 return getattr(Sonar, self.preset)()
             if self.pulse is None:
-                raise ValueError("missing table [sonar.pulse], or key 'preset'")
+                raise ArgumentError("pulse", "be given as [sonar.pulse], or `preset` instead")
             rx_m, banks = self._receivers()
         with located("[sonar.pulse]"):
             pulse = self.pulse.build()
@@ -84,22 +85,19 @@ class SonarTable(Table):
         match self.rx_m, self.receivers, self.spacing_m:
             case list(), None, None:
                 if self.bank_heights_m is not None:
-                    raise ValueError(
-                        "bank_heights_m must be left out with rx_m, which has the heights: give "
-                        "the banks by bank_numbers"
-                    )
+                    allowed = "be left out with `rx_m`, which has the heights"
+                    hint = "give the banks by `bank_numbers`"
+                    raise ArgumentError("bank_heights_m", allowed, hint=hint)
                 return np.array(self.rx_m), self.bank_numbers
             case None, int(count), float(spacing):
                 if self.bank_numbers is not None:
-                    raise ValueError(
-                        "bank_numbers must be left out without rx_m: give the heights of the banks "
-                        "by bank_heights_m"
-                    )
+                    hint = "give the heights of the banks by `bank_heights_m`"
+                    raise ArgumentError("bank_numbers", "be left out without `rx_m`", hint=hint)
                 row_m = line_array(count, spacing)
                 if self.bank_heights_m is None:
                     return row_m, None
                 return stacked(row_m, self.bank_heights_m)
-        raise ValueError("give the receivers by either receivers and spacing_m, or rx_m")
+        raise ArgumentError("rx_m", "be given, or `receivers` and `spacing_m`, and not both")
 
 
 class MotionTable(Table):
@@ -116,7 +114,7 @@ class MotionTable(Table):
         phases, frequencies = np.radians([phase]), np.array([1 / period])
         if self.random_seed is not None:
             if "phase_deg" in self.model_fields_set:
-                raise ValueError("phase_deg must be left out with random_seed")
+                raise ArgumentError("phase_deg", "be left out with `random_seed`")
             # Sum of sinusoids of random frequency and phase, with periods from period_s upward.
             random = np.random.default_rng(validate.count("random_seed", self.random_seed, least=0))
             frequencies = random.uniform(0.1, 1.0, 32) / period
@@ -182,18 +180,19 @@ class TrackTable(Table):
         if self.file is not None:
             others = sorted(self.model_fields_set - {"file"})
             if others:
-                raise ValueError(f"[track] file must be the only key, got also {', '.join(others)}")
-            with located("[track] file"):
-                try:
-                    return read_track(folder / self.file, georeference)
-                except OSError as error:
-                    raise ValueError(
-                        f"must be readable: {error.strerror}: {folder / self.file}"
-                    ) from None
+                got = f"also {', '.join(others)}"
+                raise ArgumentError("file", "be the only key", got, where="[track]")
+            path = folder / self.file
+            try:
+                with located("[track] file"):
+                    return read_track(path, georeference)
+            except OSError as error:
+                hint = f"{error.strerror}: {path}"
+                raise ArgumentError("file", "be readable", hint=hint, where="[track]") from None
         course = ("start_m", "velocity_m_s", "pings", "ping_interval_s")
         for name in course:
             if getattr(self, name) is None:
-                raise ValueError(f"[track] missing key {name!r} (or 'file')")
+                raise ArgumentError(name, "be given, or `file`", where="[track]")
         motions = {}
         for argument in ("surge_m", "sway_m", "heave_m", "yaw_rad", "pitch_rad", "roll_rad"):
             table = argument.split("_")[0]

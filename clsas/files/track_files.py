@@ -12,6 +12,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.findings import warn_of
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.track import Track, doubts_of_track
+from clsas.engine.data.validate import ArgumentError
 from clsas.files.csv_columns import read_columns
 from clsas.files.mistakes import suggestion
 from clsas.files.tables import located
@@ -81,9 +82,10 @@ def _check_names(path: str | os.PathLike, names: list[str]) -> None:
         required: tuple[str, ...] = ("time_s", *_GEOGRAPHIC)
         for name in names:
             if name not in (*required, *_ATTITUDE[1:]):
-                raise ValueError(f"{path}: column {name!r} excludes latitude_deg and longitude_deg")
+                allowed = "be left out with latitude_deg and longitude_deg"
+                raise ArgumentError(f"column {name!r}", allowed, where=f"{path}:")
     else:
         required = ("time_s", *_POSITION, *(_VELOCITY if set(names) & set(_VELOCITY) else ()))
     for name in (*required, *names):
         if names.count(name) != 1:
-            raise ValueError(f"{path}: column {name!r} must be present once")
+            raise ArgumentError(f"column {name!r}", "be present once", where=f"{path}:")

@@ -285,8 +285,8 @@ def test_a_track_file_may_have_latitudes_and_longitudes(tmp_path):
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        ("height_m", "z_m", "column 'z_m' excludes latitude_deg and longitude_deg"),
-        ("pitch_deg", "yaw_deg", "column 'yaw_deg' excludes latitude_deg"),
+        ("height_m", "z_m", "column 'z_m' must be left out with latitude_deg and longitude_deg"),
+        ("pitch_deg", "yaw_deg", "column 'yaw_deg' must be left out with latitude_deg"),
         (",heading_deg", ",pitch_deg", "column 'heading_deg' must be present once"),
         ("60.39,", "91,", "latitude_deg must be"),
         ("latitude_deg", "lattitude_deg", "did you mean 'latitude_deg'"),
@@ -365,10 +365,14 @@ def test_a_track_file_that_is_no_text(tmp_path):
         ),
         (
             f"{SONAR}bandwidth_hz = -1",
-            "[sonar.pulse] bandwidth_hz must be finite and > 0 and <= 200000 Hz, got -1",
+            "[sonar.pulse] bandwidth_hz must be finite and > 0 Hz, got -1",
+        ),
+        (
+            f"{SONAR}bandwidth_hz = 3e5",
+            "[sonar.pulse] bandwidth_hz must be finite and <= 200000 Hz, got 300000",
         ),
         (f"{SONAR}bandwidth_hz = nan", "[sonar.pulse] bandwidth_hz must be finite"),
-        (SONAR, "[sonar.pulse] missing key 'bandwidth_hz'"),
+        (SONAR, "[sonar.pulse] bandwidth_hz must be given: only a phase code"),
         (
             f"{SONAR}code = true",
             "[sonar.pulse] code must be a text in quotes or a list in [...], got True",
@@ -382,13 +386,16 @@ def test_a_track_file_that_is_no_text(tmp_path):
             "[sonar]\npreset = 'edgetech'\nspacing_m = 1",
             "preset must be the only key, got also spacing",
         ),
-        ("[sonar]\nreceivers = 3", "missing table [sonar.pulse], or key 'preset'"),
+        (
+            "[sonar]\nreceivers = 3",
+            "[sonar] pulse must be given as [sonar.pulse], or `preset` instead",
+        ),
         (
             f"[sonar]\nreceivers = 3\n{SONAR[SONAR.index('[sonar.p') :]}",
-            "by either receivers and spacing_m, or rx_m",
+            "[sonar] rx_m must be given, or `receivers` and `spacing_m`, and not both",
         ),
         (SONAR.replace("[0.1, 0, 0]", "[0.1, 0]"), "[sonar] rx_m[1] must be a list of 3, got"),
-        ("[track]\npings = 3", "[track] missing key 'start_m' (or 'file')"),
+        ("[track]\npings = 3", "[track] start_m must be given, or `file`"),
         (TRACK.replace("400", "2.5"), "[track] pings must be a whole number, got 2.5"),
         (TRACK.replace("400", "0"), "[track] pings must be at least 1, got 0"),
         (f"{TRACK}file = 'a.csv'", "[track] file must be the only key, got also ping_interval_s"),
@@ -399,7 +406,7 @@ def test_a_track_file_that_is_no_text(tmp_path):
         (f"{TRACK}[track.sway]\namplitude_m = 1\nperiod_s = 0", "[track.sway] period_s must be"),
         (
             f"{TRACK}[track.sway]\namplitude_m = 1\nperiod_s = 1\nphase_deg = 1\nrandom_seed = 1",
-            "[track.sway] phase_deg must be left out with random_seed",
+            "[track.sway] phase_deg must be left out with `random_seed`",
         ),
         (
             "[[targets]]\nposition_m = [0, 1, 2]\n[[targets]]\nposition = [0, 1, 2]",
@@ -428,10 +435,13 @@ def test_a_track_file_that_is_no_text(tmp_path):
         (GRID.replace("x =", "z ="), "unknown key 'z' in [grid]: did you mean 'z_m'?"),
         (
             "[grid]\nx = { start_m = 0, stop_m = 1, count = 3 }",
-            "[grid] missing key 'y' (or 'origin_m'",
+            "[grid] y must be given, or `origin_m`",
         ),
-        (SLANTED.replace("shape = [2, 3]", ""), "[grid] missing key 'shape'"),
-        (SLANTED + "z_m = 2", "[grid] z_m and column_step_m exclude each other: give x, y and z_m"),
+        (SLANTED.replace("shape = [2, 3]", ""), "[grid] shape must be given"),
+        (
+            SLANTED + "z_m = 2",
+            "[grid] z_m must be left out with `column_step_m`: give `x`, `y` and",
+        ),
         (SLANTED.replace("0.1, 0.02]", "0, 0]"), "[grid] row_step_m must not be zero"),
         (SLANTED.replace("[2, 3]", "[2, 3, 4]"), "[grid] shape must be a list of 2"),
         ("[simulate]\nrange_m = [1]", "[simulate] range_m must be a list of 2, got [1]"),
@@ -482,6 +492,14 @@ def test_a_track_file_that_is_no_text(tmp_path):
 )
 def test_mistakes_are_named_with_their_place(text, message):
     assert message in refused(text)
+
+
+def test_mistakes_have_their_parts_as_data():
+    with pytest.raises(clsas.ArgumentError) as caught:
+        parse("[compress]\noversampling = 0")
+    error = caught.value
+    assert (error.where, error.argument) == ("scene.toml: [compress]", "oversampling")
+    assert error.given == "0"
 
 
 def test_a_mistyped_key_is_one_mistake_and_every_mistake_is_told():
@@ -641,8 +659,8 @@ def test_a_georeference_places_track_and_grid():
     scene = parse('[georeference]\ncrs = "EPSG:32632"\nvertical_datum = "NN2000"')
     assert scene.georeference == clsas.Georeference("EPSG:32632", vertical_datum="NN2000")
     for text, message in (
-        ("heading_deg = 0.0\nlatitude_deg = 1.0", "missing key 'longitude_deg'"),
-        ('crs = "EPSG:32632"\nheading_deg = 0.0', "crs and heading_deg exclude each other"),
+        ("heading_deg = 0.0\nlatitude_deg = 1.0", "longitude_deg must be given, or `crs`"),
+        ('crs = "EPSG:32632"\nheading_deg = 0.0', "heading_deg must be left out with `crs`"),
         ('crs = "EPSG:99999"', "crs must be one that PROJ knows"),
         ("latitude_deg = 151.0\nlongitude_deg = -33.0\nheading_deg = 0.0", "probably swapped"),
     ):

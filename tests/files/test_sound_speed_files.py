@@ -41,7 +41,7 @@ def test_xarray_has_depths_and_speeds():
 
 def test_cphd_refuses_a_profile(tmp_path):
     pytest.importorskip("sarkit")
-    with pytest.raises(ValueError, match="lines must not have sound_speed"):
+    with pytest.raises(ValueError, match="lines must have no `sound_speed`"):
         clsas.write_cphd(tmp_path / "lines.cphd", lines())
 
 
@@ -65,10 +65,10 @@ def test_csv_with_speeds_or_what_they_follow_from(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "must have the columns depth_m, speed_m_s or depth_m, temperature_c, salinity"),
+        ("", "cast.csv: columns must be depth_m, speed_m_s or depth_m, temperature_c, salinity"),
         ("depth_m,speed_m_s\n", "must have depths below the names"),
         ("depth,speed_m_s\n0,1500\n", "unknown column 'depth'.*depth_m"),
-        ("depth_m,speed_m_s,salinity\n0,1500,35\n", "must have the columns"),
+        ("depth_m,speed_m_s,salinity\n0,1500,35\n", "columns must be"),
         ("depth_m,speed_m_s\n0,1500\n1,fast\n", "line 3 must be 2 numbers, got '1,fast'"),
         ("depth_m,temperature_c,salinity\n0,25,35\n26\n", "line 3 must be 3 numbers, got '26'"),
         ("depth_m,speed_m_s\n0,4900\n10,4900\n", "cast.csv: speed_m_s .* feet per second"),
