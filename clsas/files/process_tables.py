@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +11,8 @@ import numpy as np
 from pydantic import Field
 
 from clsas.engine.data import validate
-from clsas.engine.factorized.planner import tolerance_in_db
+from clsas.engine.data.validate import ArgumentError, Choice, Count, Number
+from clsas.engine.factorized.planner import TOLERANCE
 from clsas.files.tables import Table, Vector, located
 from clsas.interferometry.checks import (
     checked_coherence,
@@ -37,54 +38,49 @@ CORRECTIONS = ("calibrate", "navigate", "focus", "pair_errors")
 _USUAL = ("inspect", "image")
 _OPTIONAL = (*CORRECTIONS, "heights")  # by default they run if their table exists
 _REQUIRED = {  # tables without which a step cannot run, each with a key that it must have
-    "calibrate": {"calibrate": "points_m"},
-    "pair_errors": {"pair_errors": "known_height_m or points_m", "heights": "search_m"},
-    "heights": {"heights": "search_m"},
+    "calibrate": {"calibrate": "`points_m`"},
+    "pair_errors": {"pair_errors": "`known_height_m` or `points_m`", "heights": "`search_m`"},
+    "heights": {"heights": "`search_m`"},
 }
+_METRES = Number("m", above=0.0)
 _Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class _Calibrate(Table):
     points_m: list[Vector]
     unknowns: list[str] | None = None
-    search_m: float | None = None
+    search_m: Annotated[float | None, _METRES] = None
 
     def build(self) -> dict[str, Any]:
-        options = self.given()
         with located("[process.calibrate]"):
+            options = self.given()
             options["points_m"] = validate.array("points_m", self.points_m, np.float64, (None, 3))
-            _check(options, validate.positive, search_m="m")
             _check_unknowns(options, CALIBRATED)
         return options
 
 
 class _Navigate(Table):
     range_m: _Pair | None = None
-    window_m: float | None = None
-    side: str = "port"
-    seabed_z_m: float | None = None
-    element_length_m: float | None = None
-    sway_sd_m: float = 0.1
-    yaw_sd_deg: float = 1.0
-    surge_sd_m: float = 0.1
-    correlation_pings: float | None = None
+    window_m: Annotated[float | None, _METRES] = None
+    side: Annotated[str, Choice(("port", "starboard"))] = "port"
+    seabed_z_m: Annotated[float | None, Number("m")] = None
+    element_length_m: Annotated[float | None, _METRES] = None
+    sway_sd_m: Annotated[float, _METRES] = 0.1
+    yaw_sd_deg: Annotated[float, Number("degrees", above=0.0)] = 1.0
+    surge_sd_m: Annotated[float, _METRES] = 0.1
+    correlation_pings: Annotated[float | None, Number("pings", above=0.0)] = None
     unknowns: list[str] | None = None
-    most_step_m: float = 0.1
+    most_step_m: Annotated[float, _METRES] = 0.1
 
     def build(self) -> dict[str, Any]:
-        options = self.given()
         with located("[process.navigate]"):
-            validate.one_of("side", self.side, ("port", "starboard"))
-            _check(
-                options, validate.positive, window_m="m", element_length_m="m", sway_sd_m="m",
-                yaw_sd_deg="degrees", surge_sd_m="m", correlation_pings="pings", most_step_m="m",
-            )  # fmt: skip
-            _check(options, validate.number, seabed_z_m="m")
+            options = self.given()
             _check_unknowns(options, NAVIGATED)
             if self.range_m is not None:
                 near, far = self.range_m
                 if not 0 <= near < far:
-                    raise ValueError(f"range_m must be [near, far], ascending, got {self.range_m}")
+                    got = validate.shown(self.range_m)
+                    raise ArgumentError("range_m", "be [near, far], ascending", got)
                 options["range_m"] = near, far
         if "yaw_sd_deg" in options:
             options["yaw_sd_rad"] = math.radians(options.pop("yaw_sd_deg"))
@@ -112,10 +108,8 @@ class _PairErrors(Table):
         with located("[process.pair_errors]"):
             names = [name for name in ("known_height_m", "points_m") if name in options]
             if len(names) != 1:
-                raise ValueError(
-                    "one of known_height_m and points_m must be given, got "
-                    + (" and ".join(names) or "none")
-                )
+                got = " and ".join(f"`{name}`" for name in names) or "neither"
+                raise ArgumentError("known_height_m", "be given, or `points_m`, and only one", got)
             if self.known_height_m is not None:
                 checked_level(self.known_height_m)
             if self.points_m is not None:
@@ -128,23 +122,21 @@ class _PairErrors(Table):
 
 class _Heights(Table):
     search_m: _Pair
-    window_m: float | None = None
+    window_m: Annotated[float | None, _METRES] = None
     least_coherence: float | None = None
-    tolerance_db: float | None = None
-    patch_m: float | None = None
+    tolerance_db: Annotated[float | None, TOLERANCE] = None
+    patch_m: Annotated[float | None, _METRES] = None
     store: str | None = None
 
     def build(self, folder: Path) -> dict[str, Any]:
-        options = self.given()
         with located("[process.heights]"):
+            options = self.given()
             options["search_m"] = checked_search(self.search_m)
-            _check(options, validate.positive, window_m="m", patch_m="m")
             if self.store is not None:
                 validate.suffix("store", Path(self.store), ".zarr")
                 options["store"] = folder / self.store
             if self.least_coherence is not None:
                 checked_coherence(self.least_coherence)
-            tolerance_in_db(self.tolerance_db, None)
         return options
 
 
@@ -154,7 +146,7 @@ class ProcessTable(Table):
     lines: str | None = None
     output: str | None = None
     steps: list[str] | None = None
-    bank: int | None = None
+    bank: Annotated[int | None, Count(0)] = None
     calibrate: _Calibrate | None = None
     navigate: _Navigate | None = None
     focus: _Focus | None = None
@@ -163,21 +155,17 @@ class ProcessTable(Table):
 
     def build(self, folder: Path) -> dict[str, Any]:
         """Return paths, steps and the options of every step. Paths are relative to `folder`."""
-        options: dict[str, Any] = {}
         with located("[process]"):
+            options = self.given()
             for name in ("lines", "output"):
-                if (path := getattr(self, name)) is not None:
-                    if not path:
-                        raise ValueError(f"{name} must be a path, got an empty one")
-                    options[name] = folder / path
-            if self.bank is not None:
-                options["bank"] = validate.count("bank", self.bank, least=0)
+                if name in options:
+                    options[name] = folder / validate.path(name, options[name])
         for name in _OPTIONAL:
             if (table := getattr(self, name)) is not None:
                 options[name] = table.build(folder) if name == "heights" else table.build()
         if self.steps is None and self.pair_errors is not None and self.heights is None:
-            with located("[process.pair_errors]"):
-                raise ValueError("needs [process.heights] with search_m")
+            allowed = "be given with `search_m` for [process.pair_errors]"
+            raise ArgumentError("[process.heights]", allowed)
         with located("[process]"):
             if self.steps is not None:
                 options["steps"] = checked_steps(self.steps, options)
@@ -197,18 +185,13 @@ def checked_steps(steps: Sequence[str] | None, options: dict[str, Any]) -> tuple
     else:
         chosen = set(validate.named("steps", steps, STEPS))
     if not chosen:
-        raise ValueError(f"steps must name at least one of {STEPS}, got none")
+        raise ArgumentError("steps", f"name at least one of {STEPS}", "none")
     for name, tables in _REQUIRED.items():
         for table, key in tables.items():
             if name in chosen and table not in options:
-                raise ValueError(f"steps may include {name} only with {key} in [process.{table}]")
+                allowed = f"not include {name!r} without {key} in [process.{table}]"
+                raise ArgumentError("steps", allowed)
     return tuple(name for name in STEPS if name in chosen)
-
-
-def _check(options: dict[str, Any], check: Callable[..., float], **units: str) -> None:
-    for name, unit in units.items():
-        if name in options:
-            check(name, options[name], unit)
 
 
 def _check_unknowns(options: dict[str, Any], allowed: tuple[str, ...]) -> None:

@@ -18,10 +18,10 @@ from pydantic import Field
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.track import Pointing
-from clsas.engine.exact.decide import BEST_ACCURACY_DB
+from clsas.engine.data.validate import ArgumentError, Count
+from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import checked_pairs, tolerance_in_db
 from clsas.engine.signal.compression import check_options as check_compression
-from clsas.engine.signal.interpolation import MOST_UPSAMPLING, TAPS
 from clsas.files.georeference_table import GeoreferenceTable
 from clsas.files.grid_tables import GridTable
 from clsas.files.process_tables import ProcessTable
@@ -65,9 +65,8 @@ class _Seabed(Table):
             known = inspect.signature(make).parameters
             for name in options:
                 if name not in known:
-                    raise ValueError(
-                        f"{name} must be left out with the scene {validate.shown(self.scene)}"
-                    )
+                    allowed = f"be left out with the scene {validate.shown(self.scene)}"
+                    raise ArgumentError(name, allowed)
             return make(**options)
 
 
@@ -84,9 +83,8 @@ class _Pointing(Table):
                 depression = validate.number("depression_deg", self.depression_deg, "degrees")
                 return Pointing.scan(np.radians(squint), depression_rad=np.radians(depression))
             if len(self.model_fields_set) > 1:
-                raise ValueError(
-                    "spot_m must be the only key of its table, since it sets the angles"
-                )
+                allowed = "be the only key of its table, since it sets the angles"
+                raise ArgumentError("spot_m", allowed)
             return Pointing.spot(self.spot_m)
 
 
@@ -156,19 +154,11 @@ class _Image(Table):
                     for name in (*PLAN_KEYS, *EXACT_KEYS)
                     if name in options and name != requests[0]
                 ]
-                raise ValueError(
-                    f"{requests[0]} must be the only request, got also {', '.join(others)}"
-                )
+                got = f"also {', '.join(others)}"
+                raise ArgumentError(requests[0], "be the only request", got)
             tolerance_in_db(self.tolerance_db, self.tolerance_wavelengths)
             checked_pairs([(beams, divisions) for beams, divisions in self.stages or ()])
-            if self.accuracy_db is not None:
-                validate.number(
-                    "accuracy_db", self.accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0
-                )
-            if self.taps is not None:
-                validate.one_of("taps", self.taps, TAPS)
-            if self.upsampling is not None:
-                validate.number("upsampling", self.upsampling, least=1.0, most=MOST_UPSAMPLING)
+            validate.check_declared(ExactImage, options)
         if self.stages is not None:
             options["stages"] = [tuple(stage) for stage in self.stages]
         if self.beam is not None:
@@ -180,25 +170,20 @@ class _Mosaic(Table):
     lines: str | None = None
     store: str | None = None
     patches: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
-    memory_mib: int | None = None
+    memory_mib: Annotated[int | None, Count()] = None
 
     def build(self, folder: Path) -> dict[str, Any]:
-        options = self.given()
         with located("[mosaic]"):
+            options = self.given()
             for name in ("lines", "store"):
                 if name in options:
-                    if not options[name]:
-                        raise ValueError(f"{name} must be a path, got an empty one")
-                    options[name] = folder / options[name]
+                    options[name] = folder / validate.path(name, options[name])
             if "lines" in options and not options["lines"].exists():
-                raise ValueError(
-                    f"lines must be a file or folder, but {options['lines']} does not exist"
-                )
+                hint = f"{options['lines']} does not exist"
+                raise ArgumentError("lines", "be a file or folder", hint=hint)
             if self.patches is not None:
                 rows, columns = (validate.count("every entry of patches", n) for n in self.patches)
                 options["patches"] = rows, columns
-            if self.memory_mib is not None:
-                validate.count("memory_mib", self.memory_mib)
         return options
 
 

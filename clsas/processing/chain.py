@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from clsas.files.hdf5 import save
 from clsas.files.json_types import json_able
 from clsas.files.process_tables import CORRECTIONS, STEPS, checked_steps
 from clsas.files.scene_files import SceneFile, read_scene
+from clsas.files.tables import located
 from clsas.interferometry.checks import check_grid
 from clsas.interferometry.result import Heights
 from clsas.mosaics.store import Store
@@ -371,12 +372,6 @@ def _outcome(name: str, job: Job) -> tuple[Outcome, tuple[str, ...]]:
     return outcome, tuple(dict.fromkeys(messages))  # images before and after share theirs
 
 
-@contextmanager
-def _naming(scene: SceneFile, name: str) -> Iterator[None]:
+def _naming(scene: SceneFile, name: str) -> AbstractContextManager[None]:
     """Put the scene, a step and its table in front of errors."""
-    try:
-        yield
-    except (TypeError, ValueError) as error:
-        where = f"{scene.name or 'scene'}: {name} ({TABLES[name]})"
-        kind = TypeError if isinstance(error, TypeError) else ValueError
-        raise kind(f"{where}: {error}") from error
+    return located(f"{scene.name or 'scene'}: {name} ({TABLES[name]}):")

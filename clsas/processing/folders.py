@@ -9,6 +9,7 @@ from pathlib import Path
 
 from clsas.engine.data import validate
 from clsas.engine.data.atomic import locked
+from clsas.engine.data.validate import ArgumentError
 from clsas.files.scene_files import SceneFile
 from clsas.processing.record import NAME, StepRecord, read_records
 from clsas.processing.recording import Recording
@@ -22,9 +23,8 @@ def folder_of(scene: SceneFile, output: str | os.PathLike | None) -> Path:
     if "output" in scene.process:
         return scene.process["output"]
     if not Path(scene.name).suffix:
-        raise ValueError(
-            "output must be given, since the scene has no file to name the folder after"
-        )
+        allowed = "be given, since the scene has no file to name the folder after"
+        raise ArgumentError("output", allowed)
     return Path(scene.name).with_suffix("")
 
 
@@ -32,13 +32,12 @@ def check_folder(folder: Path, recording: Recording) -> None:
     """Raise ValueError if the folder cannot be created, or contains the recording."""
     source = recording.described["file"]
     if source is not None and Path(source).parent.resolve() == folder.resolve():
-        raise ValueError(f"output must not be the folder of the recording, got {str(folder)!r}")
+        raise ArgumentError("output", "not be the folder of the recording", repr(str(folder)))
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"output must be a folder, got the file {str(folder)!r}")
+        raise ArgumentError("output", "be a folder", f"the file {str(folder)!r}")
     if not folder.parent.is_dir():
-        raise ValueError(
-            f"output {str(folder)!r} cannot be created: there is no folder {str(folder.parent)!r}"
-        )
+        hint = f"there is no folder {str(folder.parent)!r}"
+        raise ArgumentError("output", "lie in an existing folder", repr(str(folder)), hint)
 
 
 def checked_records(
@@ -74,9 +73,11 @@ def checked_records(
     for name in names:
         for file in FILES[name]:
             if file not in own and os.path.lexists(folder / file):
-                raise ValueError(
-                    f"output {str(folder)!r} contains {file}, which {name} would replace and which "
-                    "clsas did not write: choose another output, or remove the file"
+                raise ArgumentError(
+                    "output",
+                    f"not contain {file}, which {name} would replace and clsas did not write",
+                    repr(str(folder)),
+                    "choose another folder, or remove the file",
                 )
     return records
 

@@ -21,6 +21,7 @@ import scipy
 from clsas.engine.data import reading, reprs, validate
 from clsas.engine.data.atomic import replacing
 from clsas.engine.data.digests import DIGEST, digest, is_intact, with_digest
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
 from clsas.files.json_types import json_able
 from clsas.files.process_tables import CORRECTIONS
@@ -116,27 +117,21 @@ def read_records(folder: Path, scene: SceneFile) -> tuple[dict[str, StepRecord],
         return {}, False
     except (IsADirectoryError, ValueError):
         pass
-    contains = f"output {str(folder)!r} contains"
+    own, choose = repr(str(folder)), "choose another folder, or remove"
     if not isinstance(document, dict) or document.get("format") != _FORMAT:
         if _MARK in text:
             return {}, True
-        raise ValueError(
-            f"{contains} a {NAME} that clsas did not write, or whose beginning is damaged: choose "
-            "another output, or remove the file"
-        )
+        allowed = f"not contain a {NAME} that clsas did not write, or whose beginning is damaged"
+        raise ArgumentError("output", allowed, own, f"{choose} the file")
     if document.get("version") != _VERSION:
-        raise ValueError(
-            f"{contains} a {NAME} of another version of clsas: choose another output, or remove "
-            "the folder"
-        )
+        allowed = f"not contain a {NAME} of another version of clsas"
+        raise ArgumentError("output", allowed, own, f"{choose} this one")
     steps = document.pop("steps", None)
     if not is_intact(document) or not isinstance(steps, list):
         return {}, True
-    if (other := document.get("scene")) != (own := _of_folder(scene, folder)):
-        raise ValueError(
-            f"{contains} the results of another scene: {validate.shown(other)} relative to the "
-            f"folder, not {own!r}. Choose another output, or remove the folder"
-        )
+    if (other := document.get("scene")) != (this := _of_folder(scene, folder)):
+        got = f"{own} with those of {validate.shown(other)} relative to the folder, not {this!r}"
+        raise ArgumentError("output", "not contain results of another scene", got, f"{choose} it")
     found = {}
     for step in filter(is_intact, steps):
         values = {name: value for name, value in step.items() if name != DIGEST}

@@ -11,6 +11,7 @@ from typing import Any
 from clsas.engine.data import validate
 from clsas.engine.data.digests import digest
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.compression import compress
 from clsas.engine.signal.echoes import Echoes
 from clsas.files.formats import load
@@ -48,14 +49,12 @@ class Recording:
             found = digest(given)
             return cls({"file": None, "digest": found}, found, None, given, options)
         path = scene.process.get("lines") if given is None else validate.path("lines", given)
+        where = f"{scene.name}: [process]"
         if path is None:
-            raise ValueError(
-                f"{scene.name}: missing key 'lines' in [process], the path of the recording"
-            )
+            raise ArgumentError("lines", "be given", hint="the path of the recording", where=where)
         if given is None and not path.exists():
-            raise ValueError(
-                f"{scene.name}: [process] lines must be a file, but {path} does not exist"
-            )
+            hint = f"{path} does not exist"
+            raise ArgumentError("lines", "be a file", hint=hint, where=where)
         found = file_digest(path)
         of_both = step_digest("recording", options, found)
         return cls({"file": str(path), "digest": found}, of_both, path, None, options)
@@ -96,8 +95,8 @@ def loaded(path: Path, expected: str, *kinds: type) -> Any:
     """
     found = load(path)
     if not isinstance(found, kinds):
-        names = " or ".join(kind.__name__ for kind in kinds)
-        raise ValueError(f"{path} must contain {names}, got {type(found).__name__}")
+        names = " or ".join(f"`{kind.__name__}`" for kind in kinds)
+        raise ValueError(f"{path} must contain {names}, got `{type(found).__name__}`")
     # Compute the digest after reading, so that a change in between is detected.
     if file_digest(path) != expected:
         raise ValueError(

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from clsas import plot
+from clsas.engine.data import validate
 from clsas.engine.data.atomic import replacing, staging
 from clsas.engine.data.digests import digest
 from clsas.engine.data.extras import install_command, is_installed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines, banks_of, first_two_banks
-from clsas.engine.data.validate import warn
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device
 from clsas.engine.factorized.planner import TOLERANCE_DB
 from clsas.engine.imaging import backproject, factorize, plan
@@ -23,6 +24,7 @@ from clsas.files.hdf5 import save
 from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS
+from clsas.files.tables import located
 from clsas.inspection.inspection import inspect
 from clsas.interferometry.heights import heights
 from clsas.interferometry.pair_errors import pair_errors
@@ -86,13 +88,10 @@ class Job:
 
     def of_bank(self, lines: RangeLines) -> RangeLines:
         """Return the lines of the receiver bank that is imaged: the scene's, or else the first."""
-        chosen = self.scene.process.get("bank")
-        if chosen is None:
-            return lines.bank(banks_of(lines.bank_numbers)[0])
-        try:
-            return lines.bank(chosen)
-        except ValueError as error:
-            raise ValueError(f"[process] {str(error).replace('number', 'bank', 1)}") from None
+        banks = banks_of(lines.bank_numbers)
+        with located("[process]"):
+            chosen = validate.one_of("bank", self.scene.process.get("bank", banks[0]), banks)
+        return lines.bank(chosen)
 
     @property
     def title(self) -> str:
@@ -176,7 +175,7 @@ def inspected(job: Job) -> Outcome:
         element_length_m=None if scene.sonar is None else scene.sonar.element_length_m,
     )  # fmt: skip
     for finding in found.findings:
-        warn(f"{finding.name}: {finding.message}")
+        validate.warn(f"{finding.name}: {finding.message}")
     _write(job.folder / "inspect.txt", found.describe() + "\n")
     files = ["inspect.txt", *job.draw("inspect.png", lambda: plot.inspection(found, scene.grid))]
     findings = [{"name": each.name, "message": each.message} for each in found.findings]
@@ -298,10 +297,9 @@ def _given(options: dict[str, Any], *names: str) -> dict[str, Any]:
 
 def check_banks(lines: RangeLines) -> tuple[RangeLines, RangeLines]:
     """Return the two banks for heights; raise ValueError for a recording of one bank."""
-    try:
-        first, second = first_two_banks(lines.bank_numbers)
-    except ValueError as error:
-        raise ValueError(f"the recording {error}") from None
+    if lines.banks < 2:
+        raise ArgumentError("lines", "have at least 2 receiver banks (`bank_numbers`)", lines.banks)
+    first, second = first_two_banks(lines.bank_numbers)
     return lines.bank(first), lines.bank(second)
 
 
@@ -310,8 +308,8 @@ def joined(job: Job) -> Outcome:
     scene = job.scene
     (grid,) = scene.need("grid")
     request = request_of(scene)
-    if set(request) & {"taps", "upsampling"}:
-        raise ValueError("taps and upsampling have no effect in a mosaic")
+    if ignored := {"taps", "upsampling"} & set(request):
+        raise ArgumentError(min(ignored), "be left out for a mosaic, in which it has no effect")
     memory_mib = scene.mosaic.get("memory_mib")
     begin = partial(
         mosaic, job.of_bank(job.lines), grid, job.store, **request, beam=scene.image.get("beam"),
@@ -408,7 +406,9 @@ TABLES = {name: f"[process.{name}]" for name in CORRECTIONS} | {
 def check_pictures() -> None:
     """Warn if no pictures can be written."""
     if not is_installed("matplotlib"):
-        warn(f"no pictures are written, since they need matplotlib: {install_command('plot')}")
+        validate.warn(
+            f"no pictures are written, since they need matplotlib: {install_command('plot')}"
+        )
 
 
 def _formed(
