@@ -113,7 +113,7 @@ def test_a_case_has_no_banks():
     ("keys", "message"),
     [
         ("receivers = 2\nspacing_m = 0.1\nbank_numbers = [0, 1]", "bank_heights_m"),
-        ("rx_m = [[0, 0, 0], [0, 0, 1]]\nbank_heights_m = [0.0, 1.0]", "by bank_numbers"),
+        ("rx_m = [[0, 0, 0], [0, 0, 1]]\nbank_heights_m = [0.0, 1.0]", "by `bank_numbers`"),
         ("rx_m = [[0, 0, 0], [0, 0, 1]]\nbank_numbers = [0, 2]", "without a gap"),
     ],
 )
