@@ -197,13 +197,10 @@ def _report_store(store: clsas.Store, output: Path, as_json: bool) -> None:
 
 
 def _raised(plane: clsas.Grid, relief: Path) -> clsas.Grid:
-    """Return a plane with the heights in a file; raise an error that names the option."""
+    """Return a plane with the heights in a file; a usage error unless it is a plane."""
     if not plane.is_planar:
         raise click.UsageError("--relief requires a plane, but the grid of the scene has heights")
-    try:
-        return plane.with_height(read_heights(relief, plane.shape))
-    except ValueError as error:
-        raise ValueError(f"--relief {error}") from None
+    return plane.with_height(read_heights(relief, plane.shape))
 
 
 def in_words(results: dict[str, Any]) -> str:

@@ -27,6 +27,7 @@ from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart, keep_ou
 from clsas.cli.wording import command
 from clsas.engine.data.extras import needed
 from clsas.engine.data.threads import uninterrupted
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import open_device
 from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.files.scene_files import SceneFile, simulation_digest
@@ -197,10 +198,9 @@ def _check_paths(output: Path, picture: Path | None, lines_path: Path | None, fo
 def _read_request(described: SceneFile, given: dict[str, Any], exact: bool) -> dict[str, Any]:
     """Return the request for every patch, which is one of `PLAN_KEYS` or an accuracy."""
     request = read_request(described, given, exact)
-    if set(request) - {*PLAN_KEYS, "accuracy_db"}:
-        raise ValueError(
-            f"{described.name}: [image] taps and upsampling have no effect in a mosaic"
-        )
+    if ignored := set(request) - {*PLAN_KEYS, "accuracy_db"}:
+        allowed = "be left out for a mosaic, in which it has no effect"
+        raise ArgumentError(min(ignored), allowed, where=f"{described.name}: [image]")
     return request or {"accuracy_db": ACCURACY_DB}
 
 

@@ -16,6 +16,8 @@ from click.core import ParameterSource
 
 from clsas.engine.data.validate import ArgumentError, described
 
+_NAMES_AND_CODE = re.compile(r"`([^`\n]+)`")
+_CODE = re.compile(r"`([A-Z]\w*|\w+\.[^`\n]+)`")  # functions, methods and classes
 _RUNNING = "clsas.cli.running"  # key of the running command's context among those of click
 
 # Parameters of commands that stand for an argument of the library with another name. The first one
@@ -28,6 +30,7 @@ _PARAMETERS = {
     "follow_s": ("follow",),
     "found": ("heights_file",),
     "georeference": ("crs",),
+    "height_file": ("relief",),
     "height_m": ("origin",),
     "image": ("image_file",),
     "images": ("source",),
@@ -116,13 +119,15 @@ def option_name(param: click.Parameter) -> str:
 def error_message(error: BaseException) -> str:
     """Return an exception's message in the words of the command that is running, if any."""
     running = _running()
-    if running is None or not isinstance(error, ArgumentError) or error.where:
-        return in_options(str(error))  # a file keeps its own words
+    if running is None or not isinstance(error, ArgumentError):
+        return in_options(str(error))
+    if error.where:  # names are keys of a file
+        return in_options(str(error), _CODE)
     argument = _worded(error.argument, running) or error.argument
     return in_options(error.sentence(argument, _typed(error.given)))
 
 
-def in_options(text: str) -> str:
+def in_options(text: str, code: re.Pattern = _NAMES_AND_CODE) -> str:
     """Return a message with words of the running command for what stands in backticks.
 
     Names of arguments become options, and names of functions commands. Other code stays.
@@ -130,7 +135,7 @@ def in_options(text: str) -> str:
     running = _running()
     if running is None:
         return text
-    return re.sub(r"`([^`\n]+)`", lambda code: _worded(code[1], running) or code[0], text)
+    return code.sub(lambda found: _worded(found[1], running) or found[0], text)
 
 
 def _running() -> click.Context | None:
