@@ -230,9 +230,9 @@ def test_receivers_as_fast_as_allowed(platform, grid, direction):
     [
         ({"range_step_m": 1e-300}, "range_step_m must be .*>= 1e-09 and <= 1e\\+09 m, got 1e-300"),
         ({"range_step_m": 1e300}, "range_step_m must be .*got 1e"),
-        ({"carrier_hz": 1e15}, "carrier_hz = 1e\\+15 Hz makes .* cycles over"),
-        ({"carrier_hz": 1e300}, "carrier_hz = 1e\\+300 Hz makes .* cycles over"),
-        ({"sound_speed_m_s": 1e-308}, "carrier_hz = .* makes inf cycles over"),
+        ({"carrier_hz": 1e15}, "carrier_hz must make at most .* cycles, .* got 1e\\+15 Hz"),
+        ({"carrier_hz": 1e300}, "carrier_hz must make at most .* cycles, .* got 1e\\+300 Hz"),
+        ({"sound_speed_m_s": 1e-308}, "carrier_hz must make at most .* got .* Hz, with inf cycles"),
     ],
 )
 def test_numbers_that_no_phase_survives_are_refused(change, message):
