@@ -90,7 +90,7 @@ class Pulse:
                 )
         if duration >= _LONG_S and band * duration > _MOST_PRODUCT:
             validate.warn(
-                f"duration_s is {duration:g} s, {band * duration:.3g} cycles of its band; pulses "
+                f"`duration_s` is {duration:g} s, {band * duration:.3g} cycles of its band; pulses "
                 "of sonars last milliseconds. Give it in seconds, not in milliseconds"
             )
 
@@ -125,10 +125,8 @@ class Pulse:
         chips = _chips("chips", chips)
         carrier = validate.positive("carrier_hz", carrier_hz, "Hz")
         if len(chips) > 2 * carrier * duration:
-            raise ValueError(
-                f"duration_s must be at least chips / (2 carrier_hz) = "
-                f"{len(chips) / (2 * carrier):g} s, got {duration:g} s"
-            )
+            allowed = f"be at least chips / (2 `carrier_hz`) = {len(chips) / (2 * carrier):g} s"
+            raise ArgumentError("duration_s", allowed, f"{duration:g} s")
         return cls(carrier, len(chips) / duration, duration, chips, taper)
 
     def envelope(self, time_s: ArrayLike) -> NDArray[np.complex128]:
@@ -249,16 +247,16 @@ class Sonar:
     rx_m: NDArray[np.float64]
     tx_m: NDArray[np.float64] = (0.0, 0.0, 0.0)  # type: ignore[assignment]
     sample_rate_hz: float = None  # type: ignore[assignment]
-    sound_speed_m_s: float = 1500.0
-    tx_length_m: float | None = None
-    rx_length_m: float | None = None
-    tx_height_m: float | None = None
-    rx_height_m: float | None = None
+    sound_speed_m_s: Annotated[float, Number("m/s", above=0.0, help="Speed of sound.")] = 1500.0
+    tx_length_m: Annotated[float | None, Number("m", above=0.0, help="Transmitter length.")] = None
+    rx_length_m: Annotated[float | None, Number("m", above=0.0, help="Receiver length.")] = None
+    tx_height_m: Annotated[float | None, Number("m", above=0.0, help="Transmitter height.")] = None
+    rx_height_m: Annotated[float | None, Number("m", above=0.0, help="Receiver height.")] = None
     bank_numbers: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:  # noqa: D105
-        if not isinstance(self.pulse, Pulse):
-            raise TypeError(f"pulse must be a clsas.Pulse, got {type(self.pulse).__name__}")
+        validate.instance("pulse", self.pulse, Pulse)
+        validate.check_fields(self)
         band = self.pulse.bandwidth_hz
         rate = 2 * band if self.sample_rate_hz is None else self.sample_rate_hz
         # A rate of exactly 1.25 bandwidths may be rounded down.
@@ -267,11 +265,7 @@ class Sonar:
             "rx_m": validate.array("rx_m", self.rx_m, np.float64, (None, 3)),
             "tx_m": validate.array("tx_m", self.tx_m, np.float64, (3,)),
             "sample_rate_hz": validate.number("sample_rate_hz", rate, "Hz", least=least),
-            "sound_speed_m_s": validate.positive("sound_speed_m_s", self.sound_speed_m_s, "m/s"),
         }
-        for name in ("tx_length_m", "rx_length_m", "tx_height_m", "rx_height_m"):
-            size = getattr(self, name)
-            fields[name] = None if size is None else validate.positive(name, size, "m")
         if self.bank_numbers is not None:
             fields["bank_numbers"] = _checked_banks(self.bank_numbers, len(fields["rx_m"]))
         for name, value in fields.items():
@@ -426,14 +420,11 @@ def _checked_banks(value: ArrayLike, receivers: int) -> NDArray[np.int64]:
     numbers = checked_bank_numbers(value, receivers, "receivers")
     counts = np.bincount(numbers)
     if not counts.all():
-        raise ValueError(
-            f"bank_numbers must count banks from 0 without a gap, got {banks_of(numbers)}"
-        )
+        allowed = "count banks from 0 without a gap"
+        raise ArgumentError("bank_numbers", allowed, banks_of(numbers))
     if np.ptp(counts):
-        raise ValueError(
-            "bank_numbers must give every bank the same number of receivers, got "
-            f"{', '.join(map(str, counts))}"
-        )
+        allowed = "give every bank the same number of receivers"
+        raise ArgumentError("bank_numbers", allowed, ", ".join(map(str, counts)))
     return numbers
 
 
@@ -445,10 +436,8 @@ def _chips(name: str, value: object) -> tuple[int, ...]:
         given = np.zeros(0)
     is_code = given.ndim == 1 and given.size > 0 and given.dtype.kind in "iuf"
     if not is_code or not np.isin(given, (1, -1)).all():
-        raise ValueError(
-            f"{name} must be {'up, down or ' * (name == 'code')}chips of +1 and -1, "
-            f"got {validate.shown(value)}"
-        )
+        allowed = f"be {'up, down or ' * (name == 'code')}chips of +1 and -1"
+        raise ArgumentError(name, allowed, validate.shown(value))
     return tuple(given.astype(int).tolist())
 
 

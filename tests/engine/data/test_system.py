@@ -128,7 +128,7 @@ def test_sample_rate_defaults_to_twice_the_bandwidth():
             r"code must be .* chips of \+1 and -1, got \(1, 0, -1\)",
         ),
         ({"code": ()}, ValueError, r"code must be .* got \(\)"),
-        ({"code": (1, -1)}, ValueError, "bandwidth_hz of a phase code must be .* 2000 Hz, got"),
+        ({"code": (1, -1)}, ValueError, "bandwidth_hz must be chips/duration = 2000 Hz .* got"),
     ],
 )
 def test_bad_pulse(arguments, error, message):
@@ -140,7 +140,7 @@ def test_bad_pulse(arguments, error, message):
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"pulse": "chirp"}, TypeError, "pulse must be a clsas.Pulse, got str"),
+        ({"pulse": "chirp"}, TypeError, "pulse must be of type Pulse, got str"),
         ({"rx_m": [0, 0, 0]}, ValueError, r"rx_m must have shape \(any, 3\)"),
         ({"rx_m": np.zeros((0, 3))}, ValueError, "rx_m must have shape .* no empty axis"),
         ({"rx_m": [[0, np.nan, 0]]}, ValueError, "rx_m must be finite, got 1 NaN"),
