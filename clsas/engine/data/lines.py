@@ -14,6 +14,7 @@ from clsas.engine.data import pings, reprs, validate
 from clsas.engine.data.fourier import EDGE_PRODUCT, smooth_edge
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.sound_speed import SoundSpeed, check_reaches
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 
 _PER_CHANNEL = (
     "first_range_m",
@@ -259,7 +260,7 @@ class RangeLines:
         """
         index = self._index(channels)
         if len(range(self.channels)[index] if isinstance(index, slice) else index) == 0:
-            raise ValueError("channels must select at least one line, got none")
+            raise ArgumentError("channels", "select at least one line", "none")
         return self._selected(index)
 
     def bank(self, number: int) -> RangeLines:
@@ -308,19 +309,18 @@ class RangeLines:
         try:
             given = np.atleast_1d(channels)
         except ValueError as error:
-            raise ValueError(f"channels must be a regular array: {error}") from None
+            raise ArgumentError("channels", "be a regular array", hint=str(error)) from None
         if given.ndim != 1:
-            raise ValueError(f"channels must have one axis, got shape {given.shape}")
+            raise ArgumentError("channels", "have one axis", f"shape {given.shape}")
         given = given if given.size else given.astype(int)
         if given.dtype.kind not in "iub":
             got = validate.shown(channels)
-            raise TypeError(f"channels must be a slice, whole numbers or bools, got {got}")
+            raise ArgumentTypeError("channels", "be a slice, whole numbers or bools", got)
         if given.dtype.kind != "b":
             return validate.indices("channels", given, self.channels, least=-self.channels)
         if len(given) != self.channels:
-            raise ValueError(
-                f"channels must be one bool for each of {self.channels} channels, got {len(given)}"
-            )
+            allowed = f"be one bool for each of {self.channels} channels"
+            raise ArgumentError("channels", allowed, len(given))
         return np.flatnonzero(given)
 
     def high_passed(self, cutoff_hz: float) -> RangeLines:
@@ -347,22 +347,21 @@ class RangeLines:
         lowest = max(0.0, self.carrier_hz - rate / 2)
         cutoff = validate.positive("cutoff_hz", cutoff_hz, "Hz")
         if cutoff <= lowest:
-            raise ValueError(
-                f"cutoff_hz must be finite and > {lowest:g} and < {lowest + rate:g} Hz, got "
-                f"{cutoff:g}: lines on a carrier of {self.carrier_hz:g} Hz contain nothing below "
-                f"{lowest:g} Hz"
+            raise ArgumentError(
+                "cutoff_hz",
+                f"be finite and > {lowest:g} and < {lowest + rate:g} Hz",
+                f"{cutoff:g}",
+                f"lines on a carrier of {self.carrier_hz:g} Hz contain nothing below {lowest:g} Hz",
             )
         validate.number("cutoff_hz", cutoff, "Hz", above=lowest, below=lowest + rate)
         if cutoff * self.length < rate:
-            raise ValueError(
-                f"cutoff_hz must be at least one cycle per line, {rate / self.length:g} Hz, "
-                f"got {cutoff:g} Hz"
-            )
+            allowed = f"be at least one cycle per line, {rate / self.length:g} Hz"
+            raise ArgumentError("cutoff_hz", allowed, f"{cutoff:g} Hz")
         # The edge begins at half the cutoff, or at the lowest frequency of the band if that is
         # higher.
         width = min(cutoff / 2, cutoff - lowest)
         padded = fft.next_fast_len(self.length + int(np.ceil(EDGE_PRODUCT * rate / width)))
-        validate.memory("the padding for cutoff_hz", 16 * padded)
+        validate.memory("cutoff_hz", 16 * padded)
         frequency = np.abs(self.carrier_hz + fft.fftfreq(padded, 1 / rate))
         response = smooth_edge((cutoff - frequency) / width)
         samples = np.empty_like(self.samples)
@@ -426,24 +425,26 @@ class RangeLines:
         if receivers is None:
             counts = pings.channels_per_ping(self.ping_starts, self.channels)
             if np.ptp(counts):
-                raise ValueError(
-                    "receivers must be given, because pings (consecutive channels with one tx "
-                    f"position) have from {counts.min()} to {counts.max()} channels"
+                raise ArgumentError(
+                    "receivers",
+                    "be given",
+                    hint="pings (consecutive channels with one transmitter position) have from "
+                    f"{counts.min()} to {counts.max()} channels",
                 )
             receivers = int(counts[0])
         receivers = validate.count("receivers", receivers)
         number, rest = divmod(self.channels, receivers)
         if rest or number < 2:
-            raise ValueError(
-                "receivers must divide the channels into at least 2 pings, "
-                f"got {receivers} receivers and {self.channels} channels"
-            )
+            got = f"{receivers} receivers and {self.channels} channels"
+            raise ArgumentError("receivers", "divide the channels into at least 2 pings", got)
         first_m = self.first_range_m.reshape(number, receivers)
         spread_m = float(np.ptp(first_m, axis=0).max())
         if spread_m > _EQUAL_RANGE * self.range_step_m:
-            raise ValueError(
-                "first_range_m of a receiver must be the same in all pings, because a background "
-                f"lies at one delay; it differs by up to {spread_m:g} m"
+            raise ArgumentError(
+                "first_range_m",
+                "be the same in all pings of a receiver",
+                f"ranges that differ by up to {spread_m:g} m",
+                "a background lies at one delay",
             )
         samples = np.array(self.samples).reshape(number, receivers, self.length)
         for receiver in range(receivers):
@@ -483,12 +484,13 @@ class RangeLines:
             near = (
                 "are at one position"
                 if least_advance_m is None
-                else f"lie within least_advance_m = {least_advance_m:g} m"
+                else f"lie within `least_advance_m` = {least_advance_m:g} m"
             )
-            raise ValueError(
-                f"lines must come from a platform that moves: of {found.count} pings "
-                f"({self.channels} lines) only the first would stay, because all {near}. Check "
-                "the positions"
+            raise ArgumentError(
+                "lines",
+                "come from a platform that moves",
+                hint=f"of {found.count} pings ({self.channels} lines) only the first would stay, "
+                f"because all {near}; check the positions",
             )
         return self if kept.all() else self.select(found.channels(kept))
 
@@ -511,10 +513,8 @@ class RangeLines:
             samples = self.samples * factors[:, None]
         if not np.isfinite(samples).all():
             largest = float(np.abs(factors).max())
-            raise ValueError(
-                f"weights must keep the samples within float32, up to "
-                f"{np.finfo(np.float32).max:.2g}, got weights up to {largest:.3g}"
-            )
+            allowed = f"keep the samples within float32, up to {np.finfo(np.float32).max:.2g}"
+            raise ArgumentError("weights", allowed, f"weights up to {largest:.3g}")
         return replace(self, samples=samples)
 
     def without_samples(self) -> RangeLines:
@@ -561,7 +561,7 @@ def checked_channels(received: Any, start: str) -> dict[str, Any]:
         checked["look_direction"] = _unit_vectors("look_direction", checked["look_direction"])
     if received.sound_speed is not None:
         for name in ("tx_m", "rx_m"):
-            check_reaches(received.sound_speed, checked[name][:, 2], name)
+            check_reaches(received.sound_speed, checked[name][:, 2], f"`{name}`")
     return checked
 
 
@@ -569,7 +569,7 @@ def _unit_vectors(name: str, vectors: NDArray[np.float64]) -> NDArray[np.float64
     """Return vectors scaled to length 1. Those that have it already are returned bit for bit."""
     largest = np.abs(vectors).max(axis=1, keepdims=True)
     if not largest.all():
-        raise ValueError(f"{name} must not have a vector of length 0")
+        raise ArgumentError(name, "not have a vector of length 0")
     scaled = vectors / largest  # avoids overflow and underflow in the norm
     length = np.linalg.norm(scaled, axis=1, keepdims=True)
     if np.abs(length * largest - 1).max() < _UNIT:
@@ -589,9 +589,8 @@ def checked_bank_numbers(value: ArrayLike, count: int, of: str) -> NDArray[np.in
     """
     numbers = validate.indices("bank_numbers", value, _MOST_BANKS)
     if numbers.shape != (count,):
-        raise ValueError(
-            f"bank_numbers must be one number for each of {count} {of}, got shape {numbers.shape}"
-        )
+        allowed = f"be one number for each of {count} {of}"
+        raise ArgumentError("bank_numbers", allowed, f"shape {numbers.shape}")
     numbers = numbers.view()
     numbers.flags.writeable = False
     return numbers
@@ -616,7 +615,7 @@ def bank_members(numbers: NDArray[np.int64] | None, number: int) -> slice | NDAr
         names = f"one of the banks {', '.join(map(str, known))}"
         if len(known) == 1:
             names = f"{known[0]}, since there is one bank"
-        raise ValueError(f"number must be {names}, got {number}")
+        raise ArgumentError("number", f"be {names}", number)
     return slice(None) if numbers is None else np.flatnonzero(numbers == number)
 
 
@@ -640,7 +639,7 @@ def first_two_banks(numbers: NDArray[np.int64] | None) -> tuple[int, int]:
     """
     first, *others = banks_of(numbers)
     if not others:
-        raise ValueError("must have at least 2 receiver banks (bank_numbers), got 1")
+        raise ValueError("must have at least 2 receiver banks, got 1")
     second, *unused = others
     if unused:
         words = f"bank {unused[0]} is"
@@ -648,7 +647,7 @@ def first_two_banks(numbers: NDArray[np.int64] | None) -> tuple[int, int]:
             words = f"banks {', '.join(map(str, unused[:-1]))} and {unused[-1]} are"
         validate.warn(
             f"heights are measured from banks {first} and {second}; {words} not used. "
-            "To choose others, give lines.bank(n) of both"
+            "To choose others, give `lines.bank(n)` of both"
         )
     return first, second
 

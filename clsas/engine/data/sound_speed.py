@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.validate import ArgumentError
 
 SLOWEST_M_S, FASTEST_M_S = 1300.0, 1800.0
 """Slowest and fastest sound in water: fresh water near freezing has 1402 m/s, hot brines of the
@@ -251,8 +252,8 @@ class SoundSpeed:
         """
         one = validate.number("one_z_m", one_z_m, "m")
         other = validate.number("other_z_m", other_z_m, "m")
-        check_reaches(self, one, "one_z_m")
-        check_reaches(self, other, "other_z_m")
+        check_reaches(self, one, "`one_z_m`")
+        check_reaches(self, other, "`other_z_m`")
         top, bottom = max(one, other), min(one, other)
         ends = np.array([top, bottom])
         speeds = self.at(ends)
@@ -271,7 +272,7 @@ class SoundSpeed:
         return float((top - bottom) / np.sum(np.diff(depth) / slower * share))
 
 
-def check_reaches(profile: SoundSpeed, z_m: ArrayLike, name: str = "z_m") -> None:
+def check_reaches(profile: SoundSpeed, z_m: ArrayLike, name: str = "`z_m`") -> None:
     """Raise ValueError if heights of antennas or pixels lie outside a profile."""
     z = np.asarray(z_m, np.float64)
     if not z.size:
@@ -284,10 +285,12 @@ def check_reaches(profile: SoundSpeed, z_m: ArrayLike, name: str = "z_m") -> Non
     # The deepest ocean is 11 km deep, so depths in kilometres end below 12.
     is_km = last <= _DEEPEST_M / 1e3 and last < depth[1] <= 1e3 * last
     advice = "; if its depths are kilometres, multiply them by 1000" if is_km else ""
-    raise ValueError(
-        f"sound_speed must include the depths of {name}, {depth[0]:g} to {depth[1]:g} m, got a "
-        f"profile from {first:g} to {last:g} m (depth is surface_z_m = {profile.surface_z_m:g} m "
-        f"minus z): extend the profile, or correct surface_z_m{advice}"
+    raise ArgumentError(
+        "sound_speed",
+        f"include the depths of {name}, {depth[0]:g} to {depth[1]:g} m",
+        f"a profile from {first:g} to {last:g} m (depth is `surface_z_m` = "
+        f"{profile.surface_z_m:g} m minus z)",
+        f"extend the profile, or correct `surface_z_m`{advice}",
     )
 
 
@@ -305,14 +308,12 @@ def _measured(*arguments: ArrayLike) -> tuple[NDArray[np.float64], ...]:
 
 def _check_depths(depth: NDArray[np.float64]) -> None:
     if len(depth) < 2:
-        raise ValueError(
-            "depth_m must have at least 2 depths, got 1; a constant speed is sound_speed_m_s"
-        )
+        hint = "a constant speed is `sound_speed_m_s`"
+        raise ArgumentError("depth_m", "have at least 2 depths", "1", hint)
     if not np.all(np.diff(depth) > 0):
         at = int(np.argmin(np.diff(depth) > 0))
-        raise ValueError(
-            f"depth_m must ascend (positive down), got {depth[at + 1]:g} m after {depth[at]:g} m"
-        )
+        got = f"{depth[at + 1]:g} m after {depth[at]:g} m"
+        raise ArgumentError("depth_m", "ascend (positive down)", got)
     for value in (depth[0], depth[-1]):
         validate.number("depth_m", value, "m", least=0.0, most=_DEEPEST_M)
 
@@ -323,16 +324,16 @@ def _check_speeds(depth: NDArray[np.float64], speed: NDArray[np.float64]) -> Non
         advice = ""
         for unit, metres in (("feet per second", _FEET_M), ("kilometres per second", 1e3)):
             if low * metres >= SLOWEST_M_S and high * metres <= FASTEST_M_S:
-                advice = f"; these look like {unit}, multiply them by {metres:g}"
-        raise ValueError(
-            f"speed_m_s must be that of water, {SLOWEST_M_S:g} to {FASTEST_M_S:g} m/s, got "
-            f"{low:g} to {high:g} m/s{advice}"
-        )
+                advice = f"these look like {unit}, multiply them by {metres:g}"
+        allowed = f"be that of water, {SLOWEST_M_S:g} to {FASTEST_M_S:g} m/s"
+        raise ArgumentError("speed_m_s", allowed, f"{low:g} to {high:g} m/s", advice)
     steepness = np.abs(np.diff(speed)) / np.diff(depth)
     at = int(steepness.argmax())
     if steepness[at] > STEEPEST_PER_S:
-        raise ValueError(
-            f"speed_m_s must change by at most {STEEPEST_PER_S:g} m/s per metre of depth_m, got "
-            f"{speed[at]:g} m/s at {depth[at]:g} m and {speed[at + 1]:g} m/s at {depth[at + 1]:g} "
-            "m: remove the outlier"
+        raise ArgumentError(
+            "speed_m_s",
+            f"change by at most {STEEPEST_PER_S:g} m/s per metre of `depth_m`",
+            f"{speed[at]:g} m/s at {depth[at]:g} m and {speed[at + 1]:g} m/s at "
+            f"{depth[at + 1]:g} m",
+            "remove the outlier",
         )

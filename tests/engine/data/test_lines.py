@@ -270,7 +270,7 @@ def test_pings_that_stand_still_need_the_number_of_receivers():
 def test_backgrounds_at_different_delays_are_refused():
     lines, _ = survey()
     moved = lines_of(lines.samples, 20e3, lines.tx_m, np.arange(80) * 1e-4)
-    with pytest.raises(ValueError, match=r"differs by up to 0\.0078 m"):
+    with pytest.raises(ValueError, match=r"ranges that differ by up to 0\.0078 m"):
         moved.without_background()
 
 

@@ -48,7 +48,7 @@ def test_the_mean_speed_is_that_of_the_time(one, other):
         (([0, 10], [343, 343]), "must be that of water, 1300 to 1800 m/s, got 343 to 343 m/s$"),
         (
             ([0, 1, 2], [1500, 1400, 1500]),
-            "at most 60 m/s per metre of depth_m.* remove the outlier",
+            "at most 60 m/s per metre of `depth_m`.* remove the outlier",
         ),
         (([0, 10], [1500]), r"speed_m_s must have shape \(2\)"),
         (([0, 10], [1500, np.nan]), "speed_m_s must be finite"),
@@ -72,7 +72,9 @@ def test_mackenzies_formula_is_for_the_ocean(arguments, name):
 
 def test_nothing_is_extrapolated():
     profile = SoundSpeed([2, 30], [1500, 1490])
-    with pytest.raises(ValueError, match=r"include the depths of z_m, 1 to 1 m, got .* 2 to 30 m"):
+    with pytest.raises(
+        ValueError, match=r"include the depths of `z_m`, 1 to 1 m, got .* 2 to 30 m"
+    ):
         profile.at(-1.0)
     with pytest.raises(ValueError, match="depths of tx_m, 31 to 31 m"):
         check_reaches(profile, -31.0, "tx_m")

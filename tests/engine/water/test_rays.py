@@ -135,7 +135,9 @@ def test_a_shadow_is_named_with_its_ranges():
 
 
 def test_heights_outside_the_profile():
-    with pytest.raises(ValueError, match="sound_speed must include the depths of z_m, 61 to 61 m"):
+    with pytest.raises(
+        ValueError, match="sound_speed must include the depths of `z_m`, 61 to 61 m"
+    ):
         rays(LAYERS, 10.0, -5.0, -61.0)
 
 

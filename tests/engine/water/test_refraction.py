@@ -240,7 +240,7 @@ def test_resampled_lines_are_those_at_the_delays():
 
 
 def test_a_profile_must_reach_antennas_and_pixels():
-    with pytest.raises(ValueError, match="depths of tx_m, 6 to 6 m, got a profile from 10 to 60"):
+    with pytest.raises(ValueError, match="depths of `tx_m`, 6 to 6 m, got a profile from 10 to 60"):
         over(profile=SoundSpeed([10, 60], [1500, 1500]))
     shallow = over(profile=SoundSpeed([0, 20], [1500, 1500]))
     with pytest.raises(ValueError, match="depths of the grid's pixels, 25 to 25 m"):
