@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.validate import ArgumentError
 
 if TYPE_CHECKING:
     import pyproj
@@ -99,11 +100,11 @@ class Georeference:
         if self.crs is not None:
             put("crs", _words("crs", self.crs))
             if local:
-                raise ValueError(f"{local[0]} must be left out with crs, which places the origin")
+                raise ArgumentError(local[0], "be left out with `crs`, which places the origin")
             return
         for name in _LOCAL:
             if getattr(self, name) is None:
-                raise ValueError(f"{name} must be given unless crs is")
+                raise ArgumentError(name, "be given unless `crs` is")
         latitude, longitude = checked_degrees(self.latitude_deg, self.longitude_deg, ())
         put("latitude_deg", float(latitude))
         put("longitude_deg", float(longitude))
@@ -436,10 +437,8 @@ def placed(lines: Recorded, grid: Grid) -> Grid:
         return grid
     if grid.georeference is None:
         return replace(grid, georeference=lines.georeference)
-    raise ValueError(
-        f"grid must have the georeference of the lines ({lines.georeference}), "
-        f"got {grid.georeference}"
-    )
+    allowed = f"have the georeference of the lines ({lines.georeference})"
+    raise ArgumentError("grid", allowed, str(grid.georeference))
 
 
 def checked_degrees(
@@ -462,13 +461,13 @@ def checked_degrees(
     if farthest > 90:
         hint = ""
         if farthest <= 360 and np.abs(longitude).max(initial=0.0) <= 90:
-            hint = "; latitude_deg and longitude_deg are probably swapped"
-        raise ValueError(
-            f"latitude_deg must be from -90 to 90 degrees, got {_worst(latitude):.10g}{hint}"
+            hint = "`latitude_deg` and `longitude_deg` are probably swapped"
+        raise ArgumentError(
+            "latitude_deg", "be from -90 to 90 degrees", f"{_worst(latitude):.10g}", hint
         )
     if longitude.size and (longitude.min() < -180 or longitude.max() > 360):
-        raise ValueError(
-            f"longitude_deg must be from -180 to 360 degrees, got {_worst(longitude):.10g}"
+        raise ArgumentError(
+            "longitude_deg", "be from -180 to 360 degrees", f"{_worst(longitude):.10g}"
         )
     return latitude, np.where(longitude >= 180, longitude - 360, longitude)
 
@@ -482,9 +481,9 @@ def _words(name: str, value: object) -> str:
     """Return a text that is not empty."""
     text = validate.text(name, value)
     if not text.strip():
-        raise ValueError(f"{name} must not be empty")
+        raise ArgumentError(name, "not be empty")
     if "\0" in text:  # PROJ would ignore everything after it
-        raise ValueError(f"{name} must be text without NUL, got {validate.shown(text)}")
+        raise ArgumentError(name, "be text without NUL", validate.shown(text))
     return text.strip()
 
 
@@ -500,5 +499,5 @@ def _positions(name: str, value: ArrayLike) -> NDArray[np.float64]:
     """Return positions [..., 3], checked."""
     found = validate.array(name, value, np.float64, None)
     if found.ndim == 0 or found.shape[-1] != 3:
-        raise ValueError(f"{name} must have shape [..., 3], got {found.shape}")
+        raise ArgumentError(name, "have shape [..., 3]", str(found.shape))
     return found

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 
 _ALL = slice(None)
 _PARALLEL = 1e-12  # sine of the angle between parallel steps; float64 rounds to 1e-16
@@ -96,8 +97,8 @@ class Grid:
         try:
             shape = tuple(validate.count("every entry of shape", n) for n in counts)
         except TypeError:
-            raise TypeError(
-                f"shape must be whole numbers of pixels per axis, got {validate.shown(self.shape)}"
+            raise ArgumentTypeError(
+                "shape", "be whole numbers of pixels per axis", validate.shown(self.shape)
             ) from None
         validate.memory("shape", 8 * max(shape, default=0))
         object.__setattr__(self, "shape", shape)
@@ -105,12 +106,12 @@ class Grid:
         plane = ("origin_m", "row_step_m", "column_step_m")
         if self.points_m is not None:
             if any(getattr(self, name) is not None for name in (*plane, "height_m")):
-                raise ValueError("points_m must stand alone: it excludes a plane and heights")
+                raise ArgumentError("points_m", "stand alone, without a plane or heights")
             put("points_m", (*shape, 3))
             self._check_bounds("points_m")
             return
         if len(shape) != 2:
-            raise ValueError(f"shape of a plane must be (rows, columns), got {shape}")
+            raise ArgumentError("shape", "be (rows, columns) for a plane", str(shape))
         for name in plane:
             put(name, (3,))
         _check_steps(*self.vectors_m[1:], shape)
@@ -123,9 +124,10 @@ class Grid:
         with np.errstate(over="ignore", invalid="ignore"):
             farthest_m = float(np.abs(self.bounds_m).max())
         if not farthest_m <= validate.FARTHEST_M:
-            raise ValueError(
-                f"pixels must lie within {validate.FARTHEST_M:g} m of the origin along each axis, "
-                f"got one at {farthest_m:g} m by {names}"
+            raise ArgumentError(
+                names,
+                f"put all pixels within {validate.FARTHEST_M:g} m of the origin along each axis",
+                f"one at {farthest_m:g} m",
             )
 
     def __repr__(self) -> str:
@@ -245,10 +247,8 @@ class Grid:
             If the grid is not a plane, or the heights do not have its shape or are not finite.
         """
         if not self.is_planar:
-            raise ValueError(
-                "height_m can be added only to a plane, and only once: the grid has heights "
-                "already, or consists of points"
-            )
+            got = "points" if self.points_m is not None else "a grid with heights"
+            raise ArgumentError("height_m", "be added to a plane without heights", got)
         height_m = validate.array("height_m", height_m, np.float64, self.shape)
         return replace(self, height_m=height_m)
 
@@ -287,7 +287,7 @@ class Grid:
             If the grid consists of arbitrary points.
         """
         if self.origin_m is None or self.row_step_m is None or self.column_step_m is None:
-            raise ValueError("grid must be a plane or height map to have steps, got points")
+            raise ArgumentError("grid", "be a plane or height map to have steps", "points")
         return self.origin_m, self.row_step_m, self.column_step_m
 
     @property
@@ -308,7 +308,7 @@ class Grid:
             Unless columns run along x and rows along y (`has_axes`).
         """
         if not self.has_axes:
-            raise ValueError("grid must have columns along x and rows along y to have axes_m")
+            raise ArgumentError("grid", "have columns along x and rows along y to have `axes_m`")
         rows, columns = self.shape
         origin_m, row_step_m, column_step_m = self.vectors_m
         return (
@@ -326,7 +326,7 @@ class Grid:
             If the grid consists of arbitrary points.
         """
         if self.points_m is not None:
-            raise ValueError("grid must be a plane or height map to have axes, got points")
+            raise ArgumentError("grid", "be a plane or height map to have axes", "points")
         rows, columns = self.shape
         _, row_step_m, column_step_m = self.vectors_m
         across = self._side("along columns", column_step_m, columns, free="xyz")
@@ -419,7 +419,8 @@ class Grid:
             return self.points(some_m, georeference=self.georeference)
         row, column = (range(n)[s] for n, s in zip(self.shape, (rows, columns), strict=True))
         if not row or not column:
-            raise ValueError(f"window must contain a pixel, got rows {rows} and columns {columns}")
+            name, empty = ("columns", columns) if row else ("rows", rows)
+            raise ArgumentError(name, "select a pixel", str(empty))
         if (row, column) == tuple(map(range, self.shape)):
             return self
         origin_m, row_step_m, column_step_m = self.vectors_m
@@ -437,7 +438,7 @@ class Grid:
         if len(self.shape) > 1:
             return rows, columns
         if columns != _ALL:
-            raise ValueError(f"columns must be left out for points of shape {self.shape}")
+            raise ArgumentError("columns", f"be left out for points of shape {self.shape}")
         return (rows,)
 
 
@@ -460,24 +461,19 @@ def _axis(name: str, axis: tuple[float, float, int]) -> tuple[float, float, int]
     try:
         start, stop, count = axis
     except (TypeError, ValueError):
-        raise TypeError(
-            f"{name} must be (start m, stop m, count), got {validate.shown(axis)}"
-        ) from None
+        raise ArgumentTypeError(name, "be (start m, stop m, count)", validate.shown(axis)) from None
     start, stop = _coordinate(f"{name} start", start), _coordinate(f"{name} stop", stop)
     count = validate.count(f"{name} count", count)
     validate.memory(f"{name} count", 8 * count)
     if count == 1:
         if start != stop:
-            raise ValueError(
-                f"{name} must start and stop at one position for 1 pixel, got {start} m to {stop} m"
-            )
+            allowed = "start and stop at one position for 1 pixel"
+            raise ArgumentError(name, allowed, f"{start} m to {stop} m")
         return start, 0.0, count
     step = (stop - start) / (count - 1)
     if step == 0:
-        raise ValueError(
-            f"{name} must start and stop at different positions, got {count} pixels from {start} m "
-            f"to {stop} m"
-        )
+        allowed = "start and stop at different positions"
+        raise ArgumentError(name, allowed, f"{count} pixels from {start} m to {stop} m")
     return start, step, count
 
 
@@ -488,17 +484,15 @@ def _check_steps(
     steps = {"row_step_m": row_step_m, "column_step_m": column_step_m}
     for (name, step), count in zip(steps.items(), shape, strict=True):
         if count > 1 and not step.any():
-            raise ValueError(f"{name} must not be zero m, got {step} for {count} pixels")
+            raise ArgumentError(name, "not be zero m", f"{step} for {count} pixels")
     if min(shape) == 1:
         return
     # Compare directions, because steps may have any length.
     directions = (step / np.abs(step).max() for step in steps.values())
     sine = np.linalg.norm(np.cross(*(d / np.linalg.norm(d) for d in directions)))
     if sine < _PARALLEL:
-        raise ValueError(
-            f"row_step_m and column_step_m must not be parallel, got {row_step_m} "
-            f"and {column_step_m} m"
-        )
+        allowed = f"not be parallel to `column_step_m`, {column_step_m} m"
+        raise ArgumentError("row_step_m", allowed, f"{row_step_m} m")
 
 
 def without_heights(grid: Grid) -> Grid:

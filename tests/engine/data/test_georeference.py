@@ -22,8 +22,8 @@ def test_equal_places_are_equal():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: clsas.Georeference(), "latitude_deg must be given unless crs is"),
-        (lambda: replace(UTM, heading_deg=3.0), "heading_deg must be left out with crs"),
+        (lambda: clsas.Georeference(), "latitude_deg must be given unless `crs` is"),
+        (lambda: replace(UTM, heading_deg=3.0), "heading_deg must be left out with `crs`"),
         (lambda: clsas.Georeference.local(151.2, -33.9, heading_deg=0), "are probably swapped"),
         (lambda: clsas.Georeference.local(151.2, -133.9, heading_deg=0), "degrees, got 151.2$"),
         (lambda: clsas.Georeference.local(0, 361, heading_deg=0), "longitude_deg must be from"),
