@@ -306,7 +306,9 @@ def test_relative_error_is_of_one_place():
 
 
 def test_relative_error_names_bad_input():
-    with pytest.raises(ValueError, match=r"must have one shape, got \(2, 3\) and \(3, 2\)"):
+    with pytest.raises(
+        ValueError, match=r"image must have the shape of `reference`, \(3, 2\), got \(2, 3\)"
+    ):
         relative_error_db(speckle(2, 3), speckle(3, 2))
     with pytest.raises(ValueError, match="reference must not be zero"):
         relative_error_db(speckle(2, 3), np.zeros((2, 3)))

@@ -119,7 +119,7 @@ def test_positions_that_are_not_finite_are_refused(function):
                 )),
                 rx_m=jittered,
             ),
-            r"stand still around ping \d+; lines\.without_still_pings\(\) drops such pings",
+            r"stand still around ping \d+; `lines\.without_still_pings\(\)` drops such pings",
         ),
     ],
 )  # fmt: skip

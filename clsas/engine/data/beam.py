@@ -175,9 +175,10 @@ class BeamWindow:
         wavelength = validate.positive("wavelength_m", wavelength_m, "m")
         width = 2 * math.degrees(math.asin(min(_HALF_POWER * wavelength / length, 1.0)))
         if width < _NARROWEST:
-            raise ValueError(
-                f"length_m must make a beam of at least {_NARROWEST:g} degrees, got {length:g} m, "
-                f"which makes {width:g} degrees at wavelength_m = {wavelength:g} m"
+            raise ArgumentError(
+                "length_m",
+                f"make a beam of at least {_NARROWEST:g} degrees",
+                f"{length:g} m, which makes {width:g} degrees at `wavelength_m` = {wavelength:g} m",
             )
         return cls(width, shape, **({"element_length_m": length} | others))
 
@@ -211,16 +212,15 @@ class BeamWindow:
         """
         count = validate.count("count", count)
         if self.shape == "inverse":
-            raise ValueError(
-                "shape must not be 'inverse' to divide a beam: its weights follow from the angle "
-                "to the axis, and not from the width"
+            raise ArgumentError(
+                "shape",
+                "not be 'inverse' to divide a beam",
+                hint="its weights follow from the angle to the axis, and not from the width",
             )
         low, high = (math.sin(angle) for angle in self.limits_rad)
         if (high - low) / count < math.radians(_NARROWEST):
-            raise ValueError(
-                f"count must leave parts of at least {_NARROWEST:g} degrees, got {count} parts of "
-                f"{self.width_deg:g} degrees"
-            )
+            allowed = f"leave parts of at least {_NARROWEST:g} degrees"
+            raise ArgumentError("count", allowed, f"{count} parts of {self.width_deg:g} degrees")
         edges_deg = np.degrees(np.arcsin(np.linspace(low, high, count + 1).clip(-1, 1)))
         return tuple(
             replace(self, width_deg=float(last - first), squint_deg=float(first + last) / 2)
@@ -373,10 +373,11 @@ class BeamWindow:
         )
         values = self._inside(q, wavelength_m, middle)
         if not values.max() <= _MOST_WEIGHT:
-            raise ValueError(
-                f"width_deg must keep 'inverse' within -40 dB of an element of "
-                f"{self.element_length_m:g} m at a wavelength of {wavelength_m:g} m, "
-                f"got {self.width_deg:g} degrees"
+            raise ArgumentError(
+                "width_deg",
+                f"keep 'inverse' within -40 dB of an element of {self.element_length_m:g} m at a "
+                f"wavelength of {wavelength_m:g} m",
+                f"{self.width_deg:g} degrees",
             )
         cubics = np.linalg.solve(np.vander(nodes, increasing=True), values.T).T
         return cubics.astype(np.float32)
@@ -399,10 +400,8 @@ class BeamWindow:
         if self.along is None:
             return track_directions(lines, self.track_pings)
         if self.along.ndim == 2 and len(self.along) != lines.channels:
-            raise ValueError(
-                f"along must have one direction, or one for each of {lines.channels} channels, "
-                f"got {len(self.along)}"
-            )
+            allowed = f"have one direction, or one for each of {lines.channels} channels"
+            raise ArgumentError("along", allowed, len(self.along))
         return np.broadcast_to(self.along, (lines.channels, 3))
 
     def _inside(
@@ -503,19 +502,19 @@ def _directions(lines: RangeLines, pings: int | None) -> NDArray[np.float64]:
     channels_m = lines.phase_centres_m
     count = len(lines.ping_starts)
     if count < 2:
-        raise ValueError(
-            f"along must be given: {lines.channels} channels with one transmitter position have "
-            f"no track"
-        )
+        hint = f"{lines.channels} channels with one transmitter position have no track"
+        raise ArgumentError("along", "be given", hint=hint)
     centres_m = lines.ping_centres_m
     span = pings or min(max(count // _SMOOTHED_SHARE, 5), MOST_TRACK_PINGS)
     tangent = np.concatenate([_tangents(leg_m, span) for leg_m in _legs(centres_m)])
     speed = np.linalg.norm(tangent, axis=1)
     extent_m = np.linalg.norm(np.ptp(centres_m, axis=0))
     if not speed.min() > 1e-3 * extent_m / count:
-        raise ValueError(
-            "along must be given: the phase centres of the lines stand still around ping "
-            f"{speed.argmin()}; lines.without_still_pings() drops such pings"
+        raise ArgumentError(
+            "along",
+            "be given",
+            hint=f"the phase centres of the lines stand still around ping {speed.argmin()}; "
+            "`lines.without_still_pings()` drops such pings",
         )
     tangent /= speed[:, None]
     # The front channels of a long array lie where the middle of later pings will be.

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data.image import Image
 from clsas.engine.data.image_error import complex_values
+from clsas.engine.data.validate import ArgumentError
 
 
 def entropy(image: Image | ArrayLike) -> float:
@@ -87,5 +88,5 @@ def contrast(image: Image | ArrayLike) -> float:
 def _intensity(image: Image | ArrayLike) -> NDArray[np.float64]:
     amplitude = np.abs(complex_values("image", image))
     if not amplitude.any():
-        raise ValueError("image must not be zero everywhere")
+        raise ArgumentError("image", "not be zero everywhere")
     return (amplitude / amplitude.max()) ** 2

@@ -159,7 +159,7 @@ def _likely_cause(
     for factor, unit in ((1e3, "km"), (1e-3, "mm")):
         if fits(factor):
             return f"The grid would be reached if it were in {unit}: lengths must be given in m"
-    return "Check the grid, the positions of the antennas and first_range_m, all in m"
+    return "Check the grid, the positions of the antennas and `first_range_m`, all in m"
 
 
 def behind(

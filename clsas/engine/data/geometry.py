@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import cdist
 
+from clsas.engine.data.validate import ArgumentError
+
 
 def legs_m(
     points_m: ArrayLike,
@@ -52,13 +54,14 @@ def legs_m(
     if rx_velocity_m_s is None:
         return out, np.broadcast_to(_norm(points - rx), out.shape)
     if sound_speed_m_s is None:
-        raise ValueError("sound_speed_m_s must be given with rx_velocity_m_s")
+        raise ArgumentError("sound_speed_m_s", "be given with `rx_velocity_m_s`")
     beta = _vectors("rx_velocity_m_s", rx_velocity_m_s) / sound_speed_m_s
     beta2 = _dot(beta, beta)
     if not np.all(beta2 < 1):
-        raise ValueError(
-            f"rx_velocity_m_s must be slower than sound ({sound_speed_m_s:g} m/s), "
-            f"got {sound_speed_m_s * np.sqrt(np.max(beta2)):g} m/s"
+        raise ArgumentError(
+            "rx_velocity_m_s",
+            f"be slower than sound ({sound_speed_m_s:g} m/s)",
+            f"{sound_speed_m_s * np.sqrt(np.max(beta2)):g} m/s",
         )
     offset = points - rx - beta * out[..., None]
     along = _dot(offset, beta)
@@ -106,7 +109,7 @@ def pairwise_range_m(
 def _vectors(name: str, value: ArrayLike) -> NDArray[np.float64]:
     vectors = np.asarray(value, dtype=np.float64)
     if vectors.ndim == 0 or vectors.shape[-1] != 3:
-        raise ValueError(f"{name} must have shape (..., 3), got {vectors.shape}")
+        raise ArgumentError(name, "have shape (..., 3)", str(vectors.shape))
     return vectors
 
 

@@ -13,6 +13,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import level_db
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 
 if TYPE_CHECKING:
     import xarray
@@ -249,11 +250,10 @@ class Image:
         """
         wanted = np.dtype(np.complex64 if dtype is None else dtype)
         if wanted.kind != "c":
-            raise TypeError(
-                f"dtype must be complex, as pixels are, got {wanted}: use np.abs for amplitudes"
-            )
+            hint = "use `np.abs` for amplitudes"
+            raise ArgumentTypeError("dtype", "be complex, as pixels are", str(wanted), hint)
         if copy is False and wanted != self.pixels.dtype:
-            raise ValueError(f"copy must not be False if complex64 is to become {wanted}")
+            raise ArgumentError("copy", f"not be False if complex64 is to become {wanted}")
         return self.pixels.astype(wanted, copy=bool(copy))
 
 

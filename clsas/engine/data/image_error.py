@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
+from clsas.engine.data.validate import ArgumentError
 
 # Pixels along either side over which levels are averaged. Single pixels of speckle are dark by
 # chance, so the darkest tenth of them would be nulls of the speckle, 13 dB below the mean. The mean
@@ -52,13 +53,12 @@ def relative_error_db(
     """
     given, wanted = complex_values("image", image), complex_values("reference", reference)
     if given.shape != wanted.shape:
-        raise ValueError(
-            f"image and reference must have one shape, got {given.shape} and {wanted.shape}"
-        )
+        allowed = f"have the shape of `reference`, {wanted.shape}"
+        raise ArgumentError("image", allowed, str(given.shape))
     if isinstance(image, Image) and isinstance(reference, Image):
         check_one_grid(image.grid, reference.grid)
     if not wanted.any():
-        raise ValueError("reference must not be zero everywhere")
+        raise ArgumentError("reference", "not be zero everywhere")
     if darkest is not None:
         chosen = darkest_pixels(wanted, darkest)
         given, wanted = given[chosen], wanted[chosen]
@@ -87,9 +87,8 @@ def check_one_grid(image: Grid, reference: Grid, names: str = "image and referen
     positions_m = reference.positions_m(*part)
     apart_m = np.abs(image.positions_m(*part) - positions_m).max()
     if apart_m > 1e-9 + 1e-14 * np.abs(positions_m).max():
-        raise ValueError(
-            f"{names} must lie on one grid, got pixel positions that differ by up to {apart_m:g} m"
-        )
+        got = f"pixel positions that differ by up to {apart_m:g} m"
+        raise ArgumentError(names, "lie on one grid", got)
 
 
 def _norm_db(values: NDArray[np.float64]) -> float:
@@ -119,7 +118,7 @@ def darkest_pixels(image: NDArray[np.complexfloating], darkest: float) -> NDArra
     darkest = validate.number("darkest", darkest, above=0.0, most=1.0)
     imaged = image != 0
     if not imaged.any():
-        raise ValueError("the image must not be zero everywhere: it has no darkest part")
+        raise ArgumentError("image", "not be zero everywhere", hint="it has no darkest part")
     level = levels(image)
     count = max(round(darkest * np.count_nonzero(imaged)), 1)
     order = np.argsort(np.where(imaged, level, np.inf), axis=None, kind="stable")

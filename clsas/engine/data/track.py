@@ -18,6 +18,7 @@ from clsas.engine.data.findings import Finding, warn_of
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.reprs import measured
 from clsas.engine.data.system import Sonar
+from clsas.engine.data.validate import ArgumentError
 
 LEAST_FIXES = 16
 """Fewest positions that show what is usual: a plain choice."""
@@ -104,10 +105,12 @@ class Track:
         if step_s.min(initial=np.inf) <= 0:
             wrong = np.flatnonzero(step_s <= 0)
             how = "repeated" if step_s[wrong[0]] == 0 else "out of order"
-            raise ValueError(
-                f"time_s must ascend strictly, got a step of {step_s[wrong[0]]:g} s from ping "
-                f"{wrong[0]} to the next ({how}; {len(wrong)} such steps): sort pings by time and "
-                "drop repeated ones"
+            raise ArgumentError(
+                "time_s",
+                "ascend strictly",
+                f"a step of {step_s[wrong[0]]:g} s from ping {wrong[0]} to the next ({how}; "
+                f"{len(wrong)} such steps)",
+                "sort pings by time and drop repeated ones",
             )
         for name, most in (("yaw_rad", 2 * np.pi), ("pitch_rad", np.pi / 2), ("roll_rad", np.pi)):
             angles = np.abs(getattr(self, name))
@@ -115,8 +118,8 @@ class Track:
             found = float(angles.min() if name == "yaw_rad" else angles.max())
             if found > most * (1 + 1e-6):
                 validate.warn(
-                    f"{name} is {found:.4g} rad, more than {np.degrees(most):.0f} degrees. If it "
-                    "is in degrees, convert it with numpy.radians"
+                    f"`{name}` is {found:.4g} rad, more than {np.degrees(most):.0f} degrees. If it "
+                    "is in degrees, convert it with `numpy.radians`"
                 )
 
     @property
@@ -453,9 +456,10 @@ class Pointing:
         length = np.linalg.norm(along, axis=1, keepdims=True)
         blind = np.flatnonzero(length <= 1e-9 * distance**2)
         if blind.size:
-            raise ValueError(
-                f"spot_m must not lie straight ahead or astern of the platform, "
-                f"got {self.spot_m} m at ping {blind[0]}"
+            raise ArgumentError(
+                "spot_m",
+                "not lie straight ahead or astern of the platform",
+                f"{self.spot_m} m at ping {blind[0]}",
             )
         along, beam = along / length, beam / distance
         return np.stack([along, beam, np.cross(along, beam)], axis=1)
@@ -538,7 +542,7 @@ def held_fixes(count: str, share: float) -> Finding:
         share,
         MOST_HELD,
         "interpolate the navigation at the times of the pings, or leave out pings taken standing "
-        "still with lines.without_still_pings()",
+        "still with `lines.without_still_pings()`",
     )
 
 

@@ -229,7 +229,7 @@ def test_channels_and_axes_of_other_types():
     "angles", [{"yaw_rad": 90.0}, {"yaw_rad": -135}, {"pitch_rad": [0, 2.5, 1]}, {"roll_rad": 4.0}]
 )
 def test_angles_in_degrees_are_warned_of(angles):
-    with pytest.warns(ClsasWarning, match="If it is in degrees, convert it with numpy.radians"):
+    with pytest.warns(ClsasWarning, match="If it is in degrees, convert it with `numpy.radians`"):
         Track(np.zeros((3, 3)), [0, 1, 2], **angles)
 
 
