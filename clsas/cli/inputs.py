@@ -76,8 +76,9 @@ def load_banks(
     lines = load_lines(path, None, described)
     try:
         return lines, first_two_banks(lines.bank_numbers)
-    except ValueError as error:
-        raise ValueError(f"{path} {error}" + (f": {remedy}" if remedy else "")) from None
+    except ArgumentError as error:
+        said = f"{path} must {error.allowed}, got {error.given}"
+        raise ValueError(said + (f": {remedy}" if remedy else "")) from None
 
 
 def read_plan(path: Path) -> clsas.Plan:

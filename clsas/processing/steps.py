@@ -297,8 +297,6 @@ def _given(options: dict[str, Any], *names: str) -> dict[str, Any]:
 
 def check_banks(lines: RangeLines) -> tuple[RangeLines, RangeLines]:
     """Return the two banks for heights; raise ValueError for a recording of one bank."""
-    if lines.banks < 2:
-        raise ArgumentError("lines", "have at least 2 receiver banks (`bank_numbers`)", lines.banks)
     first, second = first_two_banks(lines.bank_numbers)
     return lines.bank(first), lines.bank(second)
 

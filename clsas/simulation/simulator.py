@@ -399,8 +399,8 @@ def _check_heights(
     """Raise ValueError if a profile does not reach all antennas and the whole scene."""
     if sound_speed is None:
         return
-    check_reaches(sound_speed, geometry.tx_m[:, 2], "tx_m")
-    check_reaches(sound_speed, geometry.rx_m[:, 2], "rx_m")
+    check_reaches(sound_speed, geometry.tx_m[:, 2], "`tx_m`")
+    check_reaches(sound_speed, geometry.rx_m[:, 2], "`rx_m`")
     for part in parts:
         z_m = part.positions_m[:, 2] if isinstance(part, PointTargets) else part.heights_m
         check_reaches(sound_speed, z_m, "the scene's points")

@@ -639,7 +639,7 @@ def first_two_banks(numbers: NDArray[np.int64] | None) -> tuple[int, int]:
     """
     first, *others = banks_of(numbers)
     if not others:
-        raise ValueError("must have at least 2 receiver banks, got 1")
+        raise ArgumentError("lines", "have at least 2 receiver banks", "1")
     second, *unused = others
     if unused:
         words = f"bank {unused[0]} is"

@@ -556,7 +556,7 @@ def test_no_search_where_the_exact_image_is_formed_sooner(monkeypatch):
     def searched(*_):
         pytest.fail("a search takes longer than the exact image")
 
-    monkeypatch.setattr(planner, "fastest", searched)
+    monkeypatch.setattr(planner, "fastest_plan", searched)
     lines, grid = over(around(0, 40, shape=(40, 40)))
     assert plan(lines, grid, tolerance_db=-40, costs=Costs()).is_exact
     with pytest.raises(pytest.fail.Exception):  # but those who ask for a factorization get one
