@@ -241,7 +241,7 @@ def test_heights_run_only_if_asked_for(scene):
         ("window_m = 0.2", "least_coherence = 1.0", r"\[process.heights\] least_coherence must be"),
         ("window_m = 0.2", "tolerance_db = -5.0", r"\[process.heights\] tolerance_db must be"),
         ("window_m = 0.2", "window = 0.2", r"unknown key 'window' in \[process.heights\]"),
-        (SCENE[SCENE.index("[process.heights]") :], "", "may include heights only with search_m"),
+        (SCENE[SCENE.index("[process.heights]") :], "", "not include 'heights' without `search_m`"),
         (SCENE[: SCENE.index("[image]")], "", r"missing table \[grid\]"),
     ],
 )
@@ -284,7 +284,7 @@ def test_files_of_others_are_never_replaced(scene, name):
     folder = scene.with_suffix("")
     folder.mkdir()
     (folder / name).write_text("mine")
-    with pytest.raises(ValueError, match=f"contains {name}, which heights would replace"):
+    with pytest.raises(ValueError, match=f"not contain {name}, which heights would replace"):
         clsas.process(scene)
     assert (folder / name).read_text() == "mine"
 
@@ -371,8 +371,8 @@ def test_printed_errors_have_units(name, value, sd, expected):
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ("", "one of known_height_m and points_m must be given, got none"),
-        ("known_height_m = 0.0\npoints_m = [[0, 32, 0]]", "got known_height_m and points_m"),
+        ("", "known_height_m must be given, or `points_m`, and only one, got neither"),
+        ("known_height_m = 0.0\npoints_m = [[0, 32, 0]]", "got `known_height_m` and `points_m`"),
         ("known_height_m = 0.0\nknown_sd_m = -1", "known_sd_m must be"),
         ('known_height_m = 0.0\nunknowns = ["heave"]', "unknowns"),
         ("known_height_m = 1e300", r"\[process.pair_errors\] known_height_m must be finite and"),
@@ -401,17 +401,17 @@ def test_the_example_of_the_documentation_is_a_scene(scene):
 
 def test_pair_errors_need_both_tables(scene):
     change(scene, '"image", "heights"', '"pair_errors"')
-    with pytest.raises(ValueError, match=r"known_height_m or points_m in \[process.pair_errors\]"):
+    with pytest.raises(ValueError, match=r"`known_height_m` or `points_m` in \[process.pair"):
         clsas.process(scene)
     change(
         scene,
         SCENE[SCENE.index("[process.heights]") :],
         "[process.pair_errors]\nknown_height_m = 0",
     )
-    with pytest.raises(ValueError, match=r"only with search_m in \[process.heights\]"):
+    with pytest.raises(ValueError, match=r"without `search_m` in \[process.heights\]"):
         clsas.process(scene)
     change(scene, 'steps = ["pair_errors"]\n', "")  # its table alone asks for the step
-    needed = r"scene.toml.*\[process.pair_errors\] needs \[process.heights\] with search_m"
+    needed = r"scene.toml: \[process.heights\] must be given with `search_m` for \[process.pair_e"
     with pytest.raises(ValueError, match=needed) as raised:
         clsas.process(scene)
     assert "steps" not in str(raised.value)

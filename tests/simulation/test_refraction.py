@@ -90,7 +90,7 @@ def test_shadow_zones_are_refused():
     ("profile", "message"),
     [
         (SoundSpeed([0, 20], [1500, 1500]), "depths of the scene's points, 25 to 25 m"),
-        (SoundSpeed([8, 60], [1500, 1500]), "depths of tx_m, 6 to 6 m"),
+        (SoundSpeed([8, 60], [1500, 1500]), "depths of `tx_m`, 6 to 6 m"),
     ],
 )
 def test_a_profile_must_reach_everything(profile, message):

@@ -132,7 +132,7 @@ class BeamWindow:
         room = 90 - self.width_deg / 2
         validate.number("squint_deg", self.squint_deg, "degrees", least=-room, most=room)
         if self.shape == "inverse" and self.element_length_m is None:
-            raise ArgumentError("element_length_m", "be given for shape 'inverse'")
+            raise ArgumentError("element_length_m", "be given for `shape='inverse'`")
         if self.along is not None:
             along = validate.array("along", self.along, np.float64, None)
             shape = (3,) if along.ndim == 1 else (None, 3)

@@ -19,8 +19,8 @@ from clsas.engine.signal.interpolation import Readout
 from clsas.engine.water.ray_delays import FLIGHT_STEPS, RaySample, at_speed, straight_m, times_s
 from clsas.engine.water.rays import Rays, rays, shadow
 
-_NODES = 48  # distances from which the change of a range axis follows
-_DEGREE = 20  # of the polynomial through them
+_NODES = 64  # distances from which the change of a range axis follows
+_DEGREE = 28  # of the polynomial through them
 _CHANGED_AT_ONCE = 1 << 16  # samples that are interpolated together; they fit into a cache
 _BEYOND = 0.1  # of the distances of sample pixels, by which those of others may extend farther
 # Samples of the widest filters of the imagers, from which an image reads. Where a line of few

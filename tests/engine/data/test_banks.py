@@ -123,7 +123,7 @@ def test_surveys_of_several_files_keep_banks(lines, tmp_path):
 
 def test_cphd_refuses_banks(lines, tmp_path):
     pytest.importorskip("sarkit")
-    with pytest.raises(ValueError, match=r"one bank, got 2: write lines.bank\(0\)"):
+    with pytest.raises(ValueError, match=r"one bank, got 2: write `lines.bank\(0\)`"):
         clsas.write_cphd(tmp_path / "lines.cphd", lines)
 
 
