@@ -66,12 +66,12 @@ def differences(
                 found.append("the grid has another position or other heights")
         elif isinstance(mine, dict) and isinstance(theirs, dict):
             found += [
-                f"{name}'s {key} is {mine.get(key)} in the store, {theirs[key]} given"
+                f"`{name}`'s {key} is {mine.get(key)} in the store, {theirs[key]} given"
                 for key in theirs
                 if mine.get(key) != theirs[key]
             ]
         elif mine != theirs:
-            found.append(f"{name} is {mine} in the store, {theirs} given")
+            found.append(f"`{name}` is {mine} in the store, {theirs} given")
     return found
 
 
