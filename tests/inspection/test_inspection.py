@@ -130,7 +130,7 @@ SAMPLES = {
     "common": (
         common,
         {"background": ()},
-        ("is the same in all pings", 'without_background("median")'),
+        ("is the same in all pings", "without_background('median')"),
     ),
     "constant": (
         lambda samples: np.add(samples, 0.1, out=samples),
@@ -369,7 +369,7 @@ def test_a_band_that_is_not_sampled_finely_enough(lines):
 def test_a_band_beyond_its_carrier(lines):
     found = clsas.inspect(replace(lines, range_step_m=lines.range_step_m / 1000))
     assert found["band"].value == pytest.approx(30e6, rel=0.05)
-    assert "check units: range_step_m in metres" in found["band"].remedy
+    assert "check units: `range_step_m` in metres" in found["band"].remedy
 
 
 @pytest.mark.slow
@@ -480,7 +480,7 @@ def test_a_carrier_in_khz_is_found_wherever_the_band_is(lines, middle_hz):
     found = clsas.inspect(in_khz(lines, middle_hz))
     assert np.mean(found.band_hz) == pytest.approx(middle_hz, abs=100)
     assert names(found) == ["band"]
-    assert "carrier_hz in Hz (not kHz)" in found["band"].remedy
+    assert "`carrier_hz` in Hz (not kHz)" in found["band"].remedy
     assert found.wavelength_m == pytest.approx(1500 / 7.5e3, rel=0.1)  # at half of 15 kHz
     narrow = clsas.inspect(in_khz(lines, middle_hz, share=0.02))
     assert {"advance", "band"} <= set(names(narrow))

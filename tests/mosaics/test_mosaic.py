@@ -510,7 +510,10 @@ class TestResuming:
             ({"beam": None}, "`beam` is .*width_deg.* in the store, None given"),
             ({"patches": (2, 2)}, "patches have 30 x 20 pixels in the store, 30 x 40 given"),
             ({"grid": Grid.plane((-4, 4, 80), (30, 41, 60))}, "the grid has another position"),
-            ({"grid": Grid.plane((-4, 4, 40), (30, 40, 60))}, r"`pixels` is \[60, 80\] in the store"),
+            (
+                {"grid": Grid.plane((-4, 4, 40), (30, 40, 60))},
+                r"`pixels` is \[60, 80\] in the store",
+            ),
             ({"lines": LINES.select(slice(1, None))}, "the range lines differ"),
         ],
     )

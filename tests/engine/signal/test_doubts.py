@@ -132,7 +132,7 @@ def test_every_imager_warns_once_with_cause_and_remedy(lines, way):
         WAYS[way](wrong, GRID)
     (message,) = [str(each.message) for each in caught if "focus" in str(each.message)]
     assert "would be if its phase had the opposite sign" in message
-    assert message.endswith("samples=lines.samples.conj())")
+    assert message.endswith("samples=lines.samples.conj())`")
 
 
 @pytest.mark.slow
