@@ -51,9 +51,6 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         if before is not None:
             os.fchmod(descriptor, stat.S_IMODE(before.st_mode))
         os.fsync(descriptor)
-        with suppress(OSError):  # some file systems have no locks
-            # From now on other processes may read it, for which HDF5 takes a shared lock.
-            fcntl.flock(descriptor, fcntl.LOCK_SH)
         os.replace(temporary, path)
         sync_folder(path.parent)
 
@@ -288,8 +285,10 @@ def _claim(path: Path, make: Callable[[Path], object]) -> int:
         make(path)
         with suppress(FileNotFoundError):
             descriptor = _open(path)
+            # A shared lock keeps others from removing it, and lets HDF5, which takes one too, read
+            # it once it has its name. To change an exclusive lock would free it for a moment.
             with suppress(OSError):  # some file systems have no locks, so leftovers stay
-                fcntl.flock(descriptor, fcntl.LOCK_EX)
+                fcntl.flock(descriptor, fcntl.LOCK_SH)
             # Another process may have removed it as a leftover before it was locked.
             if path.exists():
                 return descriptor

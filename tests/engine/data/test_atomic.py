@@ -184,6 +184,24 @@ def test_what_another_writer_is_at_stays(tmp_path):
     assert len(list(tmp_path.iterdir())) == 3
 
 
+def test_another_writer_never_finds_a_file_unlocked(tmp_path, monkeypatch):
+    """Linux frees a lock for a moment when its kind is changed."""
+    flock, locked = fcntl.flock, set()
+
+    def changed(descriptor, operation):
+        if descriptor in locked:
+            flock(descriptor, fcntl.LOCK_UN)
+            with replacing(tmp_path / "b") as other:
+                other.write_text("b")
+        flock(descriptor, operation)
+        locked.add(descriptor)
+
+    monkeypatch.setattr(fcntl, "flock", changed)
+    with replacing(tmp_path / "a") as part:
+        part.write_text("a")
+    assert (tmp_path / "a").read_text() == "a"
+
+
 def test_names_alike_stay(tmp_path):
     """Files of other programs stay, and so do links and pipes with such a name."""
     (tmp_path / ".other-0.part").touch()
@@ -210,7 +228,7 @@ def test_a_temporary_taken_for_a_leftover_is_made_anew(tmp_path, monkeypatch):
     monkeypatch.setattr(fcntl, "flock", raced)
     with replacing(tmp_path / "a") as part:
         part.write_text("a")
-    assert calls.count(fcntl.LOCK_EX) == 2
+    assert calls.count(fcntl.LOCK_SH) == 2
     assert (tmp_path / "a").read_text() == "a"
 
 
