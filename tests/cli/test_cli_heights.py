@@ -174,7 +174,7 @@ def test_one_file_may_hold_both_banks(tmp_path):
     warned = run("heights", tmp_path / "three.h5", *given)
     assert warned.stderr == (
         "Warning: heights are measured from banks 0 and 1; bank 2 is not used. To choose others, "
-        "make files of one bank by clsas convert --bank\n"
+        "give lines of one bank each: clsas convert --bank n\n"
     )
     assert np.array_equal(clsas.load(output).height_m, found.height_m, equal_nan=True)
 

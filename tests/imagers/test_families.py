@@ -25,6 +25,7 @@ MISSED = (
     ("reliefs and points with beam", 5020, -50),
     ("anything", 2159, -20),
     ("profiles with heave and motion", 7323, -70),
+    ("gaps in the band", 3643315288, -45),
 )
 """Families, seeds and tolerances of images that once erred by more than was predicted."""
 

@@ -647,7 +647,7 @@ def first_two_banks(numbers: NDArray[np.int64] | None) -> tuple[int, int]:
             words = f"banks {', '.join(map(str, unused[:-1]))} and {unused[-1]} are"
         validate.warn(
             f"heights are measured from banks {first} and {second}; {words} not used. "
-            "To choose others, give `lines.bank(n)` of both"
+            "To choose others, give lines of one bank each: `lines.bank(n)`"
         )
     return first, second
 

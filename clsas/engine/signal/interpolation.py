@@ -37,7 +37,10 @@ Gain = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Spectral gain as a function of the distance from the spectral centre, cycles per sample."""
 
 # Share of the power that is added to every bin, so that fits stay regular where the band is empty.
-_NOISE_FLOOR = 1e-13
+# Where a gap lies within the band, filters could amplify rounding errors in the gap, in every stage
+# anew; there, the share grows by steps until a filter does not amplify white noise.
+_NOISE_FLOOR, _MORE_NOISE, _MOST_NOISE_FLOOR = 1e-13, 100.0, 1e-3
+_MOST_NOISE = 1.5  # power of white noise after a filter; without such gaps, at most 1.2
 # Positions between two samples at which filters are fitted. Half or twice as many change errors by
 # 0.3 dB.
 _POSITIONS = 17
@@ -132,24 +135,31 @@ def designs(taps: int, upsamplings: Sequence[float], spectrum: Spectrum) -> list
     nu, of_position, from_positions = _positions(taps)
     turns = 2 * np.pi * f * (np.arange(taps // 2) + 0.5)
     aims = np.cos(2 * np.pi * f * nu), np.sin(2 * np.pi * f * nu)
-    # A noise floor keeps the problem regular where the band is empty.
-    share = np.sqrt(spectrum.power + _NOISE_FLOOR)[:, None]
-    coefficients = np.empty((len(rate), taps // 2, 2, taps // 2))
-    residuals = []
-    for part, (aim, basis) in enumerate(zip(aims, (np.cos(turns), np.sin(turns)), strict=True)):
-        of_frequency = 2 * basis
-        if taps == 2:
-            coefficients[:, :, part] = (0.5, 1.0)[part]
-        else:
-            # The basis is a product of functions of f and of nu, which are fitted one by one.
-            q, r = np.linalg.qr(share * of_frequency)
-            aim_in_basis = q.swapaxes(1, 2) @ (share * aim)
-            at_positions = np.linalg.pinv(r, rcond=_SINGULAR) @ aim_in_basis
-            coefficients[:, :, part] = at_positions @ from_positions[part].T
-        residuals.append(of_frequency @ coefficients[:, :, part] @ of_position[part].T - aim)
+    mean = np.array([1.0, *np.full(len(nu) - 1, 2.0)]) / (2 * len(nu) - 1)  # over positions
+    floor = np.full((len(rate), 1), _NOISE_FLOOR)
+    while True:
+        share = np.sqrt(spectrum.power + floor)[..., None]
+        coefficients = np.empty((len(rate), taps // 2, 2, taps // 2))
+        residuals, noise = [], np.zeros(len(rate))
+        for part, (aim, basis) in enumerate(zip(aims, (np.cos(turns), np.sin(turns)), strict=True)):
+            of_frequency = 2 * basis
+            if taps == 2:
+                coefficients[:, :, part] = (0.5, 1.0)[part]
+            else:
+                # The basis is a product of functions of f and of nu, which are fitted one by one.
+                q, r = np.linalg.qr(share * of_frequency)
+                aim_in_basis = q.swapaxes(1, 2) @ (share * aim)
+                at_positions = np.linalg.pinv(r, rcond=_SINGULAR) @ aim_in_basis
+                coefficients[:, :, part] = at_positions @ from_positions[part].T
+            weights = coefficients[:, :, part] @ of_position[part].T
+            noise += 2 * np.sum(weights**2, axis=1) @ mean
+            residuals.append(of_frequency @ weights - aim)
+        is_loud = (noise > _MOST_NOISE) & (floor[:, 0] < _MOST_NOISE_FLOOR)
+        if not is_loud.any():
+            break
+        floor[is_loud] *= _MORE_NOISE
     # Once the phase of the position is removed, the error is the response minus 1. Its mean over
     # positions is real, because errors at nu and -nu are complex conjugates.
-    mean = np.array([1.0, *np.full(len(nu) - 1, 2.0)]) / (2 * len(nu) - 1)
     even, odd = residuals
     square = (even**2 + odd**2) @ mean
     bias = (even * aims[0] + odd * aims[1]) @ mean

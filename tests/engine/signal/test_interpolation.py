@@ -15,6 +15,7 @@ from clsas.engine.signal.interpolation import (
     resampling,
     upsampler,
 )
+from clsas.engine.signal.spectrum import Spectrum
 
 NU = np.linspace(-0.5, 0.5, 101)
 
@@ -79,6 +80,16 @@ def test_each_doubling_gains_the_order_of_the_filter(taps, gain_db):
     """The error is of second order in the spacing if linear, of fourth with four taps."""
     errors = [design(taps, upsampling, flat(0.8)).error_db for upsampling in (8, 16)]
     assert errors[0] - errors[1] == pytest.approx(gain_db, abs=0.1)
+
+
+@pytest.mark.parametrize("taps", [4, 6, 8])
+def test_noise_in_a_gap_of_the_band_is_not_amplified(taps):
+    """Between two sub-bands, rounding errors would grow in every stage of an image."""
+    frequency = (np.arange(128) + 0.5) / 256
+    power = np.where((frequency > 0.27) & (frequency < 0.41), 1.0, 0.0)
+    spectrum = Spectrum(0.0, frequency, power / power.sum())
+    for each in designs(taps, np.geomspace(1, 12, 16), spectrum):
+        assert np.mean(np.sum(each.weights(NU) ** 2, axis=1)) < 1.6
 
 
 def test_least_squares_beats_lagrange():
