@@ -151,9 +151,10 @@ def designs(taps: int, upsamplings: Sequence[float], spectrum: Spectrum) -> list
                 aim_in_basis = q.swapaxes(1, 2) @ (share * aim)
                 at_positions = np.linalg.pinv(r, rcond=_SINGULAR) @ aim_in_basis
                 coefficients[:, :, part] = at_positions @ from_positions[part].T
-            weights = coefficients[:, :, part] @ of_position[part].T
-            noise += 2 * np.sum(weights**2, axis=1) @ mean
-            residuals.append(of_frequency @ weights - aim)
+            noise += (
+                2 * np.sum((coefficients[:, :, part] @ of_position[part].T) ** 2, axis=1) @ mean
+            )
+            residuals.append(of_frequency @ coefficients[:, :, part] @ of_position[part].T - aim)
         is_loud = (noise > _MOST_NOISE) & (floor[:, 0] < _MOST_NOISE_FLOOR)
         if not is_loud.any():
             break
