@@ -135,9 +135,9 @@ def read_request(
         for names in (PLAN_KEYS, EXACT_KEYS)
     )
     if len(planned) + exact > 1:
-        raise click.UsageError(
-            "give only one of --tolerance-db, --tolerance-wavelengths, --stages and --exact"
-        )
+        params = click.get_current_context().command.params
+        *others, last = (p.opts[0] for p in params if p.name in (*PLAN_KEYS, "exact"))
+        raise click.UsageError(f"give only one of {', '.join(others)} and {last}")
     if planned and exactly:
         raise click.UsageError(
             "--accuracy-db, --taps and --upsampling are for exact images and cannot be combined "

@@ -6,7 +6,6 @@ import math
 import os
 import tempfile
 from collections.abc import Callable
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +89,11 @@ def _range(text: str) -> tuple[float, float]:
     return near, far
 
 
+def _ratio(text: str) -> float:
+    above, _, below = text.partition("/")
+    return float(above) / float(below or 1)
+
+
 AXIS = Parsed("START:STOP:N", _axis, "START:STOP:N, two positions in metres and a number of pixels")
 POSITION = Parsed("X,Y", _position, "X,Y or X,Y,Z in metres, without a space, such as 0,42.5")
 ORIGIN = Parsed(
@@ -98,7 +102,7 @@ ORIGIN = Parsed(
     "LATITUDE,LONGITUDE in degrees, or LATITUDE,LONGITUDE,HEIGHT, without a space, such as "
     "60.39,5.32",
 )
-RATIO = Parsed("NUMBER", lambda text: float(Fraction(text)), "a number or a fraction such as 1/30")
+RATIO = Parsed("NUMBER", _ratio, "a number or a fraction such as 1/30")
 STAGES = Parsed("stages", _stages, "QRxQI for every stage, such as 2x2,2x2")
 PERCENTILES = Parsed(
     "LOW,HIGH", _percentiles, "LOW,HIGH from 0 to 100, without a space, such as 1,99.5"

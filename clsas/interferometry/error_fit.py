@@ -116,7 +116,7 @@ def fitted(
 ) -> Fit | None:
     """Return the unknowns that bring heights closest to those expected, without outliers.
 
-    None if no height is known, or if the values do not settle.
+    None if no height is known, if none is left of those used, or if the values do not settle.
     """
     values = np.zeros(unknowns)
     for _ in range(_ROUNDS):
@@ -127,7 +127,9 @@ def fitted(
         values = values + step
         change = (equations.per_unknown_m[used] @ step) / equations.sd_m[used]
         if np.sqrt(np.mean(change**2)) < _SETTLED:
-            return _described(values, equations_at(values), used, places)
+            settled = equations_at(values)
+            kept = used & settled.usable
+            return _described(values, settled, kept, places) if kept.any() else None
     return None
 
 
@@ -167,7 +169,6 @@ def _described(
     places: Places,
 ) -> Fit:
     """Return the fit with its deviations, which are scaled by the misfit where it exceeds 1."""
-    used = used & equations.usable
     residual = equations.residual_m[used] / equations.sd_m[used]
     count = int(used.sum())
     samples = count**2 / float(places.correlated(used, np.ones((len(used), 1)))[0, 0])

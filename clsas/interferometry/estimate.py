@@ -91,8 +91,12 @@ def _incomparable(comparison: Comparison, given: str) -> ArgumentError:
         allowed = "share places with the valid heights"
         return ArgumentError(given, allowed, hint=f"no valid height lies at {comparison.what}")
     typical_m = float(np.median(np.abs(equations.residual_m[some])))
-    allowed = "lie close enough to the heights for errors of the pair to explain the difference"
-    return ArgumentError(given, allowed, f"{typical_m:.3g} m")
+    return ArgumentError(
+        given,
+        "lie close enough to the heights for errors of the pair to explain the difference",
+        f"{typical_m:.3g} m",
+        "or give more places, since the estimate from these does not settle",
+    )
 
 
 def _unobservable(

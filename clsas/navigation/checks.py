@@ -44,7 +44,8 @@ def checked_unknowns(unknowns: Sequence[str], allowed: Sequence[str]) -> tuple[s
     """Return the names of unknowns; refuse none at all, repeated ones and those not allowed."""
     names = validate.named("unknowns", unknowns, allowed)
     if not names or len(set(names)) < len(names):
-        raise ArgumentError("unknowns", f"be one or several of {tuple(allowed)}", names)
+        allowed_words = f"be one or several of {', '.join(allowed)}, each once"
+        raise ArgumentError("unknowns", allowed_words, names or "none")
     return names
 
 

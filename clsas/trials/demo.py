@@ -119,8 +119,8 @@ def _scene_in(out: Path) -> SceneFile:
     taken = [name for name in _FILES if (out / name).exists()]
     if taken and not (file.is_file() and file.read_bytes() == text):
         raise FileExistsError(
-            "out must be a new folder, or that of an earlier demo with an unchanged scene.toml: in "
-            f"{out} the demo would overwrite {', '.join(taken)}"
+            "`out` must be a new folder, or that of an earlier demo with an unchanged scene.toml: "
+            f"in {out} the demo would overwrite {', '.join(taken)}"
         )
     out.mkdir(parents=True, exist_ok=True)
     file.write_bytes(text)

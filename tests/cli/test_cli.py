@@ -642,7 +642,7 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (
             ["plan", "lines.h5", *GRID, "--tolerance-db", "-30", "--stages", "2x2"],
             2,
-            "give only one of --tolerance-db, --tolerance-wavelengths, --stages and --exact",
+            "give only one of --tolerance-db, --tolerance-wavelengths and --stages",
         ),
         (
             ["image", "lines.h5", *GRID, "-o", "new.h5", "--stages", "2x2", "--taps", "4"],
@@ -660,6 +660,7 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (["plan", "lines.h5", *GRID, "--tolerance-db", "nan"], 2, "and <= -10 dB, got nan"),
         (["tradeoff", "lines.h5", *GRID, "--tolerance-db", "-9"], 2, "dB, got -9"),
         (["plan", "lines.h5", *GRID, "--tolerance-wavelengths", "9"], 2, "wavelengths, got 9"),
+        (["plan", "lines.h5", *GRID, "--tolerance-wavelengths", "1e999999999"], 2, "got inf"),
         (["plan", "lines.h5", *GRID, "--stages", "2x0"], 2, "'2x0' must be QRxQI for every"),
         (["plan", "lines.h5", *GRID, "--squint-deg", "3"], 2, "require --beam-deg"),
         (["plan", "lines.h5", *GRID, "--element-length-m", "1"], 2, "require --beam-deg"),

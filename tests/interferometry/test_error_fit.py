@@ -57,6 +57,17 @@ def test_a_third_of_outliers_does_not_matter():
     assert np.all(np.abs(found.values - TRUE) < 3 * np.sqrt(np.diag(found.covariance)))
 
 
+def test_places_that_the_last_step_makes_unusable_are_no_fit():
+    row = column = np.arange(3)
+    columns = np.ones((3, 1))
+
+    def equations_at(values):
+        residual_m = np.where(values[0] == 0, 1e-4, np.nan) * np.ones(3)
+        return Equations(residual_m, columns, np.full(3, 0.01))
+
+    assert fitted(equations_at, 1, Places(row, column, SHAPE, WINDOW)) is None
+
+
 def test_a_misfit_enlarges_deviations():
     noise_m = heights(np.random.default_rng(4))
     good, bad = (fit(factor * noise_m) for factor in (1, 3))

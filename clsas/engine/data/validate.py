@@ -135,7 +135,7 @@ def number(
         If it is not finite, not above `above` or not below `below`, or not from `least` to `most`.
     """
     scalar: Any = value
-    if getattr(value, "ndim", None) == 0:
+    if getattr(value, "ndim", None) == 0 and not isinstance(value, str):
         scalar = scalar[()]
     is_real = isinstance(scalar, Real) and not isinstance(scalar, (bool, np.timedelta64))
     if not is_real or np.ma.is_masked(value):

@@ -35,7 +35,19 @@ def test_number_takes_every_real_number(value):
 @pytest.mark.parametrize(
     "value",
     [
-        *(True, np.True_, np.array(True), "fast", "3", b"3", None, [1.0, 2.0], [3.0], np.ones(1)),
+        *(
+            True,
+            np.True_,
+            np.array(True),
+            "fast",
+            "3",
+            np.str_("3"),
+            b"3",
+            None,
+            [1.0, 2.0],
+            [3.0],
+            np.ones(1),
+        ),
         *(1j, np.complex64(1), np.ma.masked, np.datetime64("now"), timedelta(seconds=1)),
         # NumPy's durations are integers, too.
         *(np.timedelta64(1, "s"), np.timedelta64(1), np.timedelta64("NaT"), np.array(1, "m8[ms]")),
