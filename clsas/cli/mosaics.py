@@ -32,7 +32,7 @@ from clsas.engine.device.device import open_device
 from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.files.scene_files import SceneFile, simulation_digest
 from clsas.files.scene_tables import PLAN_KEYS
-from clsas.mosaics.documents import check_place
+from clsas.mosaics.document import check_place
 from clsas.mosaics.patches import patch_shape_of
 from clsas.mosaics.record import Record
 
@@ -281,17 +281,12 @@ def _verify(path: Path, as_json: bool) -> None:
     """Report which patches and arrays of a store are damaged; exit with code 1 if any is."""
     store = clsas.Store.opened(path)
     arrays = store.array_damage()
-    # Without the metadata of pixels, patches cannot be read.
-    damage, finished = {}, None
-    if "pixels" not in arrays:
-        with progress_bar("verifying") as progress:
-            damage = store.damage(progress)
-        finished = sum(index not in damage for index in store.records())
+    with progress_bar("verifying") as progress:
+        damage = store.damage(progress)
+    finished = sum(index not in damage for index in store.records())
     damaged = {f"{row},{column}": reason for (row, column), reason in damage.items()}
     summary = f"{len(damage)} damaged" if damage else "none damaged"
     lines = [f"{printable(path)}: {finished} patches match their checksums, {summary}"]
-    if finished is None:
-        lines = [f"{printable(path)}: no patch can be compared with its checksum"]
     lines += [f"  {name}: {printable(reason)}" for name, reason in arrays.items()]
     lines += [f"  patch {index}: {printable(reason)}" for index, reason in damaged.items()]
     report(

@@ -15,7 +15,6 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.result import Heights
-from clsas.mosaics.documents import read_document
 from clsas.mosaics.record import PatchIndex, Record
 from clsas.mosaics.store import Store
 
@@ -92,7 +91,7 @@ class Source:
     @property
     def inputs(self) -> dict[str, Any]:
         """Inputs of the store's mosaic; empty for an image."""
-        return {} if self.store is None else read_document(self.store.path)["inputs"]
+        return {} if self.store is None else self.store.document.inputs
 
     def windows(self) -> Iterator[tuple[slice, slice]]:
         """Yield windows that cover the image. Those of a store are whole patches."""

@@ -17,7 +17,7 @@ from clsas.engine.data.simplify import shift_error
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.engine.exact.decide import BEST_ACCURACY_DB
 from clsas.engine.factorized.planner import TOLERANCE_DB, checked_pairs, tolerance_in_db
-from clsas.mosaics.documents import is_there, read_document
+from clsas.mosaics.document import Document, is_there
 from clsas.mosaics.provenance import REQUESTS, beam_json
 from clsas.mosaics.scheduling import Growth
 from clsas.mosaics.survey import END, has_ended
@@ -86,7 +86,7 @@ def beam_of_mosaic(
         return beam_of_growing(beam)
     if store is not None and is_there(store):
         growing = beam_of_growing(beam)
-        if read_document(store)["inputs"].get("beam") == json.loads(beam_json(growing)):
+        if Document.read(store).inputs.get("beam") == json.loads(beam_json(growing)):
             return growing
     return beam
 

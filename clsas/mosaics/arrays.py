@@ -1,321 +1,334 @@
-"""Arrays of a store: create, open after a check of the metadata, compare and repair them."""
+"""Arrays of a store in Zarr: created, opened, written durably, compared and repaired.
+
+Zarr decodes an array as its metadata specify, and some decoders run code contained in the array.
+Since a store may come from a stranger, Zarr never reads metadata from it: what it receives follows
+from the store's document. The metadata in the folder are for other programs.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import json
 import math
-import os
-import uuid
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
+from zarr.abc.store import Store as ZarrStore
 from zarr.codecs import Crc32cCodec
+from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
+from zarr.storage import LocalStore, MemoryStore
 
 from clsas.engine.data import validate
-from clsas.engine.data.atomic import creating, make_folders, staging, sync_folder
-from clsas.engine.data.digests import grid_digest, with_digest
+from clsas.engine.data.atomic import creating, make_folders, replacing
+from clsas.engine.data.digests import digest, grid_digest
 from clsas.engine.data.grid import Grid
-from clsas.mosaics.documents import (
-    DIGESTS,
-    FORMAT,
-    VECTORS,
-    VERSION,
+from clsas.engine.data.reading import check_ordinary, parse_json, read_bytes
+from clsas.mosaics.document import (
     DamageError,
+    Document,
     check_own,
-    plane_of,
-    read_document,
+    read_attributes,
     write_attributes,
 )
-from clsas.mosaics.durable import DurableStore
-from clsas.mosaics.levels import (
-    CHUNK_SHAPE,
-    IN_DB,
-    LAYERS,
-    LEVELS,
-    SHADOWED,
-    WINDOW,
-    PixelArray,
-    chunk_side,
-    levels_of,
-    mosaic_arrays,
-    multiscales,
-    patch_arrays,
-)
-from clsas.mosaics.metadata import (
-    Checked,
-    Form,
-    axes_of,
-    check_group,
-    checked,
-    forms,
-    groups_of,
-    has_height,
-)
+from clsas.mosaics.levels import StoredArray, axis_of
 
+_CHECKSUM_BYTES = 4
 _COPIES = 3  # copies of coordinates or heights in memory: Zarr's, the grid's, one for the digest
+_WRONG = "its values do not match their checksum"
 
 
-def create_store(
-    path: Path,
-    inputs: dict[str, Any],
-    grid: Grid,
-    patch_shape: tuple[int, int],
-    window: tuple[int, int] | None,
-) -> None:
-    """Create the store of a mosaic in one step, so that a killed process leaves no partial store.
+@dataclass(frozen=True, eq=False)
+class StoredArrays:
+    """Arrays of a store, each opened once.
 
-    Raises
-    ------
-    ValueError
-        If a patch does not fit in memory.
-    OSError
-        If the parent folder cannot be written.
-    """
-    validate.memory("a patch of pixels", 2 * 8 * math.prod(patch_shape))  # complex64
-    plane = None
-    if grid.points_m is None:
-        plane = {name: getattr(grid, name).tolist() for name in VECTORS}
-    levels = levels_of(grid.shape, patch_shape)
-    attributes = {
-        "format": FORMAT,
-        "version": VERSION,
-        "patch_shape": list(patch_shape),
-        CHUNK_SHAPE: list(map(chunk_side, patch_shape, grid.shape)),
-        LEVELS: levels.json(),
-        "grid": plane,
-        "inputs": inputs,
-    } | multiscales(levels)
-    if window is not None:
-        attributes[WINDOW] = list(window)
-    with creating(path) as temporary:
-        _create_arrays(temporary, grid, attributes)
-        digests = _digests(temporary, attributes, grid.height_m is not None)
-        write_attributes(temporary, with_digest(attributes | {DIGESTS: digests}))
-
-
-def open_array(path: Path, attributes: dict[str, Any], name: str) -> zarr.Array:
-    """Open an array of a store for reading.
-
-    Raises
-    ------
-    DamageError
-        If the metadata are not those of a mosaic, or differ from those that were written.
-    """
-    return _opened(path, attributes, name, read_only=True)
-
-
-def write_values(
-    path: Path,
-    attributes: dict[str, Any],
-    name: str,
-    window: tuple[slice, slice],
-    values: NDArray[np.complex64] | NDArray[np.float32],
-) -> None:
-    """Write whole chunks of an array. Zarr writes no chunk that has only the fill value."""
-    _opened(path, attributes, name, read_only=False)[window] = values
-
-
-def check_metadata(path: Path, attributes: dict[str, Any]) -> None:
-    """Raise a DamageError that names the array if the metadata of any array are damaged."""
-    for name, form in forms(attributes, has_height(attributes)).items():
-        try:
-            _checked(path, attributes, name, form)
-        except DamageError as error:
-            raise DamageError(f"{name}: {error}") from error
-
-
-def compared(
-    path: Path, attributes: dict[str, Any], with_height: bool
-) -> tuple[Grid | None, dict[str, str]]:
-    """Compare metadata, coordinates and heights of a store with what was written.
-
-    Returns
-    -------
-    grid : Grid or None
-        The store's grid, with its heights if they are intact; None for arbitrary points.
-    damage : dict of str to str
-        Reason for each damaged array or group, by its name.
-    """
-    grid, found = plane_of(attributes), {}
-    axes = axes_of(attributes)
-    for name, form in forms(attributes, with_height).items():
-        try:
-            _checked(path, attributes, name, form)
-            if name in axes and grid is not None:
-                values_m = _values(path, attributes, name)
-                if not np.array_equal(values_m, axes[name].values_m(grid)):
-                    raise DamageError("its values differ from those of the grid")
-            if name == "height" and grid is not None:
-                grid = _raised(grid, _values(path, attributes, name), attributes)
-        except DamageError as error:
-            found[name] = str(error)
-    for name in groups_of(attributes):
-        try:
-            check_group(path, name)
-        except DamageError as error:
-            found[name] = str(error)
-    return grid, found
-
-
-def repair(path: Path, grid: Grid) -> dict[str, str]:
-    """Rewrite damaged metadata, coordinates and heights.
-
-    Parameters
+    Attributes
     ----------
     path : Path
-        The store.
-    grid : Grid
-        The grid that the store was made with.
-
-    Returns
-    -------
-    dict of str to str
-        Reason for each array or group that was damaged, by its name.
+        Folder of the store.
+    document : Document
     """
-    attributes = read_document(path)
-    with_height = grid.height_m is not None
-    _, found = compared(path, attributes, with_height)
-    if found:
-        axes = {*axes_of(attributes), "height"}
-        with staging(path) as temporary:
-            new, old = temporary / "new", temporary / "old"
-            new.mkdir()
-            old.mkdir()
-            _create_arrays(new, grid, attributes)
-            for name in found:
-                # Replace the metadata alone, since the chunks of pixels and the records must stay.
-                _exchange(path, name if name in axes else f"{name}/zarr.json", new, old)
-        digests = _digests(path, attributes, with_height)
-        write_attributes(path, with_digest(attributes | {DIGESTS: digests}))
-    return found
+
+    path: Path
+    document: Document
+    _opened: dict[tuple[str, bool], zarr.Array] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def create(cls, path: Path, document: Document, grid: Grid) -> None:
+        """Create a store in one step, so that a killed process leaves no partial store.
+
+        Pixels and levels have no chunks yet, which means that they are 0 or NaN.
+
+        Raises
+        ------
+        OSError
+            If the parent folder cannot be written.
+        """
+        texts = {name: _metadata(array) for name, array in document.arrays.items()}
+        digests = {name: digest(json.loads(text)) for name, text in texts.items()}
+        document = replace(document, metadata=digests)
+        with creating(path) as temporary:
+            arrays = cls(temporary, document)
+            for name in document.groups:
+                write_attributes(temporary / name, {})
+            for name in document.arrays:
+                arrays._write(name, grid)
+            document.write(temporary)
+
+    def opened(self, name: str, *, writable: bool = False) -> zarr.Array:
+        """Return an array; Zarr verifies checksums on reading.
+
+        Raises
+        ------
+        ValueError
+            If a chunk does not fit into memory.
+        """
+        if (name, writable) not in self._opened:
+            array = self.document.arrays[name]
+            validate.memory(f"a chunk of {name} in {self.path}", 2 * array.chunk_bytes)
+            files = _Files(self.path, array, read_only=not writable)
+            mode = "r+" if writable else "r"
+            self._opened[name, writable] = zarr.open_array(
+                files, path=name, mode=mode, zarr_format=3
+            )
+        return self._opened[name, writable]
+
+    def write(self, name: str, window: tuple[slice, slice], values: NDArray) -> None:
+        """Write whole chunks of an array. Zarr writes no chunk that has only the fill value."""
+        self.opened(name, writable=True)[window] = values
+
+    def checksums(
+        self, array: StoredArray, chunks: Sequence[tuple[int, ...]]
+    ) -> str | list[str | None] | None:
+        """Return the checksums behind chunks of an array; without a list if there is only one.
+
+        That of a chunk that does not exist, because it has only the fill value, is None.
+
+        Raises
+        ------
+        ValueError
+            If a chunk is not an ordinary file.
+        """
+        found: list[str | None] = []
+        for chunk in chunks:
+            path = self._chunk(array, chunk)
+            try:
+                check_ordinary(path)
+                with path.open("rb") as file:
+                    file.seek(array.chunk_bytes)
+                    found.append(file.read(2 * _CHECKSUM_BYTES).hex())  # half as many if intact
+            except FileNotFoundError:
+                found.append(None)
+        return found[0] if len(found) == 1 else found
+
+    def is_missing(self, array: StoredArray, chunks: Sequence[tuple[int, ...]]) -> bool:
+        """Return whether any of the chunks of an array does not exist."""
+        return not all(self._chunk(array, chunk).exists() for chunk in chunks)
+
+    def grid(self) -> Grid | None:
+        """Return the grid with its heights; None for arbitrary points.
+
+        Raises
+        ------
+        DamageError
+            If the heights differ from those that were written.
+        """
+        plane = self.document.plane
+        if plane is None or not self.document.has_height:
+            return plane
+        try:
+            grid = plane.with_height(self._values("height"))
+        except DamageError:
+            raise
+        except ValueError as error:
+            raise DamageError(f"its values are not heights: {error}") from error
+        if grid_digest(grid) != self.document.inputs.get("grid"):
+            raise DamageError("its values differ from those that were written")
+        return grid
+
+    def damage(self) -> dict[str, str]:
+        """Compare metadata, coordinates and heights with what was written.
+
+        Returns
+        -------
+        dict of str to str
+            Reason for each damaged array or group, by its name.
+        """
+        return dict(self._damage())
+
+    def repair(self, grid: Grid) -> dict[str, str]:
+        """Rewrite damaged metadata, coordinates and heights; return what was damaged.
+
+        A run that is killed meanwhile leaves damage, which the next one finds.
+        """
+        found = self.damage()
+        digests = dict(self.document.metadata)
+        for name in found:
+            if name in self.document.arrays:
+                digests[name] = digest(json.loads(self._write(name, grid)))
+            else:
+                self._make_folder(self.path / name)
+                write_attributes(self.path / name, {})
+        if digests != self.document.metadata:
+            replace(self.document, metadata=digests).write(self.path)
+        return found
+
+    def _damage(self) -> Iterator[tuple[str, str]]:
+        for name in self.document.groups:
+            try:
+                if read_attributes(self.path / name):
+                    yield name, "it has attributes that were not written"
+            except PermissionError:
+                raise
+            except (OSError, DamageError):
+                yield name, "its metadata cannot be read"
+        for name, array in self.document.arrays.items():
+            try:
+                self._check_metadata(name)
+                if name == "height":
+                    self.grid()
+                elif not array.patch_shape:
+                    self._check_axis(array)
+            except DamageError as error:
+                yield name, str(error)
+
+    def _check_metadata(self, name: str) -> None:
+        try:
+            found = digest(parse_json(read_bytes(self.path / name / "zarr.json")))
+        except FileNotFoundError as error:
+            raise DamageError("its metadata are missing") from error
+        except PermissionError:
+            raise
+        except (OSError, ValueError) as error:
+            raise DamageError(f"its metadata cannot be read: {error}") from error
+        if found != self.document.metadata.get(name):
+            raise DamageError("its metadata do not match their digest")
+
+    def _check_axis(self, array: StoredArray) -> None:
+        assert self.document.plane is not None  # it has axes
+        if not np.array_equal(self._values(array.name), _axis_m(array, self.document.plane)):
+            raise DamageError("its values differ from those of the grid")
+
+    def _values(self, name: str) -> NDArray[np.float64]:
+        """Return the values of coordinates or heights; raise DamageError if they are damaged."""
+        array = self.opened(name)
+        validate.memory(f"{name} in {self.path}", _COPIES * 8 * math.prod(array.shape))
+        try:
+            return np.asarray(array[...])
+        except ValueError as error:  # Zarr's message about a checksum
+            raise DamageError(_WRONG) from error
+
+    def _write(self, name: str, grid: Grid) -> bytes:
+        """Write the metadata of an array, and its values if it has coordinates or heights."""
+        array, folder = self.document.arrays[name], self.path / name
+        text = _metadata(array)
+        self._make_folder(folder)
+        with replacing(folder / "zarr.json") as temporary:
+            temporary.write_bytes(text)
+        if not array.patch_shape:
+            if (folder / "c").exists():
+                shutil.rmtree(folder / "c")
+            values_m: Any = grid.height_m if name == "height" else _axis_m(array, grid)
+            self.opened(name, writable=True)[...] = values_m
+        return text
+
+    def _make_folder(self, folder: Path) -> None:
+        """Make a folder of the store, also where damage has left something else."""
+        check_own(self.path, folder)
+        if folder.exists() and not folder.is_dir():
+            folder.unlink()
+        make_folders(folder)
+        if (folder / "zarr.json").is_dir():
+            shutil.rmtree(folder / "zarr.json")
+
+    def _chunk(self, array: StoredArray, chunk: tuple[int, ...]) -> Path:
+        return self.path.joinpath(*array.name.split("/"), "c", *map(str, chunk))
 
 
-def _exchange(path: Path, name: str, new: Path, old: Path) -> None:
-    """Move a part of a store into `old`, and its replacement from `new` to its place."""
-    target = path / name
-    check_own(path, target.parent)
-    make_folders(target.parent)
-    if os.path.lexists(target):
-        target.rename(old / uuid.uuid4().hex)
-    (new / name).rename(target)
-    sync_folder(target.parent)
+class _Files(LocalStore):
+    """Zarr store of one array, whose writes are complete and on the disk when they return.
+
+    Zarr's own store also renames finished chunks, but it does not wait for the disk, and killed
+    processes leave temporary files.
+    """
+
+    def __init__(self, path: Path, array: StoredArray, *, read_only: bool) -> None:
+        super().__init__(path, read_only=read_only)
+        self._known = {f"{array.name}/zarr.json": _metadata(array)}
+        self._size = array.chunk_bytes + _CHECKSUM_BYTES
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """Write a chunk."""
+        await asyncio.to_thread(self.set_sync, key, value)
+
+    def set_sync(self, key: str, value: Buffer) -> None:
+        """Write a chunk. Some versions of Zarr call this method instead of `set`."""
+        self._check_writable()
+        path = Path(self.root) / key
+        check_own(Path(self.root), path.parent)
+        make_folders(path.parent)
+        with replacing(path) as temporary:
+            temporary.write_bytes(value.as_buffer_like())
+
+    async def get(
+        self, key: str, prototype: BufferPrototype | None = None, *options: Any, **named: Any
+    ) -> Buffer | None:
+        """Read a chunk; raise ValueError if it is not an ordinary file of its size."""
+        if key in self._known:
+            return _buffer(prototype, self._known[key])
+        self._check(key)
+        return await super().get(key, prototype, *options, **named)
+
+    def get_sync(
+        self, key: str, *options: Any, prototype: BufferPrototype | None = None, **named: Any
+    ) -> Buffer | None:
+        """Read a chunk. Some versions of Zarr call this method instead of `get`."""
+        if key in self._known:
+            return _buffer(prototype, self._known[key])
+        self._check(key)
+        return super().get_sync(key, *options, prototype=prototype, **named)
+
+    def _check(self, key: str) -> None:
+        path = Path(self.root) / key
+        with suppress(OSError):  # a missing file is a chunk of the fill value
+            check_ordinary(path)
+            if (size := path.stat().st_size) != self._size:
+                raise ValueError(f"{path} must have {self._size} bytes, got {size}")
+
+    # LocalStore writes the file itself; the method of the base class calls `set`.
+    set_if_not_exists = ZarrStore.set_if_not_exists
 
 
-def _digests(path: Path, attributes: dict[str, Any], with_height: bool) -> dict[str, str]:
-    return {
-        name: checked(path, name, form, None).digest
-        for name, form in forms(attributes, with_height).items()
-    }
+def _buffer(prototype: BufferPrototype | None, content: bytes) -> Buffer:
+    return (prototype or default_buffer_prototype()).buffer.from_bytes(content)
 
 
-def _checked(path: Path, attributes: dict[str, Any], name: str, form: Form) -> Checked:
-    """Return the metadata of an array; raise DamageError if they are damaged."""
-    return checked(path, name, form, attributes[DIGESTS].get(name))
+def _metadata(array: StoredArray) -> bytes:
+    """Return the metadata that Zarr writes for an array. Its only codec is a checksum.
 
-
-def _opened(path: Path, attributes: dict[str, Any], name: str, *, read_only: bool) -> zarr.Array:
-    form = forms(attributes, name == "height")[name]
-    metadata = _checked(path, attributes, name, form)
-    validate.memory(f"a chunk of {name} in {path}", 2 * metadata.chunk_bytes)
-    files = DurableStore.of_array(path, name, metadata, read_only=read_only)
-    return zarr.open_array(files, path=name, mode="r" if read_only else "r+", zarr_format=3)
-
-
-def _values(path: Path, attributes: dict[str, Any], name: str) -> NDArray[np.float64]:
-    """Return the values of coordinates or heights; raise DamageError if they cannot be read."""
-    array = open_array(path, attributes, name)
-    validate.memory(f"{name} in {path}", _COPIES * 8 * math.prod(array.shape))
-    try:
-        return np.asarray(array[...])
-    except ValueError as error:  # Zarr's message about a checksum
-        raise DamageError("its values do not match their checksum") from error
-
-
-def _raised(plane: Grid, height_m: NDArray[np.float64], attributes: dict[str, Any]) -> Grid:
-    """Return a grid with heights; raise DamageError if they differ from what was written."""
-    try:
-        grid = plane.with_height(height_m)
-    except ValueError as error:
-        raise DamageError(f"its values are not heights: {error}") from error
-    if grid_digest(grid) != attributes["inputs"].get("grid"):
-        raise DamageError("its values differ from those that were written")
-    return grid
-
-
-def _map_of(grid: Grid | None) -> dict[str, Any]:
-    """Return the map projection in the convention of GDAL, if x and y are easting and northing."""
-    place = None if grid is None else grid.georeference
-    if grid is None or place is None or place.crs is None or not grid.has_axes:
-        return {}
-    authority, _, code = place.crs.partition(":")
-    if authority == "EPSG" and code.isdigit():
-        return {"_CRS": {"url": f"http://www.opengis.net/def/crs/EPSG/0/{code}"}}
-    return {"_CRS": {"wkt": place.crs}} if "[" in place.crs else {}
-
-
-def _meaning(array: PixelArray) -> dict[str, Any]:
-    """Return unit and meaning of the numbers of an array, as xarray shows them."""
-    if array.name == IN_DB:
-        return {"units": "dB", "long_name": "amplitude"}
-    known = LAYERS | SHADOWED
-    if array.kind not in known:
-        return {}
-    units, meaning = known[array.kind]
-    return {"units": units, "long_name": meaning} if units else {"long_name": meaning}
-
-
-def _create_arrays(path: Path, grid: Grid | None, attributes: dict[str, Any]) -> None:
-    """Create the groups and arrays of a mosaic: pixels, all zero, levels, coordinates, heights."""
-    files = DurableStore(path)
-    for name in groups_of(attributes):
-        write_attributes(path / name, {})
-    # Noise does not compress, so the only codec is a checksum behind every chunk.
-    checksum = Crc32cCodec()
-    names = ("y", "x") if grid is not None and grid.has_axes else ("row", "column")
-    first, *others = [*patch_arrays(attributes), *mosaic_arrays(attributes)]
+    Noise does not compress.
+    """
+    files: dict[str, Buffer] = {}
     zarr.create_array(
-        files,
-        name="pixels",
-        shape=first.shape,
-        dtype=np.complex64,
-        chunks=first.chunk_shape,
-        compressors=checksum,
-        fill_value=0,
-        dimension_names=names,
-        attributes=_map_of(grid),
+        MemoryStore(files),
+        name=array.name,
+        shape=array.shape,
+        dtype=array.data_type,
+        chunks=array.chunk_shape,
+        compressors=Crc32cCodec(),
+        fill_value=array.fill_value,
+        dimension_names=array.dimensions,
+        attributes=array.attributes,
     )
-    for array in others:
-        in_db = array.name == IN_DB
-        zarr.create_array(
-            files,
-            name=array.name,
-            shape=array.shape,
-            dtype=array.data_type,
-            chunks=array.chunk_shape,
-            compressors=checksum,
-            fill_value=array.fill_value,
-            # Programs such as xarray demand one length of every dimension of a group.
-            dimension_names=[f"overview_{n}" for n in names]
-            if in_db and array.factor > 1
-            else names,
-            attributes=_meaning(array),
-        )
-    coordinates: dict[str, tuple[tuple[str, ...], NDArray[np.float64]]] = {}
-    if grid is not None:
-        coordinates |= {
-            name: ((axis.dimension,), axis.values_m(grid))
-            for name, axis in axes_of(attributes).items()
-        }
-    if grid is not None and grid.height_m is not None:
-        coordinates["height"] = names, grid.height_m
-    for name, (dimensions, values) in coordinates.items():
-        zarr.create_array(
-            files,
-            name=name,
-            data=values,
-            compressors=checksum,
-            dimension_names=dimensions,
-            attributes={"units": "m"},
-        )
+    return files[f"{array.name}/zarr.json"].to_bytes()
+
+
+def _axis_m(array: StoredArray, plane: Grid) -> NDArray[np.float64]:
+    """Return the coordinates of an axis."""
+    return axis_of(plane.axes_m["xy".index(array.name[-1])], array.factor)

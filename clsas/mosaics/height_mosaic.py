@@ -35,7 +35,7 @@ from clsas.interferometry.request import Request
 from clsas.mosaics.arguments import beam_of_mosaic, warn_of_window
 from clsas.mosaics.banks import Bank
 from clsas.mosaics.devices import open_devices
-from clsas.mosaics.documents import PARTS_OF_B, read_document
+from clsas.mosaics.document import PARTS_OF_B
 from clsas.mosaics.height_patches import HeightsJob, seen
 from clsas.mosaics.levels import aligned_side, factors_of
 from clsas.mosaics.patches import Layout
@@ -311,7 +311,7 @@ def _decided(store: Store) -> dict[str, Any] | None:
     """Return the window and the margin of a store that exists."""
     if store.patch_shape is None:
         return None
-    inputs = read_document(store.path)["inputs"]
+    inputs = store.document.inputs
     if "window_m" not in inputs or "margin" not in inputs:  # a mosaic of images
         return None
     return {"window_m": inputs["window_m"], "margin": inputs["margin"]}

@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -54,14 +54,8 @@ SHADOWED = {
 Whether a pixel is in shadow depends on patches that may be measured later, or again.
 """
 
-WINDOW = "window"
-"""Attribute of mosaics of heights: rows and columns of the window behind each height."""
-
 LEVELS = "levels"
-"""Attribute that lists the levels, and name of the group that records those of the mosaic."""
-
-CHUNK_SHAPE = "chunk_shape"
-"""Attribute with the shape of a chunk of the pixels."""
+"""Name of the group that records the levels of the mosaic."""
 
 _CONVENTION = {
     "uuid": "d35379db-88df-4056-af3a-620245f8e347",
@@ -101,47 +95,56 @@ class Levels:
         """Factor of the coarsest level."""
         return max(self.of_patches + self.of_mosaic)
 
-    def json(self) -> dict[str, list[int]]:
-        """Return the attribute to store."""
-        return {"of_patches": list(self.of_patches), "of_mosaic": list(self.of_mosaic)}
-
 
 @dataclass(frozen=True)
-class PixelArray:
-    """An array of a store with one value for every pixel of the mosaic or of a level.
+class StoredArray:
+    """An array of a store: pixels, what belongs to them, or coordinates.
 
     Attributes
     ----------
     name : str
         Path in the store, such as "4x/amplitude".
+    data_type : str
+        "complex64", "float32" or "float64".
+    shape, chunk_shape : tuple of int
+    dimensions : tuple of str
+        Names of the dimensions.
+    attributes : dict
+        Attributes for other programs.
     factor : int
         Pixels of the mosaic along each side of a pixel of this array.
-    data_type : str
-        "complex64" or "float32".
-    shape, chunk_shape : (rows, columns)
     patch_shape : (rows, columns)
-        Size of a patch, in pixels of the mosaic.
-    has_gaps : bool
-        True if NaN stands for pixels without a value, False if all numbers are finite.
+        Size of a patch, in pixels of the mosaic; empty for coordinates.
     """
 
     name: str
-    factor: int
     data_type: str
-    shape: tuple[int, int]
-    chunk_shape: tuple[int, int]
-    patch_shape: tuple[int, int]
-    has_gaps: bool = False
-
-    @property
-    def fill_value(self) -> complex | float:
-        """Value where nothing has been written."""
-        return math.nan if self.has_gaps else 0
+    shape: tuple[int, ...]
+    chunk_shape: tuple[int, ...]
+    dimensions: tuple[str, ...]
+    attributes: dict[str, Any]
+    factor: int = 1
+    patch_shape: tuple[int, ...] = ()
 
     @property
     def kind(self) -> str:
         """Kind of numbers: "pixels", "amplitude", `IN_DB`, or one of `LAYERS` or `SHADOWED`."""
         return self.name.rpartition("/")[2]
+
+    @property
+    def has_gaps(self) -> bool:
+        """True if NaN stands for pixels without a value, False if all numbers are finite."""
+        return self.kind in (IN_DB, *LAYERS, *SHADOWED)
+
+    @property
+    def fill_value(self) -> float:
+        """Value where nothing has been written."""
+        return math.nan if self.has_gaps else 0.0
+
+    @property
+    def chunk_bytes(self) -> int:
+        """Size of the values of a chunk."""
+        return math.prod(self.chunk_shape) * np.dtype(self.data_type).itemsize
 
     def window(self, index: tuple[int, int]) -> tuple[slice, slice]:
         """Return the pixels of this array that belong to a patch."""
@@ -231,85 +234,6 @@ def level_shape(shape: tuple[int, ...], factor: int) -> tuple[int, int]:
     """Return the shape of a level. Its last pixels may cover fewer pixels of the mosaic."""
     rows, columns = (math.ceil(count / factor) for count in shape)
     return rows, columns
-
-
-def stored_levels(attributes: Mapping[str, Any]) -> Levels:
-    """Return the levels in the attributes of a store."""
-    stored = attributes[LEVELS]
-    return Levels(tuple(stored["of_patches"]), tuple(stored["of_mosaic"]))
-
-
-def layers_of(attributes: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the layers in the attributes of a store: `LAYERS` for a mosaic of heights."""
-    return tuple(LAYERS) if WINDOW in attributes else ()
-
-
-def shadowed_of(attributes: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the layers without levels in the attributes of a store, `SHADOWED` or none."""
-    return tuple(SHADOWED) if WINDOW in attributes else ()
-
-
-def are_levels(attributes: Mapping[str, Any]) -> bool:
-    """Return whether chunks and levels in the attributes of a store are as clsas writes them.
-
-    `patch_shape` and the number of pixels must have been checked.
-    """
-    shape, patch_shape = attributes["inputs"]["pixels"], attributes["patch_shape"]
-    return (
-        attributes.get(CHUNK_SHAPE) == list(map(chunk_side, patch_shape, shape))
-        and attributes.get(LEVELS) == levels_of(shape, patch_shape).json()
-    )
-
-
-def patch_arrays(attributes: Mapping[str, Any]) -> list[PixelArray]:
-    """Return the arrays that are written with each patch: the pixels, and the levels of patches."""
-    chunk_shape = tuple(attributes[CHUNK_SHAPE])
-    shape, patch_shape = tuple(attributes["inputs"]["pixels"]), tuple(attributes["patch_shape"])
-    pixels = PixelArray("pixels", 1, "complex64", shape, chunk_shape, patch_shape)
-    layers = [
-        replace(pixels, name=name, data_type="float32", has_gaps=True)
-        for name in (*layers_of(attributes), *shadowed_of(attributes))
-    ]
-    levels = stored_levels(attributes)
-    return [pixels, *layers, *_level_arrays(attributes, levels, levels.of_patches)]
-
-
-def mosaic_arrays(attributes: Mapping[str, Any]) -> list[PixelArray]:
-    """Return the arrays of the levels that are computed when all patches are finished."""
-    levels = stored_levels(attributes)
-    return _level_arrays(attributes, levels, levels.of_mosaic)
-
-
-def _level_arrays(
-    attributes: Mapping[str, Any], levels: Levels, factors: tuple[int, ...]
-) -> list[PixelArray]:
-    shape, patch_shape = tuple(attributes["inputs"]["pixels"]), tuple(attributes["patch_shape"])
-    found = []
-    for factor in factors:
-        reduced = level_shape(shape, factor)
-        if factor in levels.of_patches:
-            of_patch = level_shape(patch_shape, factor)
-            chunks = tuple(map(chunk_side, of_patch, reduced))
-        else:
-            chunks = tuple(chunk_side(count, count) for count in reduced)
-        kinds = {f"{factor}x/pixels": "complex64", f"{factor}x/amplitude": "float32"}
-        kinds |= {f"{factor}x/{name}": "float32" for name in layers_of(attributes)}
-        names = kinds if factor > 1 else {}
-        if factor == levels.coarsest:
-            names = names | {IN_DB: "float32"}
-        found += [
-            PixelArray(
-                name,
-                factor,
-                data_type,
-                reduced,
-                (chunks[0], chunks[1]),
-                patch_shape,
-                has_gaps=name.rpartition("/")[2] in (IN_DB, *LAYERS),
-            )
-            for name, data_type in names.items()
-        ]
-    return found
 
 
 def axis_of(axis_m: NDArray[np.float64], factor: int) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from typing import Any
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.digests import digest, grid_digest
 from clsas.engine.data.grid import Grid
-from clsas.mosaics.documents import PARTS_OF_B, read_document
+from clsas.mosaics.document import PARTS_OF_B, Document
 from clsas.mosaics.survey import Survey
 
 REQUESTS = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
@@ -39,17 +39,17 @@ def inputs_of(
 
 
 def differences(
-    attributes: dict[str, Any], given: dict[str, Any], patch_shape: tuple[int, int]
+    document: Document, given: dict[str, Any], patch_shape: tuple[int, int]
 ) -> list[str]:
     """Return one message for every difference between the inputs of a store and the given ones.
 
     Files may have been added to the survey, so the given parts need only begin with the stored
     ones.
     """
-    found, stored = [], attributes["inputs"]
-    if attributes["patch_shape"] != list(patch_shape):
-        mine, theirs = ("{} x {}".format(*s) for s in (attributes["patch_shape"], patch_shape))
-        found.append(f"patches have {mine} pixels in the store, {theirs} given")
+    found, stored = [], document.inputs
+    if document.patch_shape != patch_shape:
+        shapes = "{} x {} pixels in the store, {} x {} given"
+        found.append(f"patches have {shapes.format(*document.patch_shape, *patch_shape)}")
     before, now = (
         [each.get(name, []) for name in ("parts", PARTS_OF_B)] for each in (stored, given)
     )
@@ -83,7 +83,7 @@ def stored_digest(path: Path) -> str:
     ValueError
         If there is no mosaic at the path, or its document is damaged.
     """
-    return digest(read_document(path)["inputs"])
+    return digest(Document.read(path).inputs)
 
 
 def beam_json(beam: BeamWindow) -> str:

@@ -15,110 +15,90 @@ of variance v along an axis then has the variance
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
-from typing import NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.mosaics.levels import IN_DB, PixelArray
 from clsas.mosaics.means import block_means
 
-Real = TypeVar("Real", np.float32, np.float64)
+Values = dict[str, NDArray[Any]]
+"""Values of a level or of a part of it, by kind.
+
+"pixels", the mean of the complex pixels; "amplitude", the root of their mean power; and layers.
+"""
 
 _BAND = 256  # rows that are reduced at once: a plain choice, which keeps copies small
 
 
-class Level(NamedTuple):
-    """Values of a level, or of a part of it."""
-
-    amplitude: NDArray[np.float32]
-    """Root of the mean power."""
-    pixels: NDArray[np.complex64]
-    """Mean of the complex pixels."""
-    layers: Mapping[str, NDArray[np.float32]] = MappingProxyType({})
-    """Means of the layers, by name."""
-
-    def values_of(self, array: PixelArray) -> NDArray[np.float32] | NDArray[np.complex64]:
-        """Return the values of an array of the level."""
-        if array.kind in self.layers:
-            return self.layers[array.kind]
-        if array.name == IN_DB:
-            return _in_db(self.amplitude)
-        return self.pixels if array.kind == "pixels" else self.amplitude
-
-
-def levels(pixels: NDArray[np.complex64], factors: tuple[int, ...]) -> dict[int, Level]:
-    """Return the levels of a patch.
+def pyramid(
+    finest: Values, factors: Sequence[int], window: tuple[int, int] | None
+) -> dict[int, Values]:
+    """Return a patch and its levels, by factor.
 
     Parameters
     ----------
-    pixels : complex64 [rows, columns]
-    factors : tuple of int
-        1, 2, 4 and so on, ascending. Their blocks begin at the first pixel; the last blocks may
-        extend beyond the pixels, and are then the mean of those that there are.
+    finest : dict of str to array [rows, columns]
+    factors : sequence of int
+        2, 4 and so on, ascending; with 1 or without. Blocks begin at the first pixel; the last ones
+        may extend beyond the pixels, and are then the mean of those that there are.
+    window : (rows, columns) or None
+        Pixels of the window behind each height, if there are heights.
     """
-    if not factors:
-        return {}
-    bands: dict[int, list[Level]] = {factor: [] for factor in factors}
-    height = factors[-1] * max(_BAND // factors[-1], 1)
-    for first in range(0, len(pixels), height):
-        band = pixels[first : first + height]
-        level = Level(np.abs(band), band)
-        for factor in (1 << power for power in range(factors[-1].bit_length())):
-            if factor > 1:
-                rows, columns = (
-                    covered(0, of_level, factor // 2, of_band)
-                    for of_level, of_band in zip(level.amplitude.shape, band.shape, strict=True)
-                )
-                level = coarser(level, rows, columns)
-            if factor in bands:
-                bands[factor].append(level)
-    return {
-        factor: Level(
-            np.concatenate([each.amplitude for each in found]),
-            np.concatenate([each.pixels for each in found]),
-        )
-        for factor, found in bands.items()
-    }
-
-
-def layer_levels(
-    layers: Mapping[str, NDArray[np.float32]],
-    factors: tuple[int, ...],
-    window: tuple[int, int] | None,
-) -> dict[int, dict[str, NDArray[np.float32]]]:
-    """Return the layers of a patch and of its levels, by factor and name.
-
-    Parameters
-    ----------
-    layers : dict of str to float32 [rows, columns]
-    factors : tuple of int
-        1, 2, 4 and so on, as for `levels`; with 1 or without.
-    window : (rows, columns)
-        Pixels of the window behind each height; None without layers.
-    """
-    found, factor = {1: dict(layers)}, 1
+    levels, factor = {1: finest}, 1
+    shape = finest["amplitude"].shape
     while factor < max(factors, default=1):
-        factor *= 2
-        found[factor] = coarser_layers(found[factor // 2], factor, window)
+        finer, factor = levels[factor], 2 * factor
+        sides = zip(finer["amplitude"].shape, shape, strict=True)
+        rows, columns = (covered(0, count, factor // 2, pixels) for count, pixels in sides)
+        levels[factor] = coarser(finer, factor, rows, columns, window)
+    return levels
+
+
+def coarser(
+    finer: Values,
+    factor: int,
+    rows: NDArray[np.float64],
+    columns: NDArray[np.float64],
+    window: tuple[int, int] | None,
+) -> Values:
+    """Return values of the level with a factor from those with half of it.
+
+    Parameters
+    ----------
+    finer : dict of str to array [rows, columns]
+        A part of a level that begins at an even pixel along both axes.
+    factor : int
+    rows, columns : float64
+        Number of pixels of the mosaic that its pixels cover, along both axes.
+    window : (rows, columns) or None
+        Pixels of the window behind each height, if there are heights.
+    """
+    amplitude = finer["amplitude"]
+    shape = [-(-count // 2) for count in amplitude.shape]
+    found = {kind: np.empty(shape, values.dtype) for kind, values in finer.items()}
+    for first in range(0, len(amplitude), _BAND):
+        part = slice(first, first + _BAND)
+        weights = np.multiply.outer(rows[part], columns) * (amplitude[part] != 0)
+        for kind, values in finer.items():
+            mean = _mean(kind, values[part], weights)
+            if kind == "sd_m":
+                assert window is not None  # of the heights with these deviations
+                mean *= deviation_ratio(factor, window) / deviation_ratio(factor // 2, window)
+            found[kind][first // 2 : (first + _BAND) // 2] = mean
     return found
 
 
-def coarser_layers(
-    layers: Mapping[str, NDArray[np.float32]], factor: int, window: tuple[int, int] | None
-) -> dict[str, NDArray[np.float32]]:
-    """Return the layers of the level with a factor from those with half of it."""
-    found = {}
-    for name, values in layers.items():
-        if name == "sd_m":
-            assert window is not None  # of the heights with these deviations
-            less = deviation_ratio(factor, window) / deviation_ratio(factor // 2, window)
-            found[name] = np.float32(less) * np.sqrt(mean_of_four(np.square(values)))
-        else:
-            found[name] = mean_of_four(values)
-    return found
+def _mean(kind: str, values: NDArray, weights: NDArray[np.float64]) -> NDArray:
+    """Return means of 2 x 2 pixels in double precision."""
+    if kind == "pixels":
+        return block_means(values.astype(np.complex128), weights)
+    if kind == "amplitude":
+        return np.sqrt(block_means(np.square(values, dtype=np.float64), weights))
+    double = np.square(values, dtype=np.float64) if kind == "sd_m" else values.astype(np.float64)
+    mean = block_means(double, ~np.isnan(values), empty=np.nan)
+    return np.sqrt(mean) if kind == "sd_m" else mean
 
 
 def deviation_ratio(side: int, window: tuple[int, int]) -> float:
@@ -134,29 +114,7 @@ def _mean_correlation(count: int, window: int) -> float:
     )
 
 
-def mean_of_four(values: NDArray[Real]) -> NDArray[Real]:
-    """Return means of 2 x 2 pixels, of those that are not NaN; NaN if all are."""
-    mean = block_means(values.astype(np.float64), ~np.isnan(values), empty=np.nan)
-    return mean.astype(values.dtype)
-
-
-def coarser(level: Level, rows: NDArray[np.float64], columns: NDArray[np.float64]) -> Level:
-    """Return the next level.
-
-    Parameters
-    ----------
-    level : Level
-        A part of a level that begins at an even pixel along both axes.
-    rows, columns : float64
-        Number of pixels of the mosaic that its pixels cover, along both axes.
-    """
-    weights = np.multiply.outer(rows, columns) * (level.amplitude != 0)
-    power = block_means(np.square(level.amplitude, dtype=np.float64), weights)
-    pixels = block_means(level.pixels.astype(np.complex128), weights)
-    return Level(np.sqrt(power).astype(np.float32), pixels.astype(np.complex64))
-
-
-def _in_db(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
+def decibels(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return amplitudes in dB, NaN where they are zero."""
     level = np.full(amplitude.shape, np.nan, np.float32)
     np.log10(amplitude, out=level, where=amplitude > 0)

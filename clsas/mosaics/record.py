@@ -12,7 +12,7 @@ from typing import Any
 
 from clsas.engine.data import reprs
 from clsas.engine.data.digests import is_intact, with_digest
-from clsas.mosaics.documents import DamageError, read_attributes
+from clsas.mosaics.document import DamageError, read_attributes
 
 PIXELS_CHECKSUM = "pixels_crc32c"
 """Attribute with the checksum of a patch's pixels, or the list of those of its chunks."""

@@ -20,8 +20,7 @@ from clsas.engine.data.grid import Grid, without_heights
 from clsas.interferometry.baseline import Lattice
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.shadows import ReliefPart, Skyline
-from clsas.mosaics.documents import read_document
-from clsas.mosaics.levels import LAYERS, SHADOWED, WINDOW
+from clsas.mosaics.levels import LAYERS, SHADOWED
 from clsas.mosaics.patches import Layout, PatchWindow, Wide
 from clsas.mosaics.record import PatchIndex, Record
 from clsas.mosaics.store import Store
@@ -166,11 +165,11 @@ class _Seabed:
     @classmethod
     def of(cls, store: Store, records: dict[PatchIndex, Record]) -> _Seabed:
         """Return the heights of a store, given the records of patches with heights."""
-        attributes = read_document(store.path)
-        rows, columns = attributes["patch_shape"]
-        down, across = attributes["inputs"]["margin"]
-        layout = Layout(without_heights(store.grid), (rows, columns))
-        return cls(store, layout, Window(*attributes[WINDOW]), (down, across), records)
+        document = store.document
+        assert document.window is not None  # the store has heights
+        down, across = document.inputs["margin"]
+        layout = Layout(without_heights(store.grid), document.patch_shape)
+        return cls(store, layout, Window(*document.window), (down, across), records)
 
     def part(self, index: PatchIndex) -> tuple[ReliefPart, Wide]:
         """Return a patch with heights and its margin, as it was measured."""

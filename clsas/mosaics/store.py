@@ -7,10 +7,12 @@ the disk.
 
 from __future__ import annotations
 
+import importlib
+import math
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any
@@ -19,41 +21,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import reprs, validate
-from clsas.engine.data.digests import grid_digest, with_digest
 from clsas.engine.data.extras import needed
-from clsas.engine.data.grid import Grid
+from clsas.engine.data.grid import Grid, without_heights
 from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.result import Heights
 from clsas.mosaics import stored_heights
-from clsas.mosaics.documents import (
+from clsas.mosaics.document import (
+    GROUP,
+    REPAIR,
     DamageError,
+    Document,
     check_inputs,
     check_place,
     is_there,
-    read_document,
-    write_attributes,
 )
-from clsas.mosaics.levels import (
-    LEVELS,
-    SHADOWED,
-    layers_of,
-    shadowed_of,
-)
-from clsas.mosaics.metadata import GROUP, has_height
+from clsas.mosaics.levels import LEVELS, SHADOWED
 from clsas.mosaics.overview import Reading, reduced, step_of
-from clsas.mosaics.patch_writing import PatchValues, write_patch
 from clsas.mosaics.provenance import OtherInputsError, differences
-from clsas.mosaics.record import (
-    PatchIndex,
-    Record,
-    describe_arrays,
-    describe_damage,
-)
-from clsas.mosaics.stored_arrays import REPAIR, StoredArrays, zarr_arrays
+from clsas.mosaics.record import PatchIndex, Record, describe_arrays, describe_damage
 
 if TYPE_CHECKING:
     import zarr
+
+    from clsas.mosaics.patch_files import PatchFiles
 
 _OVERVIEW = 1024  # pixels along the longer side, which fills a screen
 
@@ -87,7 +78,7 @@ class Store:
         ImportError
             If Zarr is not installed.
         """
-        zarr_arrays()
+        _zarr("patch_files")
         return cls(validate.path("path", path).resolve())
 
     @classmethod
@@ -106,27 +97,36 @@ class Store:
         store = cls.at(path)
         if not store.path.exists():
             raise FileNotFoundError(2, "there is no mosaic", str(path))
-        read_document(store.path)
+        _ = store.document
         return store
+
+    @property
+    def document(self) -> Document:
+        """What the mosaic was made with.
+
+        Raises
+        ------
+        ValueError
+            If the path contains something else, a mosaic of another version, or a damaged one.
+        """
+        return self._files.document
 
     @property
     def patch_shape(self) -> tuple[int, int] | None:
         """Number of pixels of a patch, (rows, columns), or None if there is no mosaic yet."""
         if not is_there(self.path):
             return None
-        rows, columns = read_document(self.path)["patch_shape"]
-        return rows, columns
+        return self.document.patch_shape
 
     @property
     def pixels(self) -> zarr.Array:
         """Pixels on disk, complex64 [rows, columns]. Zarr verifies their checksums on reading."""
-        return self._arrays.pixels
+        return self._files.arrays.opened("pixels")
 
     @property
     def layers(self) -> tuple[str, ...]:
         """Names of the arrays that `read_layer` can read, empty unless the mosaic has heights."""
-        attributes = read_document(self.path)
-        return (*layers_of(attributes), *shadowed_of(attributes))
+        return (*self.document.layers, *self.document.shadowed)
 
     @property
     def levels(self) -> tuple[int, ...]:
@@ -135,10 +135,10 @@ class Store:
         Empty for a mosaic that fits on a screen. Levels that mix patches are missing until a run
         has finished all patches.
         """
-        arrays = list(self._arrays.files.arrays)
-        if self._arrays.of_mosaic and self._is_complete():
-            arrays = [*arrays, *self._arrays.of_mosaic]
-        return tuple(sorted({array.factor for array in arrays} - {1}))
+        levels = self.document.levels
+        if levels.of_mosaic and _zarr("completing").is_current(self._files):
+            return levels.factors
+        return tuple(factor for factor in levels.of_patches if factor > 1)
 
     @property
     def grid(self) -> Grid:
@@ -147,18 +147,16 @@ class Store:
         Raises
         ------
         ValueError
-            If the mosaic has arbitrary points, which are not stored, or if metadata, coordinates
-            or heights are damaged.
+            If the mosaic has arbitrary points, which are not stored, or if heights are damaged.
         """
-        grid, found = self._compared()
+        try:
+            grid = self._files.arrays.grid()
+        except DamageError as error:
+            raise ValueError(f"{self.path} is damaged: height: {error}{REPAIR}") from error
         if grid is None:
             raise ValueError(
                 f"{self.path} is a mosaic of arbitrary points, whose grid is not stored"
             )
-        if found:
-            raise ValueError(f"{self.path} is damaged: {describe_arrays(found)}{REPAIR}")
-        if grid_digest(grid) != read_document(self.path)["inputs"].get("grid"):
-            raise ValueError(f"{self.path} is damaged: its grid differs from what was written")
         return grid
 
     def array_damage(self) -> dict[str, str]:
@@ -177,8 +175,7 @@ class Store:
         ValueError
             If the store's own document is damaged.
         """
-        found = self._compared()[1]
-        return self._level_damage() | found
+        return _zarr("completing").damage(self._files) | self._files.arrays.damage()
 
     def begin(
         self,
@@ -211,7 +208,6 @@ class Store:
         OSError
             If the store cannot be written.
         """
-        arrays = zarr_arrays()
         validate.instance("grid", grid, Grid)
         check_inputs(inputs, grid.shape)
         patch_shape = validate.sides("patch_shape", patch_shape)
@@ -219,20 +215,23 @@ class Store:
             window_shape = validate.sides("window_shape", window_shape)
         check_place(self.path)
         if not is_there(self.path):
-            arrays.create_store(self.path, inputs, grid, patch_shape, window_shape)
-        stored = read_document(self.path)
-        if found := differences(stored, inputs, patch_shape):
+            validate.memory("a patch of pixels", 2 * 8 * math.prod(patch_shape))  # complex64
+            plane = None if grid.points_m is not None else without_heights(grid)
+            has_height = grid.height_m is not None
+            document = Document(inputs, patch_shape, plane, has_height, window_shape, {})
+            _zarr("arrays").StoredArrays.create(self.path, document, grid)
+        if found := differences(self.document, inputs, patch_shape):
             ways = "choose another path or repeat the inputs"
             if not any((self.path / GROUP).glob("*/zarr.json")):
                 ways += ", or delete the store: it has no finished patch"
             raise OtherInputsError(
                 f"{self.path} was made with other inputs: {'; '.join(found)}; {ways}"
             )
-        if repaired := arrays.repair(self.path, grid):
+        if repaired := self._files.arrays.repair(grid):
             validate.warn(
                 f"{self.path} was damaged and has been repaired: {describe_arrays(repaired)}"
             )
-        if damaged := self._level_damage():
+        if damaged := _zarr("completing").damage(self._files):
             # Without their record, the run computes them again when all patches are finished.
             (self.path / LEVELS / "zarr.json").unlink()
             validate.warn(
@@ -249,10 +248,10 @@ class Store:
         TypeError, ValueError
             If `inputs` are not those of a mosaic on the store's grid.
         """
-        attributes = read_document(self.path)
-        check_inputs(inputs, attributes["inputs"]["pixels"])
-        if attributes["inputs"] != inputs:
-            write_attributes(self.path, with_digest(attributes | {"inputs": inputs}))
+        document = self.document
+        check_inputs(inputs, document.shape)
+        if document.inputs != inputs:
+            replace(document, inputs=inputs).write(self.path)
 
     def records(self) -> dict[PatchIndex, Record]:
         """Return the records of all finished patches, by row and column.
@@ -261,10 +260,10 @@ class Store:
         part of the levels. The values themselves are not read; `damage` reads them too.
         """
         found = {}
-        _ = self.pixels  # raises if their metadata are damaged
-        for index in self._arrays.files.indices():
+        files = self._files
+        for index in files.indices():
             try:
-                record = self._arrays.files.record(index)
+                record = files.record(index)
             except DamageError:
                 continue
             if record is not None:
@@ -299,9 +298,8 @@ class Store:
             If a file cannot be read.
         """
         validate.progress(progress)
-        _ = self.pixels  # raises if their metadata are damaged
-        files = self._arrays.files
-        return self._arrays.damage(files.arrays, files.indices(), progress)
+        files = self._files
+        return files.damage(files.indices(), progress=progress)
 
     def write(
         self,
@@ -335,11 +333,7 @@ class Store:
         OSError
             If the disk is full or the store is not writable.
         """
-        _ = self.pixels  # raises if their metadata are damaged
-        patch = PatchValues.checked(
-            self._arrays, (row, column), (rows, columns), pixels, record, layers
-        )
-        write_patch(self._arrays, patch)
+        self._files.write((row, column), (rows, columns), pixels, record, layers)
 
     def complete_levels(self, progress: Callable[[int, int], object] | None = None) -> bool:
         """Compute the levels that mix patches, unless they already are those of the patches.
@@ -364,10 +358,10 @@ class Store:
             If the store cannot be read or written.
         """
         validate.progress(progress)
-        if not self._arrays.of_mosaic or self._is_complete():
+        files, completing = self._files, _zarr("completing")
+        if not files.document.of_mosaic or completing.is_current(files):
             return False
-        digest = self._digest()
-        _completing().complete(self.path, read_document(self.path), digest, self._read, progress)
+        completing.complete(files, progress)
         return True
 
     def read(
@@ -382,7 +376,7 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        return self._read("pixels", rows, columns)
+        return self._files.read("pixels", rows, columns)
 
     def read_layer(
         self,
@@ -423,7 +417,7 @@ class Store:
             if name in SHADOWED:
                 raise ArgumentError("factor", f"be 1 for {name}, which has no levels", str(factor))
             factor = self._checked_factor(factor)
-        return self._read(f"{factor}x/{name}" if factor > 1 else name, rows, columns)
+        return self._files.read(f"{factor}x/{name}" if factor > 1 else name, rows, columns)
 
     def read_level(
         self,
@@ -458,7 +452,7 @@ class Store:
         """
         factor = self._checked_factor(factor)
         validate.flag("coherent", coherent)
-        return self._read(f"{factor}x/{'pixels' if coherent else 'amplitude'}", rows, columns)
+        return self._files.read(f"{factor}x/{'pixels' if coherent else 'amplitude'}", rows, columns)
 
     def image(self, rows: slice = slice(None), columns: slice = slice(None)) -> Image:
         """Return the pixels of a window, by default all, as an image.
@@ -571,7 +565,7 @@ class Store:
         parts = [
             range(count)[validate.selection(name, given, ascending=True)]
             for name, given, count in zip(
-                ("rows", "columns"), (rows, columns), self.pixels.shape, strict=True
+                ("rows", "columns"), (rows, columns), self.document.shape, strict=True
             )
         ]
         part = self.grid.window(rows, columns)
@@ -583,28 +577,23 @@ class Store:
             if all(each.start % factor == 0 for each in parts)
         ]
         step, factor = step_of(part.shape, most, usable)
-        array = self._arrays.named(f"{factor}x/amplitude" if factor > 1 else "pixels")
+        array = f"{factor}x/amplitude" if factor > 1 else "pixels"
 
         def read(*within: slice) -> NDArray[np.complex64] | NDArray[np.float32]:
             chosen = (whole[each] for whole, each in zip(parts, within, strict=True))
-            return self._arrays.read(
+            return self._files.read(
                 array,
                 *(slice(e.start // factor, -(-e.stop // factor), e.step) for e in chosen),
             )
 
-        rows_at_once, columns_at_once = (
-            factor * side for side in self._arrays.files.pixels.patch_shape
-        )
+        rows_at_once, columns_at_once = (factor * side for side in self.document.patch_shape)
         return reduced(part, Reading(read, factor, (rows_at_once, columns_at_once)), step)
-
-    def _read(self, name: str, rows: slice, columns: slice) -> NDArray:
-        return self._arrays.read(self._arrays.named(name), rows, columns)
 
     def _checked_factor(self, factor: int) -> int:
         """Return the factor of a level; raise ValueError if there is none."""
         factor = validate.count("factor", factor)
         if factor not in (found := self.levels):
-            if damaged := self._level_damage():
+            if damaged := _zarr("completing").damage(self._files):
                 raise ValueError(f"{self.path} is damaged: {describe_arrays(damaged)}{REPAIR}")
             known = ", ".join(map(str, found)) or "none"
             raise ArgumentError(
@@ -612,32 +601,22 @@ class Store:
             )
         return factor
 
-    def _compared(self) -> tuple[Grid | None, dict[str, str]]:
-        attributes = read_document(self.path)
-        return zarr_arrays().compared(self.path, attributes, has_height(attributes))
-
-    @cached_property
-    def _arrays(self) -> StoredArrays:
-        """Pixels and levels on disk."""
-        return StoredArrays(self.path)
-
-    def _digest(self) -> str:
-        """Return a digest of the pixels of the finished patches."""
-        return _completing().digest_of_patches(self._arrays.files.recorded())
-
-    def _is_complete(self) -> bool:
-        """Return whether the levels that mix patches are those of the present patches."""
-        return _completing().is_current(self.path, read_document(self.path), self._digest())
-
-    def _level_damage(self) -> dict[str, str]:
-        """Read the levels that mix patches, if they are complete; return those that are damaged."""
-        if not (self.path / LEVELS / "zarr.json").exists():
-            return {}
-        return _completing().damage(self.path, read_document(self.path), self._digest())
+    @property
+    def _files(self) -> PatchFiles:
+        """Files of the patches, opened again if the document has been replaced."""
+        try:
+            stamp = _zarr("patch_files").stamp_of(self.path / "zarr.json")
+        except OSError:  # reading the document raises an error that says what is wrong
+            return _zarr("patch_files").PatchFiles.of(self.path)
+        return _opened(self.path, stamp)
 
 
-def _completing() -> ModuleType:
-    """Return the module that computes levels, which needs Zarr."""
+@lru_cache(maxsize=4)
+def _opened(path: Path, stamp: tuple[int, int, int]) -> PatchFiles:
+    return _zarr("patch_files").PatchFiles.of(path)
+
+
+def _zarr(module: str) -> ModuleType:
+    """Return a module of this package that needs Zarr."""
     with needed("stores of mosaics"):
-        from clsas.mosaics import completing
-    return completing
+        return importlib.import_module(f"clsas.mosaics.{module}")

@@ -16,10 +16,8 @@ from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.refinement import filled
 from clsas.interferometry.result import Heights
-from clsas.mosaics.documents import read_document
-from clsas.mosaics.levels import LAYERS, WINDOW, level_shape
-from clsas.mosaics.means import block_means
-from clsas.mosaics.pyramid import coarser_layers
+from clsas.mosaics.levels import LAYERS, level_shape
+from clsas.mosaics.pyramid import coarser
 
 if TYPE_CHECKING:
     from clsas.mosaics.store import Store
@@ -50,8 +48,9 @@ def window_of(store: Store, rows: slice, columns: slice) -> Heights:
 def sampled(store: Store, per_window: int) -> Heights:
     """Return the heights of some pixels of every window; see `Store.sampled_heights`."""
     check_heights(store)
+    assert store.document.window is not None  # the store has heights
     rows, columns = (
-        slice(None, None, max(side // per_window, 1)) for side in read_document(store.path)[WINDOW]
+        slice(None, None, max(side // per_window, 1)) for side in store.document.window
     )
     return window_of(store, rows, columns)
 
@@ -103,14 +102,14 @@ def _reduced(
     store: Store, finest: int, factor: int, rows: slice, columns: slice
 ) -> dict[str, NDArray[np.float32]]:
     """Return layers and amplitude at a factor, from those of the level with the factor `finest`."""
-    layers = {name: store.read_layer(name, rows, columns, factor=finest) for name in LAYERS}
     read = store.read if finest == 1 else partial(store.read_level, finest)
-    power = np.square(np.abs(read(rows, columns)), dtype=np.float64)
-    window = read_document(store.path)[WINDOW]
+    values = {name: store.read_layer(name, rows, columns, factor=finest) for name in LAYERS}
+    values[_AMPLITUDE] = np.abs(read(rows, columns))
     while finest < factor:
         finest *= 2
-        layers, power = coarser_layers(layers, finest, window), block_means(power, power != 0)
-    return layers | {_AMPLITUDE: np.sqrt(power).astype(np.float32)}
+        down, across = map(np.ones, values[_AMPLITUDE].shape)
+        values = coarser(values, finest, down, across, store.document.window)
+    return values
 
 
 def _heights(
@@ -139,4 +138,4 @@ def _coarser(plane: Grid, factor: int, shape: tuple[int, int]) -> Grid:
 
 
 def _window_m(store: Store) -> float:
-    return float(read_document(store.path)["inputs"]["window_m"])
+    return float(store.document.inputs["window_m"])

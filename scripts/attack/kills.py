@@ -32,8 +32,6 @@ from case import PATCHES, command, write_scene
 
 import clsas
 from clsas import Store
-from clsas.mosaics.documents import read_document
-from clsas.mosaics.levels import patch_arrays
 
 KILLS_PER_STORE = 10
 ORPHANS_S = 60  # after which workers whose main process was killed must have ended
@@ -113,7 +111,7 @@ def check_finished(path: Path, reference: Store) -> int:
         raise Miss(f"damaged: {damage}")
     records = store.records()
     for index in records:
-        for array in patch_arrays(read_document(path)):
+        for array in store.document.of_patches:
             for row, column in array.chunks(index):
                 check_file(path, reference, f"{array.name}/c/{row}/{column}")
     return len(records)

@@ -14,9 +14,9 @@ import numpy as np
 import clsas
 from clsas.engine.data.digests import grid_digest
 from clsas.engine.data.grid import Grid
-from clsas.mosaics import pyramid
 from clsas.mosaics.levels import Levels, levels_of
 from clsas.mosaics.patches import Layout, PatchWindow, patch_shape_of
+from clsas.mosaics.pyramid import pyramid
 from clsas.mosaics.record import Record
 
 SIDE, PATCHES = 20_000, (5, 5)
@@ -68,7 +68,8 @@ def measured(what: str, work: Callable[[], object]) -> Row:
 def computing(window: PatchWindow, factors: tuple[int, ...]) -> Callable[[], object]:
     """Return a function that computes the levels of a patch."""
     pixels = speckle(window)
-    return lambda: pyramid.levels(pixels, factors)
+    finest = {"pixels": pixels, "amplitude": np.abs(pixels)}
+    return lambda: pyramid(finest, factors, None)
 
 
 def writing(path: Path, grid: Grid, windows: list[PatchWindow]) -> Callable[[], object]:

@@ -226,9 +226,7 @@ def kept(tmp_path_factory):
     """A finished store with heights, of 2 x 3 patches."""
     path = tmp_path_factory.mktemp("kept") / "a.zarr"
     grid = replace(GRID, georeference=local(217.0))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("clsas.mosaics.levels.CHUNK_SIDE", 8)  # a patch has several chunks
-        list(clsas.mosaic(LINES, grid, path, **REQUEST))
+    list(clsas.mosaic(LINES, grid, path, **REQUEST))
     return path
 
 

@@ -20,7 +20,7 @@ import clsas
 from clsas.engine.data.digests import grid_digest
 from clsas.engine.data.validate import ClsasWarning
 from clsas.mosaics import pyramid
-from clsas.mosaics.documents import read_document
+from clsas.mosaics.document import Document
 from clsas.mosaics.levels import LAYERS, SHADOWED
 from clsas.mosaics.patches import Layout
 from clsas.mosaics.record import Record
@@ -220,7 +220,7 @@ def test_beams_of_folders_do_not_change_as_they_grow(tmp_path):
     store = clsas.mosaic_heights(
         tmp_path / "lines", None, GRID, tmp_path / "a.zarr", **REQUEST | {"patch_m": 5.0}, beam=beam
     )
-    assert read_document(store.path)["inputs"]["beam"]["track_pings"] == 101
+    assert Document.read(store.path).inputs["beam"]["track_pings"] == 101
     with pytest.raises(ValueError, match="beam must not normalise for a folder that"):
         clsas.mosaic_heights(
             tmp_path / "lines", None, GRID, tmp_path / "b.zarr", **REQUEST,
@@ -465,9 +465,8 @@ def test_deviations_of_levels_are_those_of_means():
     window = 9, 5
     errors = uniform_filter(random.standard_normal((4096, 1024)), window, mode="wrap")
     sd = np.full(errors.shape, errors.std(), np.float32)
-    levels = pyramid.layer_levels(
-        {"height_m": errors.astype(np.float32), "sd_m": sd}, (2, 4, 8, 16, 32), window
-    )
+    finest = {"height_m": errors.astype(np.float32), "sd_m": sd, "amplitude": np.ones_like(sd)}
+    levels = pyramid.pyramid(finest, (2, 4, 8, 16, 32), window)
     for factor in (2, 4, 8, 16, 32):
         level = levels[factor]
         ratio = level["height_m"].std() / np.median(level["sd_m"])

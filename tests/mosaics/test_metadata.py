@@ -72,26 +72,24 @@ def test_any_bit_of_coordinates_and_heights_is_found(path, kept, name):
         (path / name).write_bytes(content)
         store = clsas.Store.opened(path)
         assert list(store.array_damage()) == [name[: name.index("/")]]
-        for read in (store.image, store.overview, lambda store=store: store.grid):
-            with pytest.raises(ValueError, match=r"is damaged.*run `clsas\.mosaic` .* repair it"):
-                read()
+        if name.startswith("height"):  # the axes follow from the document
+            for read in (store.image, store.overview, lambda store=store: store.grid):
+                with pytest.raises(ValueError, match=r"damaged.*run `clsas\.mosaic` .* repair it"):
+                    read()
     assert verified(path, 1)[1]["damaged_arrays"]
 
 
 def test_a_flipped_separator_is_found_and_repaired(path, kept):
-    """Otherwise Zarr would look for chunks under other names, find none and return zeros."""
+    """By it, Zarr would look for chunks under other names, find none and return zeros."""
+    whole = clsas.Store.opened(path).read()
     document = path / "pixels" / "zarr.json"
     text = document.read_text()
     document.write_text(text.replace('"separator": "/"', '"separator": "."'))
     assert document.read_text() != text
-    store = clsas.Store.opened(path)
-    for read in (store.image, store.read, store.overview, store.damage, store.records):
-        with pytest.raises(ValueError, match=r"pixels: its metadata .* chunk_key_encoding"):
-            read()
+    np.testing.assert_array_equal(clsas.Store.opened(path).read(), whole)
     said, found = verified(path, 1)
-    assert "no patch can be compared with its checksum" in said
-    assert "  pixels: its metadata are not those of a mosaic" in said
-    assert found["finished"] is None
+    assert "  pixels: its metadata do not match their digest" in said
+    assert found["finished"] == 6
     check_repaired(path, kept, "pixels")
 
 
@@ -146,28 +144,25 @@ def test_metadata_that_were_changed_elsewhere_are_found(path, kept):
     assert clsas.Store.opened(path).array_damage() == {
         "height": "its metadata do not match their digest"
     }
-    with pytest.raises(ValueError, match="height: its metadata do not match their digest"):
-        clsas.Store.opened(path).read()
     check_repaired(path, kept, "height")
 
 
 def test_a_killed_run_leaves_a_store_that_is_repaired_by_the_next(path, kept, monkeypatch):
-    """Between the removal of the damaged part and the move of the new one to its place."""
+    """Between the removal of the damaged part and the writing of the new one."""
     from clsas.mosaics import arrays
 
     empty(path / "height")
-    exchange = arrays.os.path.lexists
+    remove = shutil.rmtree
 
     def killed(target):
-        exchange(target)
-        Path(target).rename(path.parent / "gone")
+        remove(target)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(arrays.os.path, "lexists", killed)
+        patch.setattr(arrays.shutil, "rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
             clsas.mosaic(LINES, GRID, path, **REQUEST)
-    assert not (path / "height").exists()
+    assert not (path / "height/c").exists()
     check_repaired(path, kept, "height")
 
 
@@ -175,8 +170,7 @@ class TestChunksOfNoPixels:
     def test_in_metadata(self, path, kept):
         grid = {"name": "regular", "configuration": {"chunk_shape": [0, 14]}}
         change_metadata(path, "pixels", chunk_grid=grid)
-        with pytest.raises(ValueError, match=r"a\.zarr is damaged: pixels: .* chunk_grid"):
-            clsas.Store.opened(path).image()
+        assert clsas.Store.opened(path).image().pixels.any()
         assert verified(path, 1)[1]["damaged_arrays"].keys() == {"pixels"}
         check_repaired(path, kept, "pixels")
 

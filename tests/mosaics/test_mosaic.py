@@ -33,7 +33,7 @@ from clsas.engine.device.device import list_devices
 from clsas.engine.factorized import planner
 from clsas.mosaics import scheduling
 from clsas.mosaics.devices import claim_device
-from clsas.mosaics.documents import read_document
+from clsas.mosaics.document import Document
 from clsas.mosaics.forming import Job, open_visibility, stamped_files
 from clsas.mosaics.patches import Layout
 from clsas.mosaics.record import Record
@@ -858,7 +858,7 @@ class TestFollowing:
         later.start()
         list(mosaic)
         later.join()
-        assert len(read_document(path)["inputs"]["parts"]) == 4
+        assert len(Document.read(path).inputs["parts"]) == 4
         assert len(clsas.mosaic(folder, self.GRID, path, **self.REQUEST).finished) == 10
 
     @pytest.mark.slow

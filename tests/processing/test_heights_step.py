@@ -17,7 +17,7 @@ from clsas.cli.processing import _in_words
 from clsas.engine.data.validate import ClsasWarning
 from clsas.files.process_tables import checked_steps
 from clsas.files.scene_files import read_scene
-from clsas.mosaics.documents import read_document
+from clsas.mosaics.document import Document
 from clsas.processing.record import StepRecord
 from clsas.processing.steps import is_mosaic
 
@@ -311,7 +311,7 @@ def test_heights_larger_than_memory_are_a_mosaic(scene):
     assert {path: path.read_bytes() for path in store.path.rglob("*") if path.is_file()} == before
     change(scene, "[-0.5, 0.5]", "[-0.4, 0.5]")
     clsas.process(scene)
-    assert read_document(store.path)["inputs"]["search_m"] == [-0.4, 0.5]
+    assert Document.read(store.path).inputs["search_m"] == [-0.4, 0.5]
     # A store elsewhere that somebody else made is not replaced.
     clsas.mosaic_heights(
         *flat_banks(), grid, scene.parent / "own.zarr", search_m=(-0.3, 0.3), window_m=0.2

@@ -12,7 +12,6 @@ import clsas
 from api_calls.scene import Call, nothing, scene
 from clsas.engine.data.digests import grid_digest
 from clsas.engine.factorized.costs import Costs
-from clsas.mosaics.documents import read_document
 from clsas.mosaics.record import Record
 
 
@@ -30,8 +29,8 @@ def files(folder: Path) -> dict[str, Call]:
     )
     store.image()
     opened = clsas.Store.opened(folder / "store.zarr")
-    document = read_document(opened.path)
-    inputs, patch_shape = document["inputs"], document["patch_shape"]
+    document = opened.document
+    inputs, patch_shape = document.inputs, document.patch_shape
     record = opened.records()[0, 0]
     of_heights = store_of_heights(folder, inputs, record)
     return {

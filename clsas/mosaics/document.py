@@ -1,0 +1,380 @@
+"""The document of a store: what a mosaic was made with, as JSON attributes of its Zarr group.
+
+The records of patches and of levels are such groups, too. All of them have digests.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from clsas.engine.data import validate
+from clsas.engine.data.atomic import make_folders, replacing
+from clsas.engine.data.digests import is_intact, with_digest
+from clsas.engine.data.georeference import Georeference
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.reading import parse_json, read_bytes
+from clsas.engine.data.validate import ArgumentError
+from clsas.mosaics.levels import (
+    IN_DB,
+    LAYERS,
+    SHADOWED,
+    Levels,
+    StoredArray,
+    chunk_side,
+    level_shape,
+    levels_of,
+    multiscales,
+)
+
+FORMAT = "clsas mosaic"
+VERSION = 7
+"""Version of stores. Those of other versions are refused."""
+
+REPAIR = "; run `clsas.mosaic` with the same inputs to repair it"
+"""End of messages about damage."""
+
+GROUP = "patches"
+"""Name of the group that contains the records of patches; it has no attributes of its own."""
+
+PARTS_OF_B = "parts_of_b"
+"""Input with the digests of the second bank's files, if they are not those of the first one."""
+
+_VECTORS = "origin_m", "row_step_m", "column_step_m"
+
+
+class DamageError(ValueError):
+    """A patch or a document of a store differs from what was written."""
+
+
+@dataclass(frozen=True, eq=False)
+class Document:
+    """What a store was made with. All of its arrays follow from this.
+
+    Attributes
+    ----------
+    inputs : dict
+        Inputs of the mosaic, as `clsas.mosaics.provenance.inputs_of` returns them.
+    patch_shape : (rows, columns)
+    plane : Grid or None
+        Grid of the mosaic without heights, or None for arbitrary points.
+    has_height : bool
+        True if the grid has heights.
+    window : (rows, columns) or None
+        Pixels of the window behind each height, for a mosaic of heights.
+    metadata : dict of str to str
+        Digest of the metadata of each array, as they were written.
+    """
+
+    inputs: dict[str, Any]
+    patch_shape: tuple[int, int]
+    plane: Grid | None
+    has_height: bool
+    window: tuple[int, int] | None
+    metadata: dict[str, str]
+
+    @classmethod
+    def read(cls, path: Path) -> Document:
+        """Return the document of the mosaic at a path.
+
+        Raises
+        ------
+        ValueError
+            If the path contains something else, a mosaic of another version, or a damaged one.
+        """
+        try:
+            attributes = read_attributes(path)
+        except (OSError, DamageError) as error:
+            raise ValueError(f"{path} exists and is not a mosaic of clsas") from error
+        if attributes.get("format") != FORMAT:
+            raise ValueError(f"{path} exists and is not a mosaic of clsas")
+        if attributes.get("version") != VERSION:
+            raise ValueError(
+                f"{path} is a mosaic of version {attributes.get('version')}, but this clsas works "
+                f"with version {VERSION}: choose another path"
+            )
+        if not is_intact(attributes):
+            raise ValueError(f"{path} is damaged: its attributes do not match their digest")
+        try:
+            return cls._of(attributes)
+        except (LookupError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{path} is damaged: its attributes are not those of a mosaic"
+            ) from error
+
+    @classmethod
+    def _of(cls, attributes: Mapping[str, Any]) -> Document:
+        inputs, stored, window = attributes["inputs"], attributes["grid"], attributes.get("window")
+        metadata = attributes["metadata"]
+        check_inputs(inputs, None)
+        validate.instance("metadata", metadata, dict)
+        plane = None
+        if stored is not None:
+            place = inputs.get("georeference")
+            georeference = None if place is None else Georeference(**place)
+            vectors = {name: stored[name] for name in _VECTORS}
+            plane = Grid.oriented(
+                **vectors, shape=tuple(inputs["pixels"]), georeference=georeference
+            )
+        return cls(
+            inputs,
+            validate.sides("patch_shape", attributes["patch_shape"]),
+            plane,
+            validate.flag("has_height", attributes["has_height"]),
+            None if window is None else validate.sides("window", window),
+            {name: validate.text(name, each) for name, each in metadata.items()},
+        )
+
+    def write(self, path: Path) -> None:
+        """Write the document, and wait until it is on the disk."""
+        grid = None
+        if self.plane is not None:
+            grid = {name: getattr(self.plane, name).tolist() for name in _VECTORS}
+        attributes = {
+            "format": FORMAT,
+            "version": VERSION,
+            "patch_shape": list(self.patch_shape),
+            "grid": grid,
+            "has_height": self.has_height,
+            "inputs": self.inputs,
+            "metadata": self.metadata,
+        } | ({} if self.window is None else {"window": list(self.window)})
+        write_attributes(path, with_digest(attributes | multiscales(self.levels)))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of pixels, (rows, columns)."""
+        rows, columns = self.inputs["pixels"]
+        return rows, columns
+
+    @cached_property
+    def levels(self) -> Levels:
+        """Factors of the levels."""
+        return levels_of(self.shape, self.patch_shape)
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the layers with levels, empty unless the mosaic has heights."""
+        return () if self.window is None else tuple(LAYERS)
+
+    @property
+    def shadowed(self) -> tuple[str, ...]:
+        """Names of the layers without levels, empty unless the mosaic has heights."""
+        return () if self.window is None else tuple(SHADOWED)
+
+    @property
+    def groups(self) -> list[str]:
+        """Names of the groups: that of the records, and one for each level."""
+        return [GROUP, *(f"{factor}x" for factor in self.levels.factors)]
+
+    @cached_property
+    def of_patches(self) -> tuple[StoredArray, ...]:
+        """Arrays that are written with each patch: the pixels first, layers, levels of patches."""
+        pixels = StoredArray(
+            "pixels", "complex64", self.shape, self._chunks(self.patch_shape, self.shape),
+            self._dimensions, self._map, 1, self.patch_shape,
+        )  # fmt: skip
+        layers = [
+            StoredArray(
+                name, "float32", pixels.shape, pixels.chunk_shape, self._dimensions,
+                _meaning(name), 1, self.patch_shape,
+            )
+            for name in (*self.layers, *self.shadowed)
+        ]  # fmt: skip
+        levels = [each for n in self.levels.of_patches for each in self._level(n)]
+        return (pixels, *layers, *levels)
+
+    @cached_property
+    def of_mosaic(self) -> tuple[StoredArray, ...]:
+        """Arrays of the levels that are computed when all patches are finished."""
+        return tuple(each for n in self.levels.of_mosaic for each in self._level(n))
+
+    @cached_property
+    def coordinates(self) -> tuple[StoredArray, ...]:
+        """Axes of the pixels and of the levels, unless the grid is rotated, and heights."""
+        found = []
+        if self.plane is not None and self.plane.has_axes:
+            factors = self.levels.factors
+            places = [("", 1), *((f"{n}x/", n) for n in factors)]
+            places += [("overview_", n) for n in factors[-1:]]
+            for (prefix, factor), (axis, name) in (
+                (place, axis) for place in places for axis in enumerate("xy")
+            ):
+                dimension = f"overview_{name}" if prefix == "overview_" else name
+                count = (level_shape(self.shape, factor)[1 - axis],)
+                found.append(
+                    StoredArray(
+                        prefix + name, "float64", count, count, (dimension,), {"units": "m"}, factor
+                    )
+                )
+        if self.has_height:
+            chunks = self._chunks(self.shape, self.shape)
+            found.append(
+                StoredArray(
+                    "height", "float64", self.shape, chunks, self._dimensions, {"units": "m"}
+                )
+            )
+        return tuple(found)
+
+    @cached_property
+    def arrays(self) -> dict[str, StoredArray]:
+        """All arrays of the store, by name."""
+        every = (*self.of_patches, *self.of_mosaic, *self.coordinates)
+        return {array.name: array for array in every}
+
+    @property
+    def _dimensions(self) -> tuple[str, ...]:
+        has_axes = self.plane is not None and self.plane.has_axes
+        return ("y", "x") if has_axes else ("row", "column")
+
+    @property
+    def _map(self) -> dict[str, Any]:
+        """Return the map projection in the convention of GDAL, if x and y are easting, northing."""
+        place = None if self.plane is None else self.plane.georeference
+        if self.plane is None or place is None or place.crs is None or not self.plane.has_axes:
+            return {}
+        authority, _, code = place.crs.partition(":")
+        if authority == "EPSG" and code.isdigit():
+            return {"_CRS": {"url": f"http://www.opengis.net/def/crs/EPSG/0/{code}"}}
+        return {"_CRS": {"wkt": place.crs}} if "[" in place.crs else {}
+
+    def _level(self, factor: int) -> list[StoredArray]:
+        """Return the arrays of a level; the factor 1 stands for an array in dB alone."""
+        shape = level_shape(self.shape, factor)
+        patch = self.patch_shape if factor in self.levels.of_patches else self.shape
+        chunks = self._chunks(level_shape(patch, factor), shape)
+        kinds = {"pixels": "complex64", "amplitude": "float32"}
+        kinds |= dict.fromkeys(self.layers, "float32")
+        names = {f"{factor}x/{kind}": data_type for kind, data_type in kinds.items()}
+        if factor == 1:
+            names = {}
+        if factor == self.levels.coarsest:
+            names[IN_DB] = "float32"
+        # Programs such as xarray demand one length of every dimension of a group.
+        overview = tuple(f"overview_{name}" for name in self._dimensions)
+        return [
+            StoredArray(
+                name, data_type, shape, chunks,
+                overview if name == IN_DB and factor > 1 else self._dimensions,
+                _meaning(name.rpartition("/")[2]), factor, self.patch_shape,
+            )
+            for name, data_type in names.items()
+        ]  # fmt: skip
+
+    @staticmethod
+    def _chunks(patch: tuple[int, int], shape: tuple[int, int]) -> tuple[int, int]:
+        rows, columns = map(chunk_side, patch, shape)
+        return rows, columns
+
+
+def _meaning(kind: str) -> dict[str, Any]:
+    """Return unit and meaning of the numbers of a kind of array, as xarray shows them."""
+    known = LAYERS | SHADOWED | {IN_DB: ("dB", "amplitude")}
+    units, meaning = known.get(kind, ("", ""))
+    return {name: each for name, each in (("units", units), ("long_name", meaning)) if each}
+
+
+def read_attributes(folder: Path) -> dict[str, Any]:
+    """Return the attributes of a Zarr group.
+
+    Raises
+    ------
+    DamageError
+        If the group has no valid document.
+    OSError
+        If the document cannot be read.
+    """
+    try:
+        document = parse_json(read_bytes(folder / "zarr.json"))
+        is_group = (document["zarr_format"], document["node_type"]) == (3, "group")
+        attributes = document["attributes"]
+    except (ValueError, LookupError, TypeError) as error:
+        raise DamageError("its record cannot be read") from error
+    if not (is_group and isinstance(attributes, dict)):
+        raise DamageError("its record cannot be read")
+    return attributes
+
+
+def write_attributes(folder: Path, attributes: dict[str, Any]) -> None:
+    """Write a Zarr group with attributes, and wait until it is on the disk."""
+    make_folders(folder)
+    document = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
+    with replacing(folder / "zarr.json") as temporary:
+        temporary.write_text(json.dumps(document, indent=1))
+
+
+def is_there(path: Path) -> bool:
+    """Return whether the path of a store exists and is not an empty folder."""
+    return path.exists() and not (path.is_dir() and not any(path.iterdir()))
+
+
+def check_place(path: Path) -> None:
+    """Check that a path contains a mosaic, or nothing yet and a mosaic can be created there.
+
+    Raises
+    ------
+    ValueError
+        If the path contains something else, or a damaged mosaic.
+    OSError
+        If the path cannot be written.
+    """
+    if is_there(path):
+        Document.read(path)
+    elif not path.parent.is_dir():
+        raise FileNotFoundError(2, "there is no such folder", str(path.parent))
+    try:
+        with tempfile.TemporaryFile(dir=path if path.is_dir() else path.parent):
+            pass
+    except OSError as error:  # it names the temporary file
+        raise type(error)(error.errno, error.strerror, str(path)) from error
+
+
+def check_own(store: Path, folder: Path) -> None:
+    """Raise ValueError if a symbolic link leads a folder of a store to another place.
+
+    Otherwise a store that comes from a stranger could make a run write into any folder of the user.
+    """
+    own = Path(os.path.realpath(store)) / folder.relative_to(store)
+    if Path(os.path.realpath(folder)) != own:
+        raise ValueError(
+            f"{folder} must be a real folder of the store, but a symbolic link leads elsewhere: "
+            "nothing is written through it"
+        )
+
+
+def check_inputs(inputs: Any, shape: Sequence[int] | None) -> None:
+    """Check the inputs of a mosaic.
+
+    Parameters
+    ----------
+    inputs : dict
+        The inputs, as `clsas.mosaics.provenance.inputs_of` returns them.
+    shape : (rows, columns) or None
+        Shape of the grid, which the number of pixels must equal; None for any shape.
+
+    Raises
+    ------
+    TypeError
+        If `inputs` are not a dict.
+    ValueError
+        If the list of parts or the number of pixels is missing or wrong.
+    """
+    validate.instance("inputs", inputs, dict)
+    parts, pixels = inputs.get("parts"), inputs.get("pixels")
+    for name, each in (("parts", parts), (PARTS_OF_B, inputs.get(PARTS_OF_B, []))):
+        if not isinstance(each, list):
+            raise ArgumentError("inputs", f"have a list {name!r}", validate.shown(each))
+    is_shape = (
+        isinstance(pixels, list)
+        and len(pixels) == 2
+        and all(type(side) is int and side > 0 for side in pixels)
+    )
+    if not is_shape or (shape is not None and pixels != list(shape)):
+        expected = "of two numbers" if shape is None else f"{list(shape)}, the shape of the grid"
+        raise ArgumentError("inputs", f"have 'pixels' {expected}", validate.shown(pixels))
