@@ -35,7 +35,7 @@ from .engine.signal.phase_history import from_phase_history as from_phase_histor
 from .engine.signal.replica import Replica as Replica
 from .files.airsas import read_airsas as read_airsas
 from .files.cphd import read_cphd as read_cphd
-from .files.cphd_writing import write_cphd as write_cphd
+from .files.cphd import write_cphd as write_cphd
 from .files.formats import load as load
 from .files.formats import save as save
 from .files.full_matrix import read_full_matrix as read_full_matrix

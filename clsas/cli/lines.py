@@ -19,7 +19,7 @@ from clsas.cli.wording import command
 from clsas.engine.data import validate
 from clsas.engine.data.lines import STATISTICS
 from clsas.engine.signal.compression import check_options
-from clsas.files.cphd_writing import SUFFIXES as CPHD
+from clsas.files.cphd import SUFFIXES as CPHD
 from clsas.files.formats import SUFFIXES
 from clsas.measures.density import noise_penalty_db
 from clsas.simulation.simulator import check_size

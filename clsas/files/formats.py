@@ -8,7 +8,7 @@ import h5py
 
 from clsas.engine.data import reading, validate
 from clsas.engine.data.lines import RangeLines
-from clsas.files import cphd, cphd_writing, hdf5, matlab
+from clsas.files import cphd, hdf5, matlab
 from clsas.files.airsas import is_airsas, read_airsas
 from clsas.files.full_matrix import FIELDS as FULL_MATRIX
 from clsas.files.full_matrix import full_matrix_lines
@@ -17,7 +17,7 @@ from clsas.files.phase_histories import FIELDS as PHASE_HISTORY
 from clsas.files.phase_histories import phase_history_lines
 from clsas.files.positions import checked
 
-SUFFIXES = (*hdf5.SUFFIXES, *cphd_writing.SUFFIXES)
+SUFFIXES = (*hdf5.SUFFIXES, *cphd.SUFFIXES)
 """Suffixes of files that `save` writes."""
 
 
@@ -134,9 +134,9 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     takes as much memory again as the object.
     """
     path = validate.path("path", path)
-    if path.suffix.lower() in cphd_writing.SUFFIXES:
+    if path.suffix.lower() in cphd.SUFFIXES:
         validate.instance("obj", obj, RangeLines)
         assert isinstance(obj, RangeLines)  # for type checkers
-        cphd_writing.write_cphd(path, obj)
+        cphd.write_cphd(path, obj)
     else:
         hdf5.save(path, obj)

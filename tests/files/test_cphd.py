@@ -15,9 +15,8 @@ from clsas import cli
 from clsas.engine.data import validate
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.validate import ClsasWarning
-from clsas.files import cphd, cphd_writing
-from clsas.files.cphd import read_cphd
-from clsas.files.cphd_writing import write_cphd
+from clsas.files import cphd
+from clsas.files.cphd import read_cphd, write_cphd
 from clsas.files.hdf5 import FileFormatError
 
 pytest.importorskip("sarkit", reason="sarkit (extra radar) is not installed")
@@ -187,8 +186,8 @@ def foreign(
     lines = clsas.RangeLines(
         np.ones((pulses, count), complex), 4600.0, 0.25, tx_m, rx_m, 10e9, speed_of_light
     )
-    vectors, _ = cphd_writing._vectors(lines, np.zeros(3))
-    point_m = (vectors["SRPPos"][0] - cphd_writing._EQUATOR_M) @ cphd_writing._AXES.T
+    vectors, _ = cphd._vectors(lines, np.zeros(3))
+    point_m = (vectors["SRPPos"][0] - cphd._EQUATOR_M) @ cphd._AXES.T
     target_m = point_m + [4.0, -6.0, 1.0]
 
     def delay_s(position_m):
@@ -218,7 +217,7 @@ def foreign(
         vectors["TOA1"], vectors["TOA2"] = time[:, 0], time[:, -1]
     vectors["SIGNAL"][5] = 0
     signal[5] = 0
-    tree = cphd_writing._document(sarkit.cphd, lines, vectors, np.zeros(3), domain)
+    tree = cphd._document(sarkit.cphd, lines, vectors, np.zeros(3), domain)
     root = sarkit.cphd.ElementWrapper(tree.getroot())
     root["Global"]["SGN"] = sign
     root["Channel"]["Parameters"][0]["SignalNormal"] = False
@@ -235,7 +234,7 @@ def foreign(
         scale = 0.9 * np.iinfo(dtype["real"]).max
         stored["real"], stored["imag"] = np.rint(scale * signal.real), np.rint(scale * signal.imag)
     with path.open("wb") as file:
-        cphd_writing.write_vectors(sarkit.cphd, file, tree, vectors, stored)
+        cphd.write_vectors(sarkit.cphd, file, tree, vectors, stored)
     return target_m
 
 
@@ -396,7 +395,7 @@ def change_vectors(path, change):
     vectors = np.array(vectors)
     change(vectors)
     with path.open("wb") as file:
-        cphd_writing.write_vectors(sarkit.cphd, file, tree, vectors, signal)
+        cphd.write_vectors(sarkit.cphd, file, tree, vectors, signal)
 
 
 def test_a_signal_beyond_memory_is_refused_unread(tmp_path, monkeypatch):
