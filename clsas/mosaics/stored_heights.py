@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,15 +17,48 @@ from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.refinement import filled
 from clsas.interferometry.result import Heights
+from clsas.mosaics.document import Document
 from clsas.mosaics.levels import LAYERS, level_shape
 from clsas.mosaics.pyramid import coarser
-
-if TYPE_CHECKING:
-    from clsas.mosaics.store import Store
 
 _READ = 2048  # pixels along a side that are read at once; a plain choice
 _AMPLITUDE = "amplitude"
 _BYTES = 100  # per pixel of `Heights`: eight numbers and their copies
+
+
+class Store(Protocol):
+    """What is read of a `clsas.Store`, which has these functions as methods."""
+
+    @property
+    def path(self) -> Path:
+        """Folder of the store."""
+
+    @property
+    def document(self) -> Document:
+        """What the mosaic was made with."""
+
+    @property
+    def grid(self) -> Grid:
+        """Grid of the pixels."""
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the arrays of heights."""
+
+    @property
+    def levels(self) -> tuple[int, ...]:
+        """Factors of the levels."""
+
+    def read(self, rows: slice, columns: slice) -> NDArray[np.complex64]:
+        """Return pixels."""
+
+    def read_layer(
+        self, name: str, rows: slice, columns: slice, *, factor: int = 1
+    ) -> NDArray[np.float32]:
+        """Return a part of a layer, or of its level."""
+
+    def read_level(self, factor: int, rows: slice, columns: slice) -> NDArray[Any]:
+        """Return amplitudes of a level."""
 
 
 def check_heights(store: Store) -> None:
