@@ -81,13 +81,12 @@ class _Target(File):
 )  # fmt: skip
 @click.option(
     "--lines", "lines_path", type=INPUT,
-    help="Range lines of the image, for tags with their carrier and sound speed. A .nitf, and "
-    "complex pixels with --north-up, require them.",
+    help="Range lines of the image, for tags with their carrier and sound speed. A .nitf requires "
+    "them.",
 )  # fmt: skip
 @click.option(
     "--scene", "scene_path", type=INPUT,
-    help="Scene file with the beam that formed the image, for a .nitf, or complex pixels with "
-    "--north-up.",
+    help="Scene file with the beam that formed the image, for a .nitf.",
 )  # fmt: skip
 @options.map_marks
 @options.as_json
@@ -129,7 +128,7 @@ def export(
     if lines_path is not None:
         known["lines"] = (
             load(lines_path, clsas.RangeLines)
-            if _needs_band(output.suffix.lower(), kind, given["north_up"])
+            if output.suffix.lower() in sicd.SUFFIXES  # the samples show their band
             else read_geometry(lines_path)[0]
         )
     if scene_path is not None:
@@ -147,11 +146,6 @@ def export(
         f"{printable(output)}: {size_bytes / 1e6:.3g} MB in {seconds:.2f} s",
         file=output, bytes=size_bytes, seconds=seconds,
     )  # fmt: skip
-
-
-def _needs_band(suffix: str, kind: str | None, north_up: bool) -> bool:
-    """Return whether an export depends on the band of the lines, which their samples show."""
-    return suffix in sicd.SUFFIXES or (kind == "complex" and north_up)
 
 
 def _beam(path: Path) -> clsas.BeamWindow:

@@ -87,8 +87,7 @@ class ExportOptions:
             return _ORIGIN | {"beam"}, suffix
         kind = self.kind or "db"
         used = _ORIGIN | {"kind", "north_up"}
-        of_complex = {"beam"} if self.north_up else set()
-        used |= {"8bit": _COLOURS, "complex": of_complex}.get(kind, {"reference"})
+        used |= {"8bit": _COLOURS, "complex": set()}.get(kind, {"reference"})
         return self._with_pixel_m(used), f"{suffix} with `kind={kind!r}`"
 
     def _used_by_heights(self, suffix: str) -> tuple[set[str], str]:

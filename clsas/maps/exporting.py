@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
@@ -19,10 +19,8 @@ from clsas.engine.factorized.plan import Plan
 from clsas.files.sidecars import remove_sidecars
 from clsas.interferometry.result import Heights
 from clsas.maps import geotiff, map_grids, netcdf, sicd, viewer, world_files
-from clsas.maps.collection import check_lines
 from clsas.maps.export_options import HEIGHT_SUFFIXES, SUFFIXES, ExportOptions
 from clsas.maps.geotiff import Progress
-from clsas.maps.interpolation import check_image
 from clsas.maps.orientation import Orientation
 from clsas.maps.sources import Source
 from clsas.mosaics.store import Store
@@ -94,7 +92,8 @@ def export(
         "inferno", and "viridis" for pictures of heights.
     north_up : bool
         True to resample a GeoTIFF so that its columns run east and its rows south. By default
-        pixels are kept, and the transform of the file states how they are rotated.
+        pixels are kept, and the transform of the file states how they are rotated. Complex pixels
+        cannot be resampled: form the image on the grid of `Georeference.north_up`.
     pixel_m : float, optional
         With `north_up`, the size of the new pixels, metres; by default the distance of the image's.
     georeference : Georeference, optional
@@ -104,11 +103,11 @@ def export(
         become tags of the file, beside the method, beam and device of `Image.formed`. A mosaic
         knows its own.
     lines : RangeLines, optional
-        Range lines of the image. Their carrier and sound speed become tags of the file. SICD, and
-        complex pixels with `north_up`, require them: track and band follow from them.
+        Range lines of the image. Their carrier and sound speed become tags of the file. SICD
+        requires them: track and band follow from them.
     beam : BeamWindow, optional
-        Beam with which the image was formed, for SICD, and for complex pixels with `north_up`.
-        Without it, every line that reaches a pixel contributes to it.
+        Beam with which the image was formed, for SICD. Without it, every line that reaches a pixel
+        contributes to it.
     north_arrow, scale_bar : bool
         True to draw an arrow to the north and a scale bar into a picture.
     progress : callable, optional
@@ -119,10 +118,10 @@ def export(
     TypeError, ValueError
         If an argument has the wrong type, is outside its limits or has no effect on the format; if
         a GeoTIFF has no georeference, its coordinate reference system is unknown, or its grid is
-        vertical or consists of points; if complex pixels are to be resampled, but they are on a
-        height map, are too far apart, or there are no lines; if heights are to become SICD or a
-        folder; if a mosaic is damaged, not finished, or changes meanwhile; or if the environment
-        variable SOURCE_DATE_EPOCH, which replaces the time in the history of netCDF, is no time.
+        vertical or consists of points; if complex pixels would have to be resampled; if heights are
+        to become SICD or a folder; if a mosaic is damaged, not finished, or changes meanwhile; or
+        if the environment variable SOURCE_DATE_EPOCH, which replaces the time in the history of
+        netCDF, is no time.
     FileFormatError
         If the file at `source` does not contain an image or heights.
     ImportError
@@ -158,26 +157,16 @@ def export(
     the plane of the grid, plus z of the plane, plus the height of the origin of a local
     georeference. They count from its vertical datum.
 
-    With `north_up`, power is interpolated bilinearly, and so are heights. Complex pixels are
-    interpolated by a windowed sinc, after their local carrier has been removed. Around a pixel x,
-    an image contains the spatial frequencies K dr/dx, where r is the range of a channel that sees
-    the pixel, and K the two-way phase per metre in the band of the lines. The carrier follows the
-    middle of these frequencies.
-
-    The tag INTERPOLATION_ERROR_DB bounds the rms error relative to the rms of the image. The bound
-    is measured on the spectrum of the image without its carrier. It is twice the power that a
-    spectrum would have which is everywhere as dense as this one close to half the sample rate,
-    along rows plus along columns. Bounds above -40 dB are refused. Pixels within 12 to 48 rows or
-    columns of the border of the image, which is half the length of the sinc, are 0.
+    With `north_up`, power is interpolated bilinearly, and so are heights. Pixels that received
+    nothing, and heights outside the mask, are left out.
 
     Examples
     --------
     >>> import clsas
     >>> clsas.export("image.h5", "image.tif")  # doctest: +SKIP
     >>> clsas.export("heights.h5", "heights.tif", north_up=True)  # doctest: +SKIP
-    >>> clsas.export(
-    ...     "image.h5", "complex.tif", kind="complex", north_up=True, lines=lines, beam=beam
-    ... )  # doctest: +SKIP
+    >>> image = clsas.backproject(lines, place.north_up(grid))  # doctest: +SKIP
+    >>> clsas.export(image, "complex.tif", kind="complex")  # doctest: +SKIP
     >>> clsas.export(clsas.Store.opened("mosaic.zarr"), "mosaic.tif", kind="8bit")  # doctest: +SKIP
     """
     path = validate.path("path", path)
@@ -292,8 +281,6 @@ def _write_geotiff(
         dynamic_range_db=options.dynamic_range_db or DYNAMIC_RANGE_DB,
         reference=options.reference,
         colour_map=options.colour_map or COLOUR_MAP,
-        lines=options.lines,
-        beam=options.beam,
     )
     geotiff.write(path, source, completed, tags, progress)
 
@@ -313,24 +300,31 @@ def _check_map(source: Source, options: ExportOptions) -> None:
     if options.kind == "complex" and geotiff.resamples(
         turned, north_up=options.north_up, pixel_m=options.pixel_m
     ):
-        _check_phase(grid, options.lines)
+        _refuse_phase(grid, options.pixel_m)
     if grid.height_m is not None and options.kind == "8bit":
         validate.warn(
             "8-bit levels leave out the heights of the grid; `kind='db'` has them as second band"
         )
 
 
-def _check_phase(grid: Grid, lines: RangeLines | None) -> None:
-    """Raise an error if complex pixels cannot be resampled."""
-    check_image(grid)
-    if lines is None:
-        raise ArgumentError(
-            "lines",
-            "be given for complex pixels with `north_up`, since the phase between pixels follows "
-            "from them",
-            hint="without them, export the image rotated",
-        )
-    check_lines(lines, grid)
+def _refuse_phase(grid: Grid, pixel_m: float | None) -> NoReturn:
+    """Raise the error for complex pixels that would be resampled: it says what to do instead."""
+    place = grid.georeference
+    assert place is not None  # the caller has checked it
+    hint = "leave `north_up` out; the transform of the file then states how the image is rotated"
+    if grid.is_planar and not any(step_m[2] for step_m in grid.vectors_m[1:]):
+        onto = place.north_up(grid, pixel_m)
+        names = ("origin_m", "row_step_m", "column_step_m")
+        table = [
+            f"{name} = {each.tolist()}" for name, each in zip(names, onto.vectors_m, strict=True)
+        ]
+        hint = (
+            "form the image on `georeference.north_up(grid, pixel_m)`, and export it without "
+            "`north_up`. In a scene file, this grid is\n  "
+        ) + "\n  ".join(["[grid]", *table, f"shape = {list(onto.shape)}"])
+    raise ArgumentError(
+        "kind", "not be complex with `north_up`, since only power can be resampled", hint=hint
+    )
 
 
 def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:

@@ -22,18 +22,11 @@ from numpy.typing import NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.atomic import assembling
-from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.extras import needed
-from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError
-from clsas.maps.agreement import LEAST_AGREEMENT, agreement
 from clsas.maps.bands import Band, bands_of
-from clsas.maps.carrier import Carrier
-from clsas.maps.collection import Collection
 from clsas.maps.encoding import Encoding, colour_table
 from clsas.maps.geotiff_checks import check_space, check_whole, raise_cause
-from clsas.maps.interpolation import InexactError, Interpolation
-from clsas.maps.map_grids import Affine
 from clsas.maps.orientation import Orientation
 from clsas.maps.resampling import Resampling, north_up, steps_m
 from clsas.maps.sources import Source, windows_of
@@ -66,16 +59,13 @@ class Options:
     kind : str
         One of `clsas.maps.encoding.KINDS`. Bands without amplitudes are float32, as those of "db".
     north_up : bool
-        True to resample the image on the axes of the map.
+        True to resample the image on the axes of the map; complex pixels must lie so already.
     pixel_m : float or None
         Size of the pixels then, metres; None for the distance of the image's.
     dynamic_range_db : float
     reference : float or None
         Amplitude of 0 dB; None for 1, or for the largest amplitude if the kind is "8bit".
     colour_map : str
-    lines : RangeLines or None
-    beam : BeamWindow or None
-        Lines and beam of the image, by which complex pixels are resampled.
     """
 
     kind: str
@@ -84,8 +74,6 @@ class Options:
     dynamic_range_db: float
     reference: float | None
     colour_map: str
-    lines: RangeLines | None
-    beam: BeamWindow | None
 
 
 def resamples(turned: Orientation, *, north_up: bool, pixel_m: float | None) -> bool:
@@ -184,7 +172,6 @@ class _Export:
         self._shape, self._affine = self._turned.shape, self._turned.affine
         self._largest = 0.0
         self._steps = _Steps(progress, 4 * source.grid.size)
-        self._more_tags: dict[str, str] = {}
 
     def write(self, path: Path, tags: dict[str, str], colours: dict | None) -> None:
         """Write the file from the passes: read, resample, encode with overviews, and copy."""
@@ -198,7 +185,7 @@ class _Export:
         if reference is None:
             reference = self._largest if self._options.kind == "8bit" and self._largest else 1.0
         encoding = Encoding(self._options.kind, reference, self._options.dynamic_range_db)
-        base = self._levels(first, encoding, tags | self._more_tags, colours)
+        base = self._levels(first, encoding, tags, colours)
         self._copy(base, path)
         check_whole(path)
 
@@ -229,49 +216,20 @@ class _Export:
         shape, affine = north_up(self._shape, self._affine, pixel_m)
         path = self._folder / "north_up.tif"
         with _opened(given) as file:
-            side, values_at = self._resampler(file, affine)
+            resampling = Resampling(self._shape, self._affine, affine)
             self._shape, self._affine = shape, affine
             share = self._source.grid.size / (shape[0] * shape[1])
-            with self._created(path, shape, file.dtypes[0]) as new:
-                for rows, columns in windows_of(shape, (side, side)):
-                    for number in range(1, len(self._bands) + 1):
-                        self._put(new, (rows, columns), values_at(rows, columns, number), number)
+            with self._created(path, shape, np.float32) as new:
+                for rows, columns in windows_of(shape, (_TILE, _TILE)):
+                    for number, band in enumerate(self._bands, 1):
+                        read = partial(_get, file, number)
+                        values = resampling.at(rows, columns, band, read)
+                        self._put(new, (rows, columns), values, number)
                     pixels = (rows.stop - rows.start) * (columns.stop - columns.start)
                     self._steps.add(int(pixels * share))
         check_whole(path)
         given.unlink()
         return path
-
-    def _resampler(
-        self, file: Any, onto: Affine
-    ) -> tuple[int, Callable[[slice, slice, int], NDArray]]:
-        """Return the side of windows of a new raster, and the function that reads a band there."""
-        lines, beam = self._options.lines, self._options.beam
-        if self._options.kind != "complex":
-            resampling = Resampling(self._shape, self._affine, onto)
-            return _TILE, lambda rows, columns, number: resampling.at(
-                rows, columns, self._bands[number - 1], partial(_get, file, number)
-            )
-        assert lines is not None  # the caller has checked it
-        vectors_m = self._turned.vectors_m(self._source.grid)
-        collection = Collection.of(lines, beam)
-        carrier = Carrier.of(collection, self._shape, *vectors_m)
-        read = partial(_get, file, 1)
-        try:
-            interpolation = Interpolation.of(carrier, self._affine, onto, read)
-        except InexactError:
-            agreed = agreement(collection, self._shape, *vectors_m, read)
-            if agreed < LEAST_AGREEMENT:
-                raise ArgumentError(
-                    "lines",
-                    "be those that formed the image, with the same `beam`",
-                    hint="the image's spatial frequencies agree with theirs by "
-                    f"{100 * agreed:.0f} %, where {100 * LEAST_AGREEMENT:.0f} % or more are "
-                    "expected",
-                ) from None
-            raise
-        self._more_tags["INTERPOLATION_ERROR_DB"] = f"{interpolation.error_db:.12g}"
-        return interpolation.side, lambda rows, columns, _: interpolation.at(rows, columns, read)
 
     def _levels(
         self, first: Path, encoding: Encoding, tags: dict[str, str], colours: dict | None

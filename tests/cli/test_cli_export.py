@@ -125,6 +125,28 @@ def test_images_keep_the_place_of_a_scene(folder):
         assert np.abs(image.pixels).max() > 0
 
 
+def test_the_error_of_a_turned_complex_image_states_the_grid_to_form_it_on(folder):
+    place = local(217.0)
+    lines, grid = replace(LINES, georeference=place), replace(PLANE, georeference=place)
+    clsas.save("lines.h5", lines)
+    clsas.save("turned.h5", clsas.backproject(lines, grid))
+    code, output = run("turned.h5", "a.tif", "--as", "complex", "--north-up")
+    assert (code, "--as must not be complex with --north-up" in output) == (1, True), output
+    assert "form the image on a north-up grid with clsas image --scene" in output
+    (folder / "scene.toml").write_text(output[output.index("[grid]") :])
+    arguments = ["image", "lines.h5", "--scene", "scene.toml", "-o", "new.h5", "--exact"]
+    done = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    image = clsas.load("new.h5")
+    expected_m = place.north_up(grid).positions_m()
+    np.testing.assert_array_equal(image.grid.positions_m(), expected_m)
+    for options in ((), ("--north-up",)):  # it lies so already
+        assert run("new.h5", "a.tif", "--as", "complex", *options)[0] == 0
+        with rasterio.open("a.tif") as file:
+            assert file.transform.b == file.transform.d == 0
+            np.testing.assert_array_equal(file.read(1)[::-1], image.pixels)
+
+
 def test_show_draws_the_marks_of_a_map(folder, figures):
     command = ["show", "image.h5", "--north-arrow", "--scale-bar"]
     assert CliRunner().invoke(main, command, catch_exceptions=False).exit_code == 0

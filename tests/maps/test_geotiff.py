@@ -406,6 +406,8 @@ def test_images_without_a_place_on_a_map_are_refused(tmp_path):
         image.pixels, clsas.Grid.points(image.grid.positions_m(), georeference=UTM_NORTH)
     )
     upright = clsas.Grid.oriented([0, 0, 0], [0, 0, 1], [1, 0, 0], (3, 3), georeference=UTM_NORTH)
+    raised = clsas.Image(image.pixels, image.grid.with_height(np.zeros(image.shape)))
+    phase = {"kind": "complex", "north_up": True}
     unknown = clsas.Georeference(crs="EPSG:99999")
     path = tmp_path / "a.tif"
     for source, how, message in (
@@ -416,6 +418,9 @@ def test_images_without_a_place_on_a_map_are_refused(tmp_path):
         (clsas.Image(np.ones((3, 3), complex), upright), {}, "grid must not be vertical"),
         (image, {"kind": "complex", "beam": clsas.BeamWindow(9.0)}, "beam must be left out"),
         (image, {"kind": "complex", "reference": 1.0}, "reference must be left out"),
+        (image, phase, "kind must not be complex with `north_up`, .*: form the image on `geo"),
+        (image, {**phase, "pixel_m": 100.0}, "pixel_m must be at most the longer side of the grid"),
+        (raised, phase, "kind must not be complex .*: leave `north_up` out"),
         (image, {"colour_map": "gray"}, "colour_map must be left out, .* `kind='db'`"),
         (image, {"pixel_m": 1.0}, "pixel_m must be left out, .* without `north_up`"),
         (image, {"north_up": True, "pixel_m": 100.0}, "pixel_m must be at most 16 times"),

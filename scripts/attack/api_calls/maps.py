@@ -24,8 +24,6 @@ def maps(folder: Path) -> dict[str, Call]:
     optional = ("None",)
     text = {"crs": "text", "vertical_datum": "text"}
     clsas.save(folder / "image.h5", s.image)
-    fine = clsas.Grid.plane((-0.12, 0.12, 61), (15.0, 15.24, 61))
-    clsas.save(folder / "fine.h5", clsas.backproject(s.lines, fine, beam=s.beam))
     one = np.ones(s.image.shape)
     relief = clsas.Heights(one, 0.1 * one, 0.9 * one, one > 0, 25 * one, one, s.image, 0.3)
     clsas.save(folder / "heights.h5", relief)
@@ -135,22 +133,6 @@ def maps(folder: Path) -> dict[str, Call]:
                 "pixel_m": 0.2,
                 "georeference": place,
                 "lines": s.lines,
-                "progress": nothing,
-            },
-            accepts=unset | {"source": ("an Image",)},
-        ),
-        "export:complex": Call(
-            clsas.export,
-            {
-                "source": folder / "fine.h5",
-                "path": folder / "complex.tif",
-                "kind": "complex",
-                "north_up": True,
-                "pixel_m": 0.005,
-                "georeference": place,
-                "plan": s.plan,
-                "lines": s.lines,
-                "beam": s.beam,
                 "progress": nothing,
             },
             accepts=unset | {"source": ("an Image",)},
