@@ -48,27 +48,27 @@ class Band:
         """Number of pixels without data."""
         return 0.0 if self.is_amplitude else math.nan
 
-    def summands(self, values: NDArray) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return what is added up for a mean, 0 without data, and which values have data."""
+    def summands(self, values: NDArray) -> NDArray[np.float64]:
+        """Return what a mean adds up, such as power or squared deviations; NaN without data."""
         if self.is_amplitude:
-            return np.abs(values).astype(np.float64) ** 2, values != 0
-        known = ~np.isnan(values)
-        numbers = np.where(known, values.real, 0.0).astype(np.float64)
-        return np.square(numbers) if self.is_deviation else numbers, known
+            return np.where(values != 0, np.abs(values).astype(np.float64) ** 2, math.nan)
+        numbers = values.real.astype(np.float64)
+        return np.square(numbers) if self.is_deviation else numbers
 
-    def mean(
-        self, total: NDArray[np.float64], weight: NDArray, least: float
-    ) -> NDArray[np.float32]:
-        """Return the means of sums of `summands`; no data where the weight is less than `least`."""
-        seen = weight >= least
-        mean = np.divide(total, weight, out=np.full(total.shape, self.no_data), where=seen)
+    def means(self, summands: NDArray[np.float64], count: int, least: float) -> NDArray[np.float32]:
+        """Return means over blocks of `count` x `count`, of `least` or more that have data."""
+        known = ~np.isnan(summands)
+        total = block_sums(np.where(known, summands, 0.0), count, count)
+        weight = block_sums(known.astype(np.uint16), count, count)
+        mean = np.divide(
+            total, weight, out=np.full_like(total, self.no_data), where=weight >= least
+        )
         is_square = self.is_amplitude or self.is_deviation
         return (np.sqrt(mean) if is_square else mean).astype(np.float32)
 
     def halved(self, values: NDArray) -> NDArray[np.float32]:
         """Return the means of 2 x 2 pixels, of those that have data."""
-        summands, known = self.summands(values)
-        return self.mean(block_sums(summands), block_sums(known.astype(np.uint8)), 1)
+        return self.means(self.summands(values), 2, 1)
 
 
 def bands_of(source: Source, kind: str) -> tuple[Band, ...]:

@@ -13,7 +13,6 @@ import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +26,14 @@ from clsas.engine.data.validate import ArgumentError
 from clsas.maps.bands import Band, bands_of
 from clsas.maps.encoding import Encoding, colour_table
 from clsas.maps.geotiff_checks import check_space, check_whole, raise_cause
+from clsas.maps.map_grids import cover
 from clsas.maps.orientation import Orientation
-from clsas.maps.resampling import Resampling, north_up, steps_m
 from clsas.maps.sources import Source, windows_of
 
 SUFFIXES = (".tif", ".tiff")
 """Suffixes of GeoTIFF files."""
 
-_MOST_FINER = 16  # times that new pixels may be smaller than the image's: a plain choice
+_MOST_RATIO = 16  # times that new pixels may be smaller or larger: a plain choice
 _TILE = 512  # side of a tile in pixels, as GDAL and web servers prefer
 _CACHE_MB = 128  # GDAL's cache of tiles: a plain choice; its default is a share of the memory
 _COMPRESSION: dict[str, dict[str, str]] = {
@@ -170,63 +169,91 @@ class _Export:
         shape = source.grid.shape
         self._turned = Orientation.of((shape[0], shape[1]), place.affine(source.grid))
         self._shape, self._affine = self._turned.shape, self._turned.affine
+        self._resamples = resamples(
+            self._turned, north_up=options.north_up, pixel_m=options.pixel_m
+        )
         self._largest = 0.0
         self._steps = _Steps(progress, 4 * source.grid.size)
 
     def write(self, path: Path, tags: dict[str, str], colours: dict | None) -> None:
         """Write the file from the passes: read, resample, encode with overviews, and copy."""
-        is_complex = self._options.kind == "complex"
-        first = self._folder / "first.tif"
-        self._read(first, np.complex64 if is_complex else np.float32)
         how = self._options
-        if resamples(self._turned, north_up=how.north_up, pixel_m=how.pixel_m):
+        first = self._folder / "first.tif"
+        self._read(first)
+        if self._resamples:
             first = self._resampled(first)
-        reference = self._options.reference
+        reference = how.reference
         if reference is None:
-            reference = self._largest if self._options.kind == "8bit" and self._largest else 1.0
-        encoding = Encoding(self._options.kind, reference, self._options.dynamic_range_db)
+            reference = self._largest if how.kind == "8bit" and self._largest else 1.0
+        encoding = Encoding(how.kind, reference, how.dynamic_range_db)
         base = self._levels(first, encoding, tags, colours)
         self._copy(base, path)
         check_whole(path)
 
-    def _read(self, path: Path, dtype: Any) -> None:
-        """Write the numbers of all bands in the order of the raster."""
-        with self._created(path, self._shape, dtype) as file:
+    def _read(self, path: Path) -> None:
+        """Write all bands in the order of the raster; summands of means if it is resampled."""
+        dtype: Any = np.complex64 if self._options.kind == "complex" else np.float32
+        nodata = None
+        if self._resamples:
+            dtype, nodata = np.float64, math.nan
+        with self._created(path, self._shape, dtype, nodata) as file:
             for rows, columns in self._source.windows():
                 window = self._turned.window(rows, columns)
                 for number, band in enumerate(self._bands, 1):
                     values = band.read(rows, columns)
                     if band.is_amplitude:
                         self._largest = max(self._largest, float(np.abs(values).max()))
+                    if self._resamples:
+                        values = band.summands(values)
                     self._put(file, window, self._turned.turned(values), number)
                 self._steps.add(values.size)
         check_whole(path)
 
     def _resampled(self, given: Path) -> Path:
-        """Write the numbers on the axes of the map; return the file."""
-        finest_m = min(steps_m(self._affine))
+        """Write means of summands on the axes of the map; return the file.
+
+        GDAL interpolates bilinearly between pixels that have data. Pixels that are larger than
+        those of the image are means of several such samples.
+        """
+        import rasterio
+        from rasterio.enums import Resampling
+        from rasterio.warp import reproject
+
+        a, b, _, d, e, _ = self._affine
+        finest_m = min(math.hypot(a, d), math.hypot(b, e))
         pixel_m = self._options.pixel_m or finest_m
-        if pixel_m < finest_m / _MOST_FINER:
+        if not finest_m / _MOST_RATIO <= pixel_m <= finest_m * _MOST_RATIO:
             raise ArgumentError(
                 "pixel_m",
-                f"be at least the distance of the pixels over {_MOST_FINER}, "
-                f"{finest_m / _MOST_FINER:g} m",
+                f"be {finest_m / _MOST_RATIO:g} to {finest_m * _MOST_RATIO:g} m, since the pixels "
+                f"of the image are {finest_m:g} m apart",
                 f"{pixel_m:g} m",
             )
-        shape, affine = north_up(self._shape, self._affine, pixel_m)
+        left, bottom, height, width = cover(self._shape, self._affine, pixel_m)
+        west_m, north_m = left * pixel_m, (bottom + height) * pixel_m
+        share = self._source.grid.size / (height * width)
+        self._shape = height, width
+        self._affine = (pixel_m, 0.0, west_m, 0.0, -pixel_m, north_m)
+
         path = self._folder / "north_up.tif"
-        with _opened(given) as file:
-            resampling = Resampling(self._shape, self._affine, affine)
-            self._shape, self._affine = shape, affine
-            share = self._source.grid.size / (shape[0] * shape[1])
-            with self._created(path, shape, np.float32) as new:
-                for rows, columns in windows_of(shape, (_TILE, _TILE)):
-                    for number, band in enumerate(self._bands, 1):
-                        read = partial(_get, file, number)
-                        values = resampling.at(rows, columns, band, read)
-                        self._put(new, (rows, columns), values, number)
-                    pixels = (rows.stop - rows.start) * (columns.stop - columns.start)
-                    self._steps.add(int(pixels * share))
+        count = max(math.ceil(pixel_m / finest_m - 1e-6), 1)  # samples along each side of a pixel
+        step_m = pixel_m / count
+        with _opened(given) as file, self._created(path, self._shape, np.float32) as new:
+            for rows, columns in windows_of(self._shape, (_TILE // count, _TILE // count)):
+                shape = count * (rows.stop - rows.start), count * (columns.stop - columns.start)
+                left_m, top_m = west_m + columns.start * pixel_m, north_m - rows.start * pixel_m
+                affine = rasterio.Affine(step_m, 0.0, left_m, 0.0, -step_m, top_m)
+                for number, band in enumerate(self._bands, 1):
+                    samples = np.full(shape, math.nan)
+                    # Without XSCALE, GDAL blurs pixels by a ratio that it derives from each window.
+                    reproject(
+                        rasterio.band(file, number), samples, dst_crs=file.crs,
+                        dst_transform=affine, dst_nodata=math.nan,
+                        resampling=Resampling.bilinear, XSCALE=1, YSCALE=1,
+                    )  # fmt: skip
+                    means = band.means(samples, count, count**2 / 2)
+                    self._put(new, (rows, columns), means, number)
+                self._steps.add(int(means.size * share))
         check_whole(path)
         given.unlink()
         return path
