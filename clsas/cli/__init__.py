@@ -177,11 +177,18 @@ def _interrupted() -> click.exceptions.Exit:
 
 
 def _showing(others: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that prints warnings of clsas as messages, and others as Python does."""
+    """Return a function that prints warnings of clsas as messages, and others as Python does.
+
+    A command says the same only once, even if it forms many images.
+    """
+    shown = set()
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
         if issubclass(category, clsas.ClsasWarning):
-            click.echo(f"Warning: {_worded(str(message))}", err=True)
+            text = _worded(str(message))
+            if text not in shown:
+                click.echo(f"Warning: {text}", err=True)
+            shown.add(text)
         else:
             others(_printable(str(message)), category, *where, **options)
 
