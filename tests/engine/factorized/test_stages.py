@@ -466,6 +466,15 @@ def test_no_stages_are_plain_backprojection(platform):
     assert relative_error_db(image, exact(straight)) <= -60
 
 
+def test_exact_plans_keep_their_beam(platform):
+    lines, grid = made(straight)
+    beam = BeamWindow(10.0, "hann")
+    chosen = plan(lines, grid, stages=[], beam=beam)
+    image = factorize(lines, grid, chosen, device=platform)
+    reference = backproject(lines, grid, beam=beam, accuracy_db=-70, device=platform)
+    assert relative_error_db(image, reference) <= -60
+
+
 # Physics
 
 
