@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from clsas.engine.data.decibels import in_db, power
+from clsas.engine.data.surface import LEAST_SIDE
 from clsas.engine.device import kernels
 from clsas.engine.device.buffers import padded_length
 from clsas.engine.device.device import Device
@@ -204,7 +205,8 @@ def fastest_plan(
             least_bytes = min(least_bytes, found.memory_bytes)
             rows, columns = found.sides[0]
             smaller = (rows // 2, columns) if rows > columns else (rows, columns // 2)
-            trial = replace(trial, most_root=smaller, division=None)
+            is_least = smaller[0] < LEAST_SIDE[0] or smaller[1] < LEAST_SIDE[1]
+            trial = None if is_least else replace(trial, most_root=smaller, division=None)
         else:
             return Outcome(found, roots.sampled.track, is_off_track=is_off_track)
     return Outcome(least_bytes=least_bytes, is_off_track=is_off_track)

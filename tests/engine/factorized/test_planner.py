@@ -385,6 +385,15 @@ def test_memory_decides_whatever_things_cost(costs, beam):
         plan(lines, grid, memory_bytes=int(0.8 * enough), **request)
 
 
+def test_too_little_memory_for_a_relief_is_refused():
+    """Also where no root of the image is small enough for it."""
+    plane = around(0, 40, shape=(64, 64))
+    grid = plane.with_height(0.05 * np.random.default_rng(1).standard_normal(plane.shape))
+    lines, _ = over(plane)
+    with pytest.raises(ValueError, match=r"memory_bytes must be at least .* MiB"):
+        plan(lines, grid, tolerance_db=-40, costs=EXACT_IS_SLOW, memory_bytes=1 << 18)
+
+
 @pytest.mark.parametrize("kind", ["stages", "one place"])
 def test_plain_backprojection_may_need_too_much_as_well(kind):
     grid = around(0, 40)
