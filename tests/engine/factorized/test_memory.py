@@ -14,6 +14,7 @@ from factorizing import (
 )
 
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.image_error import relative_error_db
 from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.device.buffers import Slot
 from clsas.engine.factorized import candidates, costs
@@ -107,6 +108,17 @@ def test_memory_is_the_sum_of_all_buffers(case):
     roots = min(image.roots_prepared, chosen.stages[0].subimages)
     total += 2 * costs.total_bytes(sizes.tables(roots))
     assert chosen.memory_bytes == total
+
+
+def test_batches_of_roots_make_the_same_image(platform):
+    """In a profile too, where every root has corrections of its own."""
+    lines, grid = refracted_hills()
+    request = {"tolerance_db": -60, "costs": EXACT_IS_SLOW, "device": platform}
+    whole = plan(lines, grid, **request)
+    parted = plan(lines, grid, memory_bytes=int(0.8 * whole.memory_bytes), **request)
+    assert parted.sides == whole.sides
+    images = [factorize(lines, grid, each, device=platform) for each in (parted, whole)]
+    assert relative_error_db(*images) < -110
 
 
 @pytest.mark.slow
