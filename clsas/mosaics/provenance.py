@@ -47,8 +47,11 @@ def differences(
     ones.
     """
     found, stored = [], document.inputs
+    if ("search_m" in stored) != ("search_m" in given):
+        kinds = ("heights", "images") if "search_m" in stored else ("images", "heights")
+        return ["it is a mosaic of {}, not of {}".format(*kinds)]
     if document.patch_shape != patch_shape:
-        shapes = "{} x {} pixels in the store, {} x {} given"
+        shapes = "{} x {} pixels in the store, {} x {} here"
         found.append(f"patches have {shapes.format(*document.patch_shape, *patch_shape)}")
     before, now = (
         [each.get(name, []) for name in ("parts", PARTS_OF_B)] for each in (stored, given)
@@ -66,13 +69,23 @@ def differences(
                 found.append("the grid has another position or other heights")
         elif isinstance(mine, dict) and isinstance(theirs, dict):
             found += [
-                f"`{name}`'s {key} is {mine.get(key)} in the store, {theirs[key]} given"
-                for key in theirs
-                if mine.get(key) != theirs[key]
+                f"`{name}`'s {key} is {_word(mine.get(key))} in the store, {_word(each)} here"
+                for key, each in theirs.items()
+                if mine.get(key) != each
             ]
+        elif name == "pixels" and mine != theirs:
+            shapes = "{} x {} pixels in the store, {} x {} here"
+            found.append(f"the grid has {shapes.format(*stored[name], *theirs)}")
         elif mine != theirs:
-            found.append(f"`{name}` is {mine} in the store, {theirs} given")
+            found.append(f"`{name}` is {_word(mine)} in the store, {_word(theirs)} here")
     return found
+
+
+def _word(value: Any) -> str:
+    """Return an input in words."""
+    if value is None:
+        return "not set"
+    return "set" if isinstance(value, dict) else str(value)
 
 
 def stored_digest(path: Path) -> str:

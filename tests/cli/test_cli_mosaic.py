@@ -242,7 +242,7 @@ def test_options_replace_the_scene(made, tmp_path):
             "--picture must not lie in the store",
         ),
         (["--follow"], 2, "--follow requires --lines with a folder"),
-        (["--tolerance-db", "-30"], 1, "--tolerance-db is -40.0 in the store, -30.0 given"),
+        (["--tolerance-db", "-30"], 1, "--tolerance-db is -40.0 in the store, -30.0 here"),
         (["--tolerance-db", "-300"], 2, "'--tolerance-db': must be"),
         (["--memory-mib", "0"], 2, "--memory-mib"),
         (["--device", "abacus", "-o", "new.zarr"], 1, "'abacus'"),

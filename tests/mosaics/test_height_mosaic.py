@@ -271,7 +271,7 @@ def test_the_default_window_is_kept(tmp_path):
     assert 30 < looks < 70
     again = clsas.mosaic_heights(*flat_banks(), GRID, tmp_path / "a.zarr", **request)
     assert files_of(again.path) == before
-    with pytest.raises(ValueError, match=r"`window_m` is 0.* in the store, 0\.2 given"):
+    with pytest.raises(ValueError, match=r"`window_m` is 0.* in the store, 0\.2 here"):
         clsas.mosaic_heights(*flat_banks(), GRID, store.path, **request, window_m=0.2)
 
 
@@ -596,7 +596,9 @@ class TestBadInput:
         clsas.mosaic_heights(*flat_banks(), GRID, path, **REQUEST)
         with pytest.raises(ValueError, match=r"`least_coherence` is 0\.5 in the store, 0\.6"):
             clsas.mosaic_heights(*flat_banks(), GRID, path, **REQUEST, least_coherence=0.6)
-        with pytest.raises(ValueError, match="made with other inputs"):
+        with pytest.raises(
+            ValueError, match="other inputs: it is a mosaic of heights, not of images"
+        ):
             clsas.mosaic(flat_banks()[0], GRID, path)
 
     @pytest.mark.slow

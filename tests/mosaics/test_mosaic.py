@@ -502,17 +502,17 @@ class TestResuming:
     @pytest.mark.parametrize(
         ("change", "message"),
         [
-            ({"accuracy_db": -60}, "`accuracy_db` is -70 in the store, -60 given"),
+            ({"accuracy_db": -60}, "`accuracy_db` is -70 in the store, -60 here"),
             (
                 {"accuracy_db": None, "tolerance_db": -40},
-                "`tolerance_db` is None in the store, -40 given",
+                "`tolerance_db` is not set in the store, -40 here",
             ),
-            ({"beam": None}, "`beam` is .*width_deg.* in the store, None given"),
-            ({"patches": (2, 2)}, "patches have 30 x 20 pixels in the store, 30 x 40 given"),
+            ({"beam": None}, "`beam` is set in the store, not set here"),
+            ({"patches": (2, 2)}, "patches have 30 x 20 pixels in the store, 30 x 40 here"),
             ({"grid": Grid.plane((-4, 4, 80), (30, 41, 60))}, "the grid has another position"),
             (
                 {"grid": Grid.plane((-4, 4, 40), (30, 40, 60))},
-                r"`pixels` is \[60, 80\] in the store",
+                "the grid has 60 x 80 pixels in the store, 60 x 40 here",
             ),
             ({"lines": LINES.select(slice(1, None))}, "the range lines differ"),
         ],
