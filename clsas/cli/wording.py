@@ -147,7 +147,10 @@ def _running() -> click.Context | None:
 def _worded(code: str, running: click.Context) -> str | None:
     """Return a command's words for an argument, one with its value, a function or a class."""
     options = _options(running)
-    if words := options.get(code) or _WORDS.get(code):
+    if code in options:
+        return options[code]
+    words = _WORDS.get(code, "")
+    if words and not (words.startswith("--") and words not in _typeable(running)):
         return words
     if bank := re.fullmatch(r"lines\.bank\((\w+)\)", code):
         has_bank = any(param.name == "bank" for param in running.command.params)
@@ -157,6 +160,11 @@ def _worded(code: str, running: click.Context) -> str | None:
         return f"{options[name]} {_typed(_evaluated(value))}"
     name, *part = re.split(r"(?=[ \[])", code, maxsplit=1)  # such as "x stop" or "stages[0]"
     return options[name] + "".join(part) if name in options else None
+
+
+def _typeable(running: click.Context) -> set[str]:
+    """Return the options of a command as they are typed."""
+    return {each for param in running.command.params for each in param.opts}
 
 
 def _evaluated(text: str) -> Any:

@@ -136,6 +136,8 @@ def test_every_kind_of_name_is_translated():
     ]:
         assert said(text) == expected
     assert said("use `lines.bank(2)`", options=()) == "use clsas convert --bank 2"
+    assert said("use `Georeference.local`", options=("origin",)) == "use --origin"
+    assert said("use `Georeference.local`") == "use `Georeference.local`"  # no such option
     assert in_options("`search_m`") == "`search_m`"  # no command is running
 
 
