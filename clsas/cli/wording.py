@@ -153,7 +153,7 @@ def _worded(code: str, running: click.Context) -> str | None:
     if words and not (words.startswith("--") and words not in _typeable(running)):
         return words
     if bank := re.fullmatch(r"lines\.bank\((\w+)\)", code):
-        has_bank = any(param.name == "bank" for param in running.command.params)
+        has_bank = "--bank" in _typeable(running)
         return f"{'--bank' if has_bank else 'clsas convert --bank'} {bank[1]}"
     name, value = code.split("=", 1) if "=" in code else (code, "")
     if name in options:

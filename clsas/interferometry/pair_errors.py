@@ -23,6 +23,7 @@ from clsas.interferometry.misregistration import ConstantPhase, constant_phase
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.pair_errors_result import UNKNOWNS, PairErrors
 from clsas.interferometry.result import Heights
+from clsas.navigation.checks import checked_unknowns
 
 _MRAD = 1e-3
 # Deviations by which heights may differ from expected ones without a warning; dunes reach 2.
@@ -158,7 +159,7 @@ def pair_errors(
     >>> print(f"{abs(np.median(right.height_m[right.mask])):.1f} m after")
     0.0 m after
     """
-    unknowns = _checked_unknowns(unknowns)
+    unknowns = checked_unknowns(unknowns, UNKNOWNS)
     tolerance_db = checked_tolerance_db(tolerance_db)
     validate.instance("beam", beam, BeamWindow, type(None))
     known_sd_m = checked_known_sd(known_sd_m)
@@ -215,14 +216,6 @@ def _warn_of_points(comparison: Comparison) -> None:
             f"{np.count_nonzero(~usable)} of {usable.size} `points_m` lie where no height is "
             "valid, and are left out"
         )
-
-
-def _checked_unknowns(unknowns: Sequence[str]) -> tuple[str, ...]:
-    named = validate.named("unknowns", unknowns, UNKNOWNS)
-    if not named or len(set(named)) < len(named):
-        allowed = f"be one or several of {', '.join(UNKNOWNS)}, each once"
-        raise ArgumentError("unknowns", allowed, named or "none")
-    return named
 
 
 def _check_measured(a: RangeLines, b: RangeLines, found: Heights, name: str) -> None:

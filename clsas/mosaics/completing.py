@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from clsas.engine.data.atomic import sync_folder
 from clsas.engine.data.digests import digest, is_intact, with_digest
 from clsas.mosaics.document import DamageError, check_own, read_attributes, write_attributes
-from clsas.mosaics.levels import IN_DB, LAYERS, LEVELS, StoredArray
+from clsas.mosaics.levels import LAYERS, LEVELS, StoredArray
 from clsas.mosaics.patch_files import PatchFiles
-from clsas.mosaics.pyramid import Values, coarser, covered, decibels
+from clsas.mosaics.pyramid import Values, coarser, covered, values_of
 
 _PATCHES = "patches"  # attribute with the digest of the patches
 _CHUNKS = "chunks_crc32c"  # attribute with the checksums of the chunks, by the name of the array
@@ -96,9 +96,7 @@ def complete(files: PatchFiles, progress: Callable[[int, int], object] | None) -
         window = _window(by_factor[factor][0], chunk)
         level = _level(files, factor, window)
         for array in by_factor[factor]:
-            is_db = array.kind == IN_DB
-            values = decibels(level["amplitude"]) if is_db else level[array.kind]
-            files.arrays.write(array.name, window, values)
+            files.arrays.write(array.name, window, values_of(level, array.kind))
         if progress is not None:
             progress(done, len(work))
     chunks = {

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ from clsas.mosaics.document import (
     write_attributes,
 )
 from clsas.mosaics.levels import IN_DB, StoredArray
-from clsas.mosaics.pyramid import decibels, pyramid
+from clsas.mosaics.pyramid import pyramid, values_of
 from clsas.mosaics.record import Checksums, PatchIndex, Record, describe_damage
 
 _Stamp = tuple[int, int, int]
@@ -237,14 +236,9 @@ class PatchFiles:
         with_levels = {name: layers[name] for name in document.layers}
         finest = {"pixels": pixels, "amplitude": np.abs(pixels), **with_levels}
         levels = pyramid(finest, document.levels.of_patches, document.window)
+        levels[1] = finest | layers
         for array in document.of_patches:
-            values: NDArray[Any]
-            if array.kind == IN_DB:
-                values = decibels(levels[array.factor]["amplitude"])
-            elif array.factor > 1:
-                values = levels[array.factor][array.kind]
-            else:
-                values = pixels if array.kind == "pixels" else layers[array.kind]
+            values = values_of(levels[array.factor], array.kind)
             self.arrays.write(array.name, array.window((row, column)), values)
         checksums = {
             array.name: self.arrays.checksums(array, array.chunks((row, column)))

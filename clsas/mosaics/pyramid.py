@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.mosaics.levels import IN_DB
 from clsas.mosaics.means import block_means
 
 Values = dict[str, NDArray[Any]]
@@ -114,7 +115,12 @@ def _mean_correlation(count: int, window: int) -> float:
     )
 
 
-def decibels(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
+def values_of(level: Values, kind: str) -> NDArray[Any]:
+    """Return the values of a level of a kind, which may be `IN_DB`."""
+    return _decibels(level["amplitude"]) if kind == IN_DB else level[kind]
+
+
+def _decibels(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return amplitudes in dB, NaN where they are zero."""
     level = np.full(amplitude.shape, np.nan, np.float32)
     np.log10(amplitude, out=level, where=amplitude > 0)

@@ -169,7 +169,7 @@ def number(
 
 @dataclass(frozen=True)
 class Number:
-    """What a number may be, with its unit and help: declared once, in the type of what takes it.
+    """Limits, unit and help of a number, declared once, in the type of what takes it.
 
     A field of a dataclass, or a parameter of a function, declares
     `Annotated[float, Number("Hz", above=0.0, help="Carrier frequency.")]`. Its checks, and options
@@ -192,7 +192,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Count:
-    """What a whole number may be, as `Number` says of others."""
+    """Limits and help of a whole number; see `Number`."""
 
     least: int = 1
     _: KW_ONLY
@@ -206,7 +206,7 @@ class Count:
 
 @dataclass(frozen=True)
 class Choice:
-    """What a word may be, as `Number` says of numbers."""
+    """Allowed values, and help of their choice; see `Number`."""
 
     allowed: tuple[Any, ...]
     _: KW_ONLY
@@ -219,7 +219,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Flag:
-    """What is true or false, as `Number` says of numbers."""
+    """Help of what is true or false; see `Number`."""
 
     help: str = ""
 
