@@ -55,20 +55,20 @@ def step_bar() -> Iterator[Callable[[str, int, int | None], None] | None]:
 
 
 def report(as_json: bool, text: str, **results: Any) -> None:
-    """Print results as JSON or as text."""
+    """Print results as JSON, or as text in the words of the command line."""
     if as_json:
         print_json(results)
     else:
-        say(text)
+        say(in_options(text))
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Print a text in the words of the command line, escaped; to standard error if `err`.
+    """Print a text with control characters escaped; to standard error if `err`.
 
     Pass names of files, and words read from them, through `printable` first: otherwise their line
     breaks could look like messages of clsas.
     """
-    click.echo(validate.escaped(in_options(text)), err=err)
+    click.echo(validate.escaped(text), err=err)
 
 
 def printable(name: object) -> str:
@@ -78,7 +78,7 @@ def printable(name: object) -> str:
 
 def warn(message: str) -> None:
     """Print a warning."""
-    say(f"Warning: {printable(message)}", err=True)
+    say(f"Warning: {printable(in_options(message))}", err=True)
 
 
 def print_json(results: Any, indent: int | None = 2) -> None:
