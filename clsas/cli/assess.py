@@ -32,19 +32,18 @@ _HDF5 = b"\x89HDF"
 @options.method
 @options.beam
 @options.device
-@click.option(
-    "--repeats", type=click.IntRange(0), default=0, show_default=True,
-    help="Also time the image with and without each effect, in this many runs.",
-)  # fmt: skip
+@options.of(clsas.assess, "repeats", into="timed")
 @options.as_json
 def assess(
     file: Path,
-    bank: int | None,
+    of_bank: dict[str, Any],
     scene: Path | None,
+    axes: dict[str, Any],
+    request: dict[str, Any],
+    beam: dict[str, Any],
     device: str | None,
-    repeats: int,
+    timed: dict[str, Any],
     as_json: bool,
-    **given: Any,
 ) -> None:
     """Show which effects an image needs, and what each costs.
 
@@ -67,20 +66,20 @@ def assess(
                 f"--scene requires LINES.H5, but {file} is a scene: give one of them"
             )
         scene = file
-    described, grid = read_grid(scene, given)
+    described, grid = read_grid(scene, axes)
     simulate = described.simulate
     known: dict[str, Any] = {}
     if is_lines:
-        lines = load_lines(file, bank, described)
+        lines = load_lines(file, described, **of_bank)
         sonar, track = described.sonar, described.track
         if sonar is not None and sonar.banks > 1 and lines.banks == 1:
-            sonar = sonar.bank(bank or 0)
+            sonar = sonar.bank(of_bank.get("number", 0))
         # A scene that describes another survey than the lines provides only grid and beam.
         if sonar and track and sonar.receivers * track.pings == lines.channels:
             known = {"sonar": sonar, "track": track}
     else:
         sonar, track = described.need("sonar", "track")
-        sonar = sonar.bank(bank or 0)
+        sonar = sonar.bank(of_bank.get("number", 0))
         survey = {
             name: simulate[name]
             for name in ("motion_in_flight", "phase_centres", "sound_speed")
@@ -97,10 +96,10 @@ def assess(
     found = clsas.assess(
         lines,
         grid,
-        beam=read_beam(described, given),
-        tolerance_db=_tolerance_db(read_request(described, given)),
+        beam=read_beam(described, beam),
+        tolerance_db=_tolerance_db(read_request(described, request)),
         device=device,
-        repeats=repeats,
+        **timed,
         **known,
     )
     report(

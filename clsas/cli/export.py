@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +10,14 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, read_levels, read_plan, read_scene
+from clsas.cli.inputs import check_levels, load, read_plan, read_scene
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT, ORIGIN, File, Output, keep_out
 from clsas.cli.view import Folder, size_of
 from clsas.cli.wording import command
-from clsas.engine.data import validate
 from clsas.files.hdf5 import read_geometry
 from clsas.maps import sicd
-from clsas.maps.encoding import KINDS
-from clsas.maps.export_options import SUFFIXES
+from clsas.maps.export_options import SUFFIXES, ExportOptions
 from clsas.maps.exporting import check_name
 
 
@@ -42,36 +39,17 @@ class _Target(File):
 @command()
 @click.argument("source", metavar="INPUT", type=File(exists=True))
 @click.argument("output", metavar="OUTPUT", type=_Target())
-@click.option(
-    "--as", "kind", type=click.Choice(KINDS),
-    help="Pixels of a GeoTIFF of an image: amplitude in dB, complex numbers, or 8-bit levels with "
-    "colours. [default: db]",
-)  # fmt: skip
+@options.of(ExportOptions, "kind", into="how", called={"kind": ("--as",)})
 @options.dynamic_range
-@click.option(
-    "--reference", type=float,
-    callback=options.checked(partial(validate.positive, "reference")),
-    help="Amplitude of 0 dB. [default: 1 for db, otherwise the largest]",
-)  # fmt: skip
+@options.of(ExportOptions, "reference", into="how")
 @options.colour_map
-@click.option(
-    "--north-up", is_flag=True,
-    help="Resample a GeoTIFF so that its rows run east. Without it, its transform is rotated.",
-)  # fmt: skip
-@click.option(
-    "--pixel-m", type=float,
-    callback=options.checked(partial(validate.positive, "pixel_m", unit="m")),
-    help="With --north-up, size of the pixels (m). [default: the distance of those of INPUT]",
-)  # fmt: skip
+@options.of(ExportOptions, "north_up", into="how")
+@options.of(ExportOptions, "pixel_m", into="how", beside="--north-up")
 @click.option(
     "--origin", type=ORIGIN,
-    help="Latitude and longitude (degrees) of the origin, and its height (m), if INPUT has no "
-    "georeference.",
+    help="Position of the origin, if INPUT has no georeference, as LATITUDE,LONGITUDE[,HEIGHT].",
 )  # fmt: skip
-@click.option(
-    "--heading-deg", type=float,
-    help="With --origin, heading of the x axis, clockwise from true north (degrees).",
-)  # fmt: skip
+@options.of(clsas.Georeference.local, "heading_deg", into="heading", beside="--origin")
 @click.option(
     "--crs", help="Or map projection in which x is easting and y northing, such as EPSG:32632."
 )
@@ -93,18 +71,16 @@ class _Target(File):
 def export(
     source: Path,
     output: Path,
-    kind: str | None,
-    dynamic_range_db: float | None,
-    reference: float | None,
-    colour_map: str | None,
+    how: dict[str, Any],
+    levels: dict[str, Any],
     origin: tuple[float, ...] | None,
-    heading_deg: float | None,
+    heading: dict[str, Any],
     crs: str | None,
     plan_path: Path | None,
     lines_path: Path | None,
     scene_path: Path | None,
+    marks: dict[str, Any],
     as_json: bool,
-    **given: Any,
 ) -> None:
     """Write an image or heights as a map, a picture or a web page.
 
@@ -118,8 +94,8 @@ def export(
     \b
     Example:  clsas export mosaic.zarr mosaic.tif --as 8bit
     """
-    levels = read_levels(dynamic_range_db, None, colour_map)
-    place = _georeference(origin, heading_deg, crs)
+    check_levels(levels)
+    place = _georeference(origin, heading, crs)
     if source.is_dir():
         keep_out("OUTPUT", output, "the store", source)
     known: dict[str, Any] = {}
@@ -136,8 +112,8 @@ def export(
     start = time.perf_counter()
     with progress_bar("exporting") as progress:
         clsas.export(
-            source, output, kind=kind, reference=reference, georeference=place, progress=progress,
-            **levels, **given, **known,
+            source, output, **how, **levels, **marks, **known, georeference=place,
+            progress=progress,
         )  # fmt: skip
     seconds = time.perf_counter() - start
     size_bytes = size_of(output) if output.is_dir() else output.stat().st_size
@@ -157,15 +133,13 @@ def _beam(path: Path) -> clsas.BeamWindow:
 
 
 def _georeference(
-    origin: tuple[float, ...] | None, heading_deg: float | None, crs: str | None
+    origin: tuple[float, ...] | None, heading: dict[str, Any], crs: str | None
 ) -> clsas.Georeference | None:
     """Return the georeference of the options, or None."""
     if crs is not None:
-        if origin is not None or heading_deg is not None:
+        if origin is not None or heading:
             raise click.UsageError("--crs excludes --origin and --heading-deg")
         return clsas.Georeference.projected(crs)
-    if (origin is None) != (heading_deg is None):
+    if (origin is None) != (not heading):
         raise click.UsageError("--origin and --heading-deg must be given together")
-    if origin is None or heading_deg is None:
-        return None
-    return clsas.Georeference.local(*origin, heading_deg=heading_deg)
+    return None if origin is None else clsas.Georeference.local(*origin, **heading)

@@ -2,37 +2,25 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 import clsas
 from clsas.cli import options
 from clsas.cli.inputs import load_banks, load_lines, read_beam, read_grid
-from clsas.cli.mosaics import described_flags
-from clsas.cli.outputs import printable, progress_bar, report
-from clsas.cli.parameters import INPUT, File, Output, Parsed, Store, keep_out
+from clsas.cli.outputs import described_flags, printable, progress_bar, report
+from clsas.cli.parameters import INPUT, File, Output, Store, keep_out
 from clsas.cli.wording import command
-from clsas.engine.data import validate
 from clsas.files.hdf5 import SUFFIXES
 from clsas.files.height_files import read_heights
 from clsas.files.scene_files import SceneFile
-from clsas.interferometry.checks import checked_coherence
-from clsas.interferometry.heights import LEAST_COHERENCE
+from clsas.files.scene_tables import HeightsTable
 from clsas.processing import numbers
 
 STORE_SUFFIX = ".zarr"
 """Suffix of the stores of mosaics."""
-
-
-def _heights(text: str) -> tuple[float, float]:
-    low, high = map(float, text.split(":"))
-    if not (np.isfinite([low, high]).all() and low < high):
-        raise ValueError
-    return low, high
 
 
 class _Target(File):
@@ -47,9 +35,6 @@ class _Target(File):
         return kind.convert(value, param, ctx)
 
 
-_SEARCH = Parsed("LOW:HIGH", _heights, "LOW:HIGH, two ascending heights in metres, such as -1:2")
-
-
 @command()
 @click.argument("first_file", metavar="LINES.H5", type=INPUT)
 @click.argument("second_file", metavar="[B.H5]", type=INPUT, required=False)
@@ -61,39 +46,16 @@ _SEARCH = Parsed("LOW:HIGH", _heights, "LOW:HIGH, two ascending heights in metre
     help="Heights to write: an HDF5 file, or a Zarr store that is measured patch by patch.",
 )
 @options.grid
-@click.option(
-    "--search-m",
-    type=_SEARCH,
-    required=True,
-    help="Heights above the grid between which the seabed lies (m).",
-)
+@options.of(clsas.heights, "search_m", into="request", required=True)
 @click.option(
     "--relief",
     type=INPUT,
-    help="Heights of the pixels above the plane (CSV or .npy, m), such as a coarse bathymetry. "
-    "--search-m then counts from this relief.",
+    help="CSV or .npy file of the pixels' heights above the plane in metres, such as a coarse "
+    "bathymetry. --search-m then counts from this relief.",
 )
-@click.option(
-    "--window-m",
-    type=float,
-    callback=options.checked(partial(validate.positive, "window_m", unit="m")),
-    help="Side of the windows, the resolution of the heights (m). [default: that of about 50 "
-    "independent samples]",
-)
-@options.tolerance_of_images
-@click.option(
-    "--least-coherence",
-    type=float,
-    default=LEAST_COHERENCE,
-    show_default=True,
-    callback=options.checked(checked_coherence),
-    help="Smallest coherence of a valid height.",
-)
-@click.option(
-    "--patch-m",
-    type=float,
-    callback=options.checked(partial(validate.positive, "patch_m", unit="m")),
-    help="Approximate side of the patches of a .zarr (m). [default: 1024 pixels]",
+@options.of(clsas.heights, "window_m", "tolerance_db", "least_coherence", into="request")
+@options.of(
+    HeightsTable, "patch_m", into="of_mosaic", beside=f"an output that ends in {STORE_SUFFIX}"
 )
 @options.beam
 @options.device
@@ -103,15 +65,13 @@ def heights(
     second_file: Path | None,
     output: Path,
     scene: Path | None,
-    search_m: tuple[float, float],
+    axes: dict[str, Any],
+    request: dict[str, Any],
     relief: Path | None,
-    window_m: float | None,
-    tolerance_db: float,
-    least_coherence: float,
-    patch_m: float | None,
+    of_mosaic: dict[str, Any],
+    beam: dict[str, Any],
     device: str | None,
     as_json: bool,
-    **given: Any,
 ) -> None:
     """Measure the heights of a seabed from two receiver banks.
 
@@ -128,16 +88,12 @@ def heights(
     Example:  clsas heights lines.h5 --x -2:2:201 --y 30:34:201 --search-m -1:1 -o heights.h5
     """
     is_mosaic = output.suffix.lower() == STORE_SUFFIX
-    if patch_m is not None and not is_mosaic:
+    if of_mosaic and not is_mosaic:
         raise click.UsageError(f"--patch-m requires an output that ends in {STORE_SUFFIX}")
-    described, grid = read_grid(scene, given, memory=not is_mosaic)
+    described, grid = read_grid(scene, axes, memory=not is_mosaic)
     if relief is not None:
         grid = _raised(grid, relief)
-    beam = read_beam(described, given)
-    request: dict[str, Any] = {
-        "search_m": search_m, "window_m": window_m, "tolerance_db": tolerance_db,
-        "least_coherence": least_coherence, "beam": beam, "device": device,
-    }  # fmt: skip
+    request |= {"beam": read_beam(described, beam), "device": device}
     if is_mosaic:
         keep_out("LINES.H5", first_file, "the store", output)
         # Lines are read in slices, unless they get the sound speed of the scene.
@@ -147,7 +103,7 @@ def heights(
             a, b = _both_banks(first_file, second_file, described)
         with progress_bar("measuring heights") as progress:
             store = clsas.mosaic_heights(
-                a, b, grid, output, **request, patch_m=patch_m, progress=progress
+                a, b, grid, output, **request, **of_mosaic, progress=progress
             )
         _report_store(store, output, as_json)
         return
@@ -171,7 +127,7 @@ def _both_banks(
 ) -> tuple[clsas.RangeLines, clsas.RangeLines]:
     """Return the range lines of both banks, from one file or from two."""
     if second_file is not None:
-        first, second = (load_lines(each, None, described) for each in (first_file, second_file))
+        first, second = (load_lines(each, described) for each in (first_file, second_file))
         return first, second
     remedy = "give the lines of the other bank as a second file"
     lines, both = load_banks(first_file, described, remedy)

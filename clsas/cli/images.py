@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +15,16 @@ import clsas
 from clsas.cli import options
 from clsas.cli.inputs import (
     DEFAULT_REQUEST,
+    check_levels,
     load_lines,
     read_beam,
     read_grid,
-    read_levels,
     read_request,
     warn_of_sampling,
 )
 from clsas.cli.outputs import printable, progress_bar, report, say, warn
 from clsas.cli.parameters import HDF5
 from clsas.cli.wording import command
-from clsas.engine.data import validate
 from clsas.engine.data.image import Formed
 from clsas.engine.device.device import Device, KernelTimes, open_device
 from clsas.engine.exact.decide import ACCURACY_DB
@@ -34,7 +32,6 @@ from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import WORST_TOLERANCE_DB
 from clsas.engine.forming import SceneImager, scene_of_plan
 from clsas.engine.scene import Scene
-from clsas.engine.signal.interpolation import MOST_UPSAMPLING, TAPS
 from clsas.files.scene_tables import PLAN_KEYS
 from clsas.measures.tradeoff import summary
 
@@ -50,25 +47,7 @@ _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is 
 @click.option(
     "--exact", is_flag=True, help="Form an exact image. The three options below imply this one."
 )
-@click.option(
-    "--accuracy-db",
-    type=float,
-    callback=options.check_accuracy_db,
-    help="Relative rms error of the exact image (dB). [default: -60]",
-)
-@click.option(
-    "--taps",
-    type=int,
-    callback=options.checked(partial(validate.one_of, "taps", allowed=TAPS)),
-    help="Number of taps of the interpolator: 2, 4, 6 or 8. [default: the fastest]",
-)
-@click.option(
-    "--upsampling", type=float,
-    callback=options.checked(
-        partial(validate.number, "upsampling", least=1.0, most=MOST_UPSAMPLING)
-    ),
-    help="Factor by which lines are upsampled before interpolation. [default: the fastest]",
-)  # fmt: skip
+@options.exactly
 @options.beam
 @options.device
 @options.picture("the image in dB")
@@ -79,17 +58,17 @@ _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is 
 def image(
     lines_file: Path,
     output: Path,
-    bank: int | None,
+    of_bank: dict[str, Any],
     scene: Path | None,
+    axes: dict[str, Any],
+    request: dict[str, Any],
     exact: bool,
+    beam: dict[str, Any],
     device: str | None,
     picture: Path | None,
-    dynamic_range_db: float | None,
-    percentiles: tuple[float, float] | None,
-    colour_map: str | None,
+    levels: dict[str, Any],
     profile: bool,
     as_json: bool,
-    **given: Any,
 ) -> None:
     """Form an image of range lines, to a tolerance or exactly.
 
@@ -101,19 +80,19 @@ def image(
     \b
     Example:  clsas image lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 -o image.h5 --picture image.png
     """
-    levels = read_levels(dynamic_range_db, percentiles, colour_map)
-    described, grid = read_grid(scene, given)
-    request = read_request(described, given, exact)
-    beam = read_beam(described, given)
+    check_levels(levels)
+    described, grid = read_grid(scene, axes)
+    request = read_request(described, request, exact)
+    window = read_beam(described, beam)
     # `clsas simulate` has already warned about the scene's own grid.
     if described.targets is None or grid is not described.grid:
         warn_of_sampling(described, grid)
-    lines = load_lines(lines_file, bank, described)
+    lines = load_lines(lines_file, described, **of_bank)
     opened = open_device(device)
     chosen, planned_s = None, None
     if request.keys() & set(PLAN_KEYS):
         start = time.perf_counter()
-        chosen = clsas.plan(lines, grid, **request, beam=beam, device=opened)
+        chosen = clsas.plan(lines, grid, **request, beam=window, device=opened)
         planned_s = time.perf_counter() - start
         _warn_of_error(chosen)
     profiling: AbstractContextManager[dict[str, KernelTimes]] = nullcontext({})
@@ -122,7 +101,7 @@ def image(
     with progress_bar("imaging") as progress, profiling as kernels:
         built_before_s, start = opened.build_seconds, time.perf_counter()
         if chosen is None or chosen.is_exact:
-            formed = _exactly(lines, grid, beam, opened, request, chosen, progress)
+            formed = _exactly(lines, grid, window, opened, request, chosen, progress)
         else:
             formed = _factorized(lines, grid, opened, chosen, progress)
         seconds = time.perf_counter() - start
@@ -266,12 +245,14 @@ def _table(kernels: dict[str, KernelTimes]) -> str:
 )  # fmt: skip
 def plan(
     lines_file: Path,
-    bank: int | None,
+    of_bank: dict[str, Any],
     scene: Path | None,
+    axes: dict[str, Any],
+    request: dict[str, Any],
+    beam: dict[str, Any],
     device: str | None,
     as_json: bool,
     filters: bool,
-    **given: Any,
 ) -> None:
     """Show how an image would be formed, its time and its error.
 
@@ -284,13 +265,13 @@ def plan(
     """
     if filters and not as_json:
         raise click.UsageError("--filters requires --json")
-    described, grid = read_grid(scene, given)
-    request = read_request(described, given)
-    beam = read_beam(described, given)
-    lines = load_lines(lines_file, bank, described)
+    described, grid = read_grid(scene, axes)
+    request = read_request(described, request)
+    window = read_beam(described, beam)
+    lines = load_lines(lines_file, described, **of_bank)
     if not request.keys() & set(PLAN_KEYS):
         request = DEFAULT_REQUEST
-    chosen = clsas.plan(lines, grid, **request, beam=beam, device=device)
+    chosen = clsas.plan(lines, grid, **request, beam=window, device=device)
     _warn_of_error(chosen)
     say(chosen.to_json(filters=filters) if as_json else chosen.describe())
 

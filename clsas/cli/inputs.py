@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 import clsas
+from clsas.cli.options import option_of
 from clsas.cli.outputs import warn
 from clsas.cli.parameters import keep_apart, need_matplotlib, written_to
 from clsas.cli.wording import error_message
@@ -48,19 +49,19 @@ def load_heights(path: Path) -> clsas.Heights:
 
 
 def load_lines(
-    path: Path, bank: int | None, described: SceneFile | None = None
+    path: Path, described: SceneFile | None = None, *, number: int | None = None
 ) -> clsas.RangeLines:
-    """Return the range lines of a file, or those of one of their receiver banks.
+    """Return the range lines of a file, or those of the receiver bank with a number.
 
     They get the sound speed of the scene unless they have their own.
     """
     lines: clsas.RangeLines = load(path, clsas.RangeLines)
     if described and described.sound_speed is not None and lines.sound_speed is None:
         lines = replace(lines, sound_speed=described.sound_speed)
-    if bank is None:
+    if number is None:
         return lines
     try:
-        return lines.bank(bank)
+        return lines.bank(number)
     except ArgumentError as error:
         error.add_note(str(path))
         raise
@@ -73,7 +74,7 @@ def load_banks(
 
     If there is only one, the error ends with the `remedy`, if any.
     """
-    lines = load_lines(path, None, described)
+    lines = load_lines(path, described)
     try:
         return lines, first_two_banks(lines.bank_numbers)
     except ArgumentError as error:
@@ -102,24 +103,23 @@ def read_scene(path: Path) -> SceneFile:
 
 
 def read_grid(
-    scene: Path | None, given: dict[str, Any], memory: bool = True
+    scene: Path | None, axes: dict[str, Any], memory: bool = True
 ) -> tuple[SceneFile, clsas.Grid]:
     """Return the scene, empty if there is none, and the grid of the options or of the scene.
 
     If `memory`, raise ValueError if an image on the grid does not fit into memory.
     """
-    x, y, z = (given[name] for name in ("x", "y", "z"))
-    if (x is None) != (y is None) or (z is not None and x is None):
+    if axes and not {"x", "y"} <= axes.keys():
         raise click.UsageError("--x and --y must be given together; --z requires them")
-    if scene is None and x is None:
+    if scene is None and not axes:
         raise click.UsageError("no grid given: use --scene, or --x and --y")
     described = read_scene(scene) if scene is not None else SceneFile(name="")
-    if x and y:
-        grid = clsas.Grid.plane(x, y, z or 0.0, georeference=described.georeference)
+    if axes:
+        grid = clsas.Grid.plane(**axes, georeference=described.georeference)
     else:
         (grid,) = described.need("grid")
     if memory:
-        validate.memory("--x and --y" if x else "[grid]", 8 * grid.size)
+        validate.memory("--x and --y" if axes else "[grid]", 8 * grid.size)
     return described, grid
 
 
@@ -130,18 +130,17 @@ def read_request(
 
     It has one of `PLAN_KEYS`; or, for an exact image, some or none of `EXACT_KEYS`.
     """
-    planned, exactly = (
-        {name: given[name] for name in names if given.get(name) is not None}
-        for names in (PLAN_KEYS, EXACT_KEYS)
-    )
+    planned = {name: given[name] for name in PLAN_KEYS if name in given}
+    exactly = {name: given[name] for name in EXACT_KEYS if name in given}
     if len(planned) + exact > 1:
         params = click.get_current_context().command.params
-        *others, last = (p.opts[0] for p in params if p.name in (*PLAN_KEYS, "exact"))
+        named = {getattr(param, "argument", param.name): param.opts[0] for param in params}
+        *others, last = (named[name] for name in (*PLAN_KEYS, "exact") if name in named)
         raise click.UsageError(f"give only one of {', '.join(others)} and {last}")
     if planned and exactly:
         raise click.UsageError(
             "--accuracy-db, --taps and --upsampling are for exact images and cannot be combined "
-            f"with --{next(iter(planned)).replace('_', '-')}"
+            f"with {option_of(next(iter(planned)))}"
         )
     if len(exactly) == len(EXACT_KEYS):
         raise click.UsageError(
@@ -155,12 +154,9 @@ def read_request(
     return described.request or DEFAULT_REQUEST
 
 
-def read_beam(described: SceneFile, given: dict[str, Any]) -> clsas.BeamWindow | None:
+def read_beam(described: SceneFile, changes: dict[str, Any]) -> clsas.BeamWindow | None:
     """Return the beam of the scene as changed by the options, or that of the options alone."""
     beam = described.image.get("beam")
-    options = {"width_deg": "beam_deg", "shape": "beam_shape", "squint_deg": "squint_deg"}
-    options |= {"element_length_m": "element_length_m", "track_pings": "track_pings"}
-    changes = {key: given[name] for key, name in options.items() if given[name] is not None}
     if not changes:
         return beam
     if beam is None and "width_deg" not in changes:
@@ -178,26 +174,16 @@ def read_beam(described: SceneFile, given: dict[str, Any]) -> clsas.BeamWindow |
         raise click.UsageError(error_message(error)) from error
 
 
-def read_levels(
-    dynamic_range_db: float | None,
-    percentiles: tuple[float, float] | None,
-    colour_map: str | None,
-) -> dict[str, Any]:
-    """Return the arguments of `clsas.plot.image` for levels and colours, checked."""
-    if dynamic_range_db is not None and percentiles is not None:
+def check_levels(levels: dict[str, Any]) -> None:
+    """Raise UsageError for levels and colours that no picture can have."""
+    if {"dynamic_range_db", "percentiles"} <= levels.keys():
         raise click.UsageError("--dynamic-range-db and --percentiles exclude each other")
-    given = {
-        "dynamic_range_db": dynamic_range_db,
-        "percentiles": percentiles,
-        "colour_map": colour_map,
-    }
-    if colour_map is not None:
+    if "colour_map" in levels:
         need_matplotlib()
         try:
-            check_colour_map(colour_map)
+            check_colour_map(levels["colour_map"])
         except ArgumentError as error:
             raise click.UsageError(error_message(error)) from error
-    return {name: value for name, value in given.items() if value is not None}
 
 
 def warn_of_sampling(scene: SceneFile, grid: clsas.Grid | None = None) -> None:

@@ -27,10 +27,11 @@ from clsas.files.scene_files import SceneFile
 def inspect(
     recording: Path,
     scene: Path | None,
+    axes: dict[str, Any],
+    beam: dict[str, Any],
     device: str | None,
     picture: Path | None,
     as_json: bool,
-    **given: Any,
 ) -> None:
     """Show what a recording contains, and what is wrong with it.
 
@@ -44,15 +45,14 @@ def inspect(
     """
     described = SceneFile(name="") if scene is None else read_scene(scene)
     grid = described.grid
-    if any(given[name] is not None for name in ("x", "y", "z")):
-        described, grid = read_grid(scene, given, memory=False)
-    beam = read_beam(described, given)
+    if axes:
+        described, grid = read_grid(scene, axes, memory=False)
     sonar = described.sonar
     found = clsas.inspect(
         load(recording, clsas.RangeLines, clsas.Echoes),
         grid,
         device=device,
-        beam=beam,
+        beam=read_beam(described, beam),
         element_length_m=None if sonar is None else sonar.element_length_m,
     )
     if picture is not None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +10,10 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, load_lines, read_levels, read_scene, warn_of_sampling
+from clsas.cli.inputs import check_levels, load, load_lines, read_scene, warn_of_sampling
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import HDF5, INPUT, Output
 from clsas.cli.wording import command
-from clsas.engine.data import validate
-from clsas.engine.data.lines import STATISTICS
-from clsas.engine.signal.compression import check_options
 from clsas.files.cphd import SUFFIXES as CPHD
 from clsas.files.formats import SUFFIXES
 from clsas.measures.density import noise_penalty_db
@@ -60,33 +55,11 @@ def simulate(scene_file: Path, output: Path, picture: Path | None, as_json: bool
     )  # fmt: skip
 
 
-def _check_window(window: str) -> None:
-    """Raise ValueError unless a window is one that a word describes."""
-    try:
-        check_options(window=window)
-    except ValueError:
-        raise ValueError(
-            "must be none or a window of SciPy without parameters, such as hamming, hann or "
-            f"taylor, got {validate.shown(window)}"
-        ) from None
-
-
 @command()
 @click.argument("echoes_file", metavar="ECHOES.H5", type=HDF5)
 @options.output("Range lines")
 @options.scene
-@click.option(
-    "--window", help="Window over the band, such as hamming or taylor. [default: none]",
-    callback=options.checked(_check_window),
-)  # fmt: skip
-@click.option(
-    "--oversampling", type=float, help="Samples per bandwidth. [default: 2]",
-    callback=options.checked(lambda rate: check_options(oversampling=rate)),
-)  # fmt: skip
-@click.option(
-    "--equalize", is_flag=True, default=None,
-    help="Remove the ripples of the pulse's spectrum, and the range side lobes that they cause.",
-)  # fmt: skip
+@options.of(clsas.compress, "window", "oversampling", "equalize", into="settings")
 @options.picture("the lines")
 @options.levels
 @options.as_json
@@ -94,13 +67,9 @@ def compress(
     echoes_file: Path,
     output: Path,
     scene: Path | None,
-    window: str | None,
-    oversampling: float | None,
-    equalize: bool | None,
+    settings: dict[str, Any],
     picture: Path | None,
-    dynamic_range_db: float | None,
-    percentiles: tuple[float, float] | None,
-    colour_map: str | None,
+    levels: dict[str, Any],
     as_json: bool,
 ) -> None:
     """Compress echoes into range lines.
@@ -111,13 +80,9 @@ def compress(
     \b
     Example:  clsas compress echoes.h5 -o lines.h5 --window hamming
     """
-    levels = read_levels(dynamic_range_db, percentiles, colour_map)
-    settings = _overridden(
-        read_scene(scene).compress if scene else {},
-        window=window,
-        oversampling=oversampling,
-        equalize=equalize,
-    )
+    check_levels(levels)
+    if scene is not None:
+        settings = read_scene(scene).compress | settings
     echoes = load(echoes_file, clsas.Echoes)
     with progress_bar("compressing") as progress:
         start = time.perf_counter()
@@ -146,23 +111,21 @@ def compress(
     is_flag=True,
     help="Drop pings that were taken while the sonar stood still.",
 )
-@click.option(
-    "--without-background",
-    type=click.Choice(STATISTICS),
-    help="Subtract this statistic of all pings from every ping.",
+@options.of(
+    clsas.RangeLines.without_background,
+    "statistic",
+    into="background",
+    called={"statistic": ("--without-background",)},
+    default="none",
 )
-@click.option(
-    "--high-pass-hz",
-    type=float,
-    help="Keep frequencies of the recorded signal above this one (Hz), and remove those below half "
-    "of it.",
-    callback=options.checked(partial(validate.positive, "high_pass_hz", unit="Hz")),
+@options.of(
+    clsas.RangeLines.high_passed,
+    "cutoff_hz",
+    into="high_pass",
+    called={"cutoff_hz": ("--high-pass-hz",)},
 )
-@click.option(
-    "--taper-m",
-    type=float,
-    help="Fade the lines over this range at either end (m).",
-    callback=options.checked(partial(validate.positive, "taper_m", unit="m")),
+@options.of(
+    clsas.RangeLines.tapered_ends, "length_m", into="taper", called={"length_m": ("--taper-m",)}
 )
 @click.option(
     "--compensate-density",
@@ -174,11 +137,11 @@ def compress(
 def convert(
     recording: Path,
     output: Path,
-    bank: int | None,
+    of_bank: dict[str, Any],
     without_still_pings: bool,
-    without_background: str | None,
-    high_pass_hz: float | None,
-    taper_m: float | None,
+    background: dict[str, Any],
+    high_pass: dict[str, Any],
+    taper: dict[str, Any],
     compensate_density: bool,
     as_json: bool,
 ) -> None:
@@ -193,22 +156,20 @@ def convert(
     Example:  clsas convert lines.h5 lines.cphd
     """
     start = time.perf_counter()
-    steps: list[Callable[[clsas.RangeLines], clsas.RangeLines]] = []
-    if without_still_pings:
-        steps.append(lambda lines: lines.without_still_pings())
-    if without_background is not None:
-        steps.append(lambda lines: lines.without_background(without_background))
-    if high_pass_hz is not None:
-        steps.append(lambda lines: lines.high_passed(high_pass_hz))
-    if taper_m is not None:
-        steps.append(lambda lines: lines.tapered_ends(taper_m))
+    of_lines = of_bank or without_still_pings or background or high_pass or taper
     obj: Any
-    if steps or compensate_density or bank is not None or output.suffix.lower() in CPHD:
-        obj = load_lines(recording, bank)
+    if of_lines or compensate_density or output.suffix.lower() in CPHD:
+        obj = load_lines(recording, **of_bank)
     else:
         obj = clsas.load(recording)
-    for step in steps:
-        obj = step(obj)
+    if without_still_pings:
+        obj = obj.without_still_pings()
+    if background:
+        obj = obj.without_background(**background)
+    if high_pass:
+        obj = obj.high_passed(**high_pass)
+    if taper:
+        obj = obj.tapered_ends(**taper)
     noise: dict[str, float] = {}
     if compensate_density:
         weights = clsas.density_weights(obj)
@@ -221,8 +182,3 @@ def convert(
         + "".join(f"\n  the weights raise the noise by {each:.2f} dB" for each in noise.values()),
         file=output, kind=type(obj).__name__, seconds=seconds, **noise,
     )  # fmt: skip
-
-
-def _overridden(described: dict[str, Any], **given: Any) -> dict[str, Any]:
-    """Return the settings of a scene file, with those replaced that options give."""
-    return described | {name: value for name, value in given.items() if value is not None}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,12 @@ from clsas.cli.inputs import load, load_lines, read_beam, read_grid
 from clsas.cli.outputs import json_able, print_json, printable, progress_bar, report, say
 from clsas.cli.parameters import HDF5, INPUT, POSITION, STAGES, Output
 from clsas.cli.wording import command
-from clsas.engine.data import validate
+from clsas.engine.factorized.plan import ExactImage
+from clsas.engine.factorized.planner import Request
 from clsas.files.scene_files import SceneFile
 from clsas.measures.cuts import Cut
 from clsas.measures.quality import PointResponse
 from clsas.measures.shadows import DARKEST, dark_level_db
-from clsas.measures.tradeoff import TOLERANCES_DB
 
 
 @command()
@@ -28,24 +27,16 @@ from clsas.measures.tradeoff import TOLERANCES_DB
 @click.option(
     "--near",
     type=POSITION,
-    help="Measure the point near this position on the image's axes, or near x, y, z (m).",
+    help="Measure the point near this position on the image's axes, or near x, y, z.",
 )
-@click.option(
-    "--search-m", type=float, help="Largest distance of the peak from --near (m).",
-    callback=options.checked(partial(validate.positive, "search_m", unit="m")),
-)  # fmt: skip
-@click.option(
-    "--extent-m", type=float, help="Distance from the peak within which side lobes count (m).",
-    callback=options.checked(partial(validate.positive, "extent_m", unit="m")),
-)  # fmt: skip
+@options.of(clsas.measure_point, "search_m", "extent_m", into="within", beside="--near")
 @click.option("--reference", type=INPUT, help="Exact image, against which to measure the error.")
 @options.picture("cuts through the point")
 @options.as_json
 def quality(
     image_file: Path,
     near: tuple[float, ...] | None,
-    search_m: float | None,
-    extent_m: float | None,
+    within: dict[str, Any],
     reference: Path | None,
     picture: Path | None,
     as_json: bool,
@@ -58,7 +49,7 @@ def quality(
     \b
     Example:  clsas quality image.h5 --near 0,42.5 --picture cuts.png
     """
-    if near is None and (search_m, extent_m, picture) != (None, None, None):
+    if near is None and (within or picture is not None):
         raise click.UsageError("--search-m, --extent-m and --picture require --near")
     pixels = load(image_file, clsas.Image)
     results: dict[str, Any] = {
@@ -78,7 +69,7 @@ def quality(
             f"{level:.1f} dB, with an error of {dark_error:.1f} dB relative to that level"
         )
     if near is not None:
-        response = clsas.measure_point(pixels, near, search_m=search_m, extent_m=extent_m)
+        response = clsas.measure_point(pixels, near, **within)
         results["point"] = response
         text.append(_describe(response))
         if picture is not None:
@@ -95,48 +86,28 @@ def quality(
 )
 @options.bank
 @options.grid
-@click.option(
-    "--tolerance-db",
-    type=float,
-    multiple=True,
-    callback=options.check_tolerance_db,
-    help="Tolerance (dB); repeat the option for several. "
-    f"[default: {' '.join(f'{db:g}' for db in TOLERANCES_DB)}]",
-)
-@click.option(
-    "--stages",
-    type=STAGES,
-    metavar="QRxQI,...",
-    multiple=True,
-    help="Stages of the thesis's method; repeat the option for several. "
-    "[default: 1 to 5 of 2x2, 2 of 2x4]",
-)
-@click.option(
-    "--study", is_flag=True, help="Also vary the taps of the filters, and the number of stages."
-)
+@options.of(
+    clsas.tradeoff, "tolerances_db", "stages", "study", into="ways",
+    called={"tolerances_db": ("--tolerance-db",)}, types={"tolerances_db": float, "stages": STAGES},
+)  # fmt: skip
 @options.beam
 @options.device
-@click.option(
-    "--repeats", type=click.IntRange(1), default=3, show_default=True,
-    help="Number of timed runs of each image.",
-)  # fmt: skip
+@options.of(clsas.tradeoff, "repeats", into="ways")
 @click.option("--csv", type=Output(".csv"), help="Also write the table.")
 @options.picture("time against error")
 @options.as_json
 def tradeoff(
     lines_file: Path | None,
     case: str | None,
-    bank: int | None,
+    of_bank: dict[str, Any],
     scene: Path | None,
-    tolerance_db: tuple[float, ...],
-    stages: tuple[tuple[tuple[int, int], ...], ...],
-    study: bool,
+    axes: dict[str, Any],
+    ways: dict[str, Any],
+    beam: dict[str, Any],
     device: str | None,
-    repeats: int,
     csv: Path | None,
     picture: Path | None,
     as_json: bool,
-    **given: Any,
 ) -> None:
     """Measure time and error of one image at many tolerances.
 
@@ -151,27 +122,24 @@ def tradeoff(
         raise click.UsageError("--case has its own lines: leave out LINES.H5")
     if lines_file is not None:
         title = lines_file.name
-        described, grid = read_grid(scene, given)
-        beam = read_beam(described, given)
-        lines = load_lines(lines_file, bank, described)
+        described, grid = read_grid(scene, axes)
+        window = read_beam(described, beam)
+        lines = load_lines(lines_file, described, **of_bank)
     elif case is None:
         raise click.UsageError("give either LINES.H5 or --case")
     else:
         title = case
-        if bank is not None:
+        if of_bank:
             raise click.UsageError("--case has lines of one bank: leave out --bank")
-        if scene is not None or any(given[name] is not None for name in ("x", "y", "z")):
+        if scene is not None or axes:
             raise click.UsageError("--case has its own grid: leave out --scene, --x, --y and --z")
         built_in = _case(case)
         lines, grid = built_in.lines(), built_in.grid
-        beam = read_beam(SceneFile(name="", image={"beam": built_in.beam}), given)
+        window = read_beam(SceneFile(name="", image={"beam": built_in.beam}), beam)
     with progress_bar("imaging") as progress:
         measured = clsas.tradeoff(
-            lines, grid,
-            tolerances_db=tolerance_db or TOLERANCES_DB,
-            stages=stages or None,
-            beam=beam, device=device, repeats=repeats, study=study, progress=progress,
-        )  # fmt: skip
+            lines, grid, **ways, beam=window, device=device, progress=progress
+        )
     if csv is not None:
         measured.save_csv(csv)
     if picture is not None:
@@ -181,8 +149,8 @@ def tradeoff(
     report(
         as_json,
         f"{measured.channels} lines, {' x '.join(map(str, measured.pixels))} pixels on "
-        f"{measured.device}, median of {repeats} runs; resolutions are relative to those of the "
-        f"exact image, whose darkest tenth is at {measured.dark_level_db:.1f} dB\n"
+        f"{measured.device}, median of {measured.repeats} runs; resolutions are relative to those "
+        f"of the exact image, whose darkest tenth is at {measured.dark_level_db:.1f} dB\n"
         f"{measured.describe()}",
         **json_able(measured),
     )  # fmt: skip
@@ -191,24 +159,18 @@ def tradeoff(
 @command()
 @click.argument("case", required=False)
 @options.device
-@click.option(
-    "--accuracy-db",
-    type=float,
-    callback=options.check_accuracy_db,
-    help="Accuracy of exact cases (dB). [default: -50]",
+@options.of(ExactImage, "accuracy_db", into="exactly", default="-50, of exact cases")
+@options.of(
+    Request, "tolerance_db", into="tolerance", default="-50, of factorized cases; mosaic: -40"
 )
-@click.option(
-    "--tolerance-db", type=float, callback=options.check_tolerance_db,
-    help="Tolerance of factorized cases (dB). [default: -50; mosaic: -40]",
-)  # fmt: skip
-@click.option("--repeats", type=click.IntRange(1), default=5, show_default=True, help="Timed runs.")
+@options.of(clsas.tradeoff, "repeats", into="timed", default="5")
 @options.as_json
 def bench(
     case: str | None,
     device: str | None,
-    accuracy_db: float | None,
-    tolerance_db: float | None,
-    repeats: int,
+    exactly: dict[str, Any],
+    tolerance: dict[str, Any],
+    timed: dict[str, Any],
     as_json: bool,
 ) -> None:
     """Time benchmark cases, and measure their errors.
@@ -232,14 +194,12 @@ def bench(
     measures |= dict.fromkeys(cases.HEIGHTS_CASES, benchmark.run_heights)
     if case is not None:
         _one_of(case, measures)
-        if (tolerance_db if case in cases.EXACT_CASES else accuracy_db) is not None:
+        if tolerance if case in cases.EXACT_CASES else exactly:
             raise click.UsageError("--accuracy-db is for bp-..., --tolerance-db for other cases")
     for name in [case] if case else measures:
-        exact, measure = name in cases.EXACT_CASES, measures[name]
-        option, value = ("accuracy_db", accuracy_db) if exact else ("tolerance_db", tolerance_db)
-        request = {} if value is None else {option: value}
+        request = {"repeats": 5} | timed | (exactly if name in cases.EXACT_CASES else tolerance)
         with progress_bar(name) as progress:
-            result = measure(name, device=device, repeats=repeats, progress=progress, **request)
+            result = measures[name](name, device=device, progress=progress, **request)
         if as_json:
             print_json(result, indent=None)
             continue

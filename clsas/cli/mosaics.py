@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
 from rich.console import Console
@@ -15,30 +15,64 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 import clsas
 from clsas.cli import options
 from clsas.cli.inputs import (
+    check_levels,
     read_beam,
     read_grid,
-    read_levels,
     read_request,
     read_scene,
     warn_of_sampling,
 )
-from clsas.cli.outputs import printable, progress_bar, report, say
+from clsas.cli.outputs import described_flags, printable, progress_bar, report, say
 from clsas.cli.parameters import COUNTS, INPUT, File, Store, keep_apart, keep_out
 from clsas.cli.wording import command
+from clsas.engine.data.declared import Count
 from clsas.engine.data.extras import needed
 from clsas.engine.data.threads import uninterrupted
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import open_device
 from clsas.engine.exact.decide import ACCURACY_DB
+from clsas.engine.factorized.plan import ExactImage
 from clsas.files.scene_files import SceneFile, simulation_digest
-from clsas.files.scene_tables import PLAN_KEYS
+from clsas.files.scene_tables import PLAN_KEYS, MosaicTable
 from clsas.mosaics.document import check_place
 from clsas.mosaics.patches import patch_shape_of
 from clsas.mosaics.record import Record
 
 _SCHEDULER_S = 10  # how long a scheduler may take to answer; arbitrary
 _IDLE_S = 60.0  # default of --idle-s
-_LISTED = 3  # patches that are listed for each flag; arbitrary
+
+
+@contextmanager
+def _cluster(
+    workers: Annotated[int | None, Count(help="Number of worker processes.")] = None,
+    scheduler: str | None = None,
+) -> Iterator[Any]:
+    """Yield a client of a Dask cluster, or None if no cluster is requested."""
+    if workers is None and scheduler is None:
+        yield None
+        return
+    with needed("--workers and --scheduler"):
+        from distributed import Client
+        from distributed.scheduler import KilledWorker
+
+        from clsas.mosaics.workers import local_client
+    with ExitStack() as opened:
+        if scheduler is not None:
+            try:
+                with uninterrupted():
+                    client = opened.enter_context(Client(scheduler, timeout=_SCHEDULER_S))
+            except (OSError, ValueError) as error:
+                raise click.ClickException(
+                    f"--scheduler {scheduler} cannot be reached: {error}"
+                ) from None
+        elif workers is not None:
+            client = opened.enter_context(local_client(workers))
+        try:
+            yield client
+        except KilledWorker as error:
+            raise click.ClickException(
+                f"workers ended unexpectedly several times on one patch: {error}"
+            ) from None
 
 
 @command()
@@ -56,23 +90,16 @@ _LISTED = 3  # patches that are listed for each flag; arbitrary
 @click.option(
     "--exact", is_flag=True, help="Form exact patches. --accuracy-db implies this option."
 )
-@click.option(
-    "--accuracy-db", type=float, callback=options.check_accuracy_db,
-    help="Relative rms error of exact patches (dB). [default: -60]",
-)  # fmt: skip
+@options.of(ExactImage, "accuracy_db", into="request")
 @options.beam
-@click.option("--patches", type=COUNTS, help="Number of patches along y and x, such as 8x8.")
-@click.option(
-    "--memory-mib", type=click.IntRange(1), help="Memory for one patch (MiB). [default: 1024]"
-)
+@options.of(MosaicTable, "patches", "memory_mib", into="divided", types={"patches": COUNTS})
 @click.option("--device", multiple=True, help="Device to use; repeat the option to use several.")
-@click.option("--workers", type=click.IntRange(1), help="Number of worker processes.")
+@options.of(_cluster, "workers", into="cluster")
 @click.option("--scheduler", metavar="ADDRESS", help="Use a Dask cluster, such as tls://host:8786.")
 @click.option("--follow", is_flag=True, help="Wait for files to be added to the folder --lines.")
-@click.option(
-    "--idle-s", type=float, callback=options.check_idle_s,
-    help="With --follow, stop after this many seconds without a new file. A file named `end` stops "
-    "it at once. [default: 60]",
+@options.of(
+    clsas.mosaic, "follow_s", into="idle", called={"follow_s": ("--idle-s",)}, beside="--follow",
+    default=f"{_IDLE_S:g}",
 )  # fmt: skip
 @click.option(
     "--verify", is_flag=True,
@@ -85,24 +112,23 @@ _LISTED = 3  # patches that are listed for each flag; arbitrary
 @options.refusing_unreached
 def mosaic(
     scene: Path | None,
-    exact: bool,
     lines_path: Path | None,
     output: Path | None,
-    patches: tuple[int, int] | None,
-    memory_mib: int | None,
+    axes: dict[str, Any],
+    request: dict[str, Any],
+    exact: bool,
+    beam: dict[str, Any],
+    divided: dict[str, Any],
     device: tuple[str, ...],
-    workers: int | None,
+    cluster: dict[str, Any],
     scheduler: str | None,
     follow: bool,
-    idle_s: float | None,
+    idle: dict[str, Any],
     verify: bool,
     picture: Path | None,
-    dynamic_range_db: float | None,
-    percentiles: tuple[float, float] | None,
-    colour_map: str | None,
+    levels: dict[str, Any],
     borders: bool,
     as_json: bool,
-    **given: Any,
 ) -> None:
     """Form an image of any size, patch by patch.
 
@@ -123,30 +149,29 @@ def mosaic(
         _verify(_existing_store(scene, output), as_json)
         return
     if scene is None:
-        _check_without_scene(given["x"] is not None, lines_path, output)
-    _check_combination(bool(device), workers, scheduler, follow, idle_s)
-    levels = read_levels(dynamic_range_db, percentiles, colour_map)
-    described, grid = read_grid(scene, given, memory=False)
-    request = _read_request(described, given, exact)
-    beam = read_beam(described, given)
+        _check_without_scene(bool(axes), lines_path, output)
+    _check_combination(bool(device), bool(cluster), scheduler, follow, bool(idle))
+    check_levels(levels)
+    described, grid = read_grid(scene, axes, memory=False)
+    request = _read_request(described, request, exact)
+    window = read_beam(described, beam)
     warn_of_sampling(described, grid)
     devices = [open_device(name) for name in device] or None
     in_scene = described.mosaic
     output = output or in_scene.get("store") or _store_beside(scene)
-    memory_mib = memory_mib or in_scene.get("memory_mib")
-    patches = patches or in_scene.get("patches")
-    if patches is not None:
+    memory_mib = divided.get("memory_mib") or in_scene.get("memory_mib")
+    if patches := divided.get("patches") or in_scene.get("patches"):
         patch_shape_of(patches, grid)  # before anything is simulated
     recorded = lines_path or in_scene.get("lines")
     _check_paths(output, picture, recorded, follow)
     check_place(output.resolve())  # before anything is simulated
     lines_path = recorded or _simulated(described, scene, output, picture, quiet=as_json)
     start = time.perf_counter()
-    with _cluster(workers, scheduler) as client:
+    with _cluster(**cluster, scheduler=scheduler) as client:
         formed = clsas.mosaic(
-            lines_path, grid, output, **request, beam=beam, patches=patches,
+            lines_path, grid, output, **request, beam=window, patches=patches,
             memory_bytes=memory_mib and memory_mib << 20, device=devices,
-            client=client, follow_s=(idle_s or _IDLE_S) if follow else None,
+            client=client, follow_s=idle.get("follow_s", _IDLE_S) if follow else None,
         )  # fmt: skip
         before = len(formed.finished)
         new, pixels = _form(formed, output.name, quiet=as_json)
@@ -175,14 +200,14 @@ def _check_without_scene(has_grid: bool, lines_path: Path | None, output: Path |
 
 
 def _check_combination(
-    has_device: bool, workers: int | None, scheduler: str | None, follow: bool, idle_s: float | None
+    has_device: bool, has_workers: bool, scheduler: str | None, follow: bool, has_idle: bool
 ) -> None:
     """Raise UsageError for options that exclude or require each other."""
-    if workers is not None and scheduler is not None:
+    if has_workers and scheduler is not None:
         raise click.UsageError("give only one of --workers and --scheduler")
-    if has_device and (workers or scheduler):
+    if has_device and (has_workers or scheduler):
         raise click.UsageError("--device has no effect with --workers or --scheduler")
-    if idle_s is not None and not follow:
+    if has_idle and not follow:
         raise click.UsageError("--idle-s requires --follow")
 
 
@@ -249,18 +274,6 @@ def _results(
     }
 
 
-def described_flags(flagged: dict[tuple[int, int], tuple[str, ...]]) -> list[str]:
-    """Return one line for every flag, with the patches that have it."""
-    alike: dict[str, list[str]] = {}
-    for (row, column), flags in flagged.items():
-        alike.setdefault(printable("; ".join(flags)), []).append(f"{row},{column}")
-    lines = []
-    for words, patches in alike.items():
-        more = f" and {len(patches) - _LISTED} more" if len(patches) > _LISTED else ""
-        lines.append(f"  patch {'; '.join(patches[:_LISTED])}{more}: {words}")
-    return lines
-
-
 def _store_beside(scene: Path | None) -> Path:
     """Return the default store of a scene; a usage error without a scene."""
     if scene is None:
@@ -325,36 +338,6 @@ def _simulated(
     if not quiet:
         say(f"{printable(path)}: range lines, simulated from {printable(scene)}", err=True)
     return path
-
-
-@contextmanager
-def _cluster(workers: int | None, scheduler: str | None) -> Iterator[Any]:
-    """Yield a client of a Dask cluster, or None if no cluster is requested."""
-    if workers is None and scheduler is None:
-        yield None
-        return
-    with needed("--workers and --scheduler"):
-        from distributed import Client
-        from distributed.scheduler import KilledWorker
-
-        from clsas.mosaics.workers import local_client
-    with ExitStack() as opened:
-        if scheduler is not None:
-            try:
-                with uninterrupted():
-                    client = opened.enter_context(Client(scheduler, timeout=_SCHEDULER_S))
-            except (OSError, ValueError) as error:
-                raise click.ClickException(
-                    f"--scheduler {scheduler} cannot be reached: {error}"
-                ) from None
-        elif workers is not None:
-            client = opened.enter_context(local_client(workers))
-        try:
-            yield client
-        except KilledWorker as error:
-            raise click.ClickException(
-                f"workers ended unexpectedly several times on one patch: {error}"
-            ) from None
 
 
 @contextmanager

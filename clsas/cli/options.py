@@ -1,8 +1,9 @@
-"""Options that several commands share."""
+"""Options that several commands share, and options made from declarations of the library."""
 
 from __future__ import annotations
 
 import functools
+import inspect
 import warnings
 from collections.abc import Callable
 from functools import partial
@@ -10,42 +11,164 @@ from typing import Any
 
 import click
 
-from clsas.cli.parameters import AXIS, INPUT, PERCENTILES, RATIO, STAGES, Output
-from clsas.engine.data import validate
-from clsas.engine.data.beam import SHAPES
+from clsas.cli.parameters import AXIS, INPUT, POSITION, RATIO, SPAN, STAGES, Output
+from clsas.cli.wording import typed
+from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.coverage import UnreachedWarning
-from clsas.engine.data.validate import ArgumentError, described
-from clsas.engine.exact.decide import BEST_ACCURACY_DB
-from clsas.engine.factorized.planner import (
-    BEST_TOLERANCE_DB,
-    WORST_TOLERANCE_DB,
-    checked_tolerance_db,
-    wavelengths,
+from clsas.engine.data.declared import (
+    Choice,
+    Count,
+    Declared,
+    Flag,
+    Names,
+    Number,
+    Other,
+    Positions,
+    Several,
+    Span,
+    declared,
+    default_of,
 )
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
+from clsas.engine.factorized.plan import ExactImage
+from clsas.engine.factorized.planner import Request
 from clsas.files.hdf5 import SUFFIXES
+from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS
+from clsas.maps.export_options import ExportOptions
 from clsas.plot.canvas import SUFFIXES as PICTURES
+from clsas.plot.levels import Scale
+
+_TYPES = {Number: float, Count: int, Span: SPAN, Positions: POSITION, Other: str}
+"""Type of an option, by the kind of its declaration."""
 
 
-def checked(check: Callable[[Any], object]) -> Callable:
-    """Return a callback for an option that turns exceptions of a check into usage errors."""
+class DeclaredOption(click.Option):
+    """Option that sets an argument of the library, which messages replace by the option."""
 
-    def callback(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
-        try:
-            for each in value if param.multiple else [value]:
-                if each is not None:
-                    check(each)
-        except (TypeError, ValueError) as error:
-            raise click.BadParameter(unnamed(error), ctx, param) from error
+    def __init__(self, *names: Any, argument: str, **how: Any) -> None:
+        super().__init__(*names, **how)
+        self.argument = argument
+
+
+def of(
+    source: Callable[..., Any],
+    *arguments: str,
+    into: str,
+    called: dict[str, tuple[str, ...]] | None = None,
+    types: dict[str, Any] | None = None,
+    default: str = "",
+    beside: str = "",
+    required: bool = False,
+) -> Callable:
+    """Return a decorator that adds options for arguments that a class or function declares.
+
+    The command receives those that were given as a dict, by the names of the arguments.
+
+    Parameters
+    ----------
+    source : callable
+        The class or function, which states units, limits, defaults and help.
+    *arguments : str
+        The arguments, in the order of `--help`.
+    into : str
+        Parameter of the command that receives the dict. Several decorators may fill the same one.
+    called : dict of tuple of str
+        Names of options, by argument, where these are not those of the arguments.
+    types : dict
+        Types of options, by argument, where the kind of a declaration does not determine them.
+    default : str
+        What the help states as the default instead, if the command has another one.
+    beside : str
+        Option without which these have no effect.
+    required : bool
+        Whether they must be given.
+    """
+
+    def decorate(command: Callable) -> Callable:
+        parameters = {f"{into}__{argument}": argument for argument in arguments}
+
+        @functools.wraps(command)
+        def run(*args: Any, **given: Any) -> Any:
+            chosen = {argument: given.pop(name) for name, argument in parameters.items()}
+            chosen = {name: each for name, each in chosen.items() if _is_given(each)}
+            chosen = given.pop(into, {}) | chosen
+            return command(*args, **given, **{into: chosen})
+
+        for argument in reversed(arguments):
+            what = declared(source)[argument]
+            stated = default or _default_in_words(source, argument, what)
+            run = click.option(
+                *(called or {}).get(argument, [option_of(argument)]), f"{into}__{argument}",
+                cls=DeclaredOption, argument=argument, required=required,
+                help=_help(what, stated, beside), callback=partial(_checked, what),
+                **_kind(what, (types or {}).get(argument)),
+            )(run)  # fmt: skip
+        return run
+
+    return decorate
+
+
+def _is_given(value: Any) -> bool:
+    """Return whether click found an option; one that may be repeated is else an empty tuple."""
+    return value is not None and not (isinstance(value, tuple) and not value)
+
+
+def option_of(argument: str) -> str:
+    """Return the option that an argument has unless another one is chosen."""
+    return f"--{argument.replace('_', '-')}"
+
+
+def _help(what: Declared, default: str, beside: str) -> str:
+    """Return the help of an option: what is declared, its unit, and its default."""
+    text = f"With {beside}, {what.help[0].lower()}{what.help[1:]}" if beside else what.help
+    if unit := getattr(what, "unit", ""):
+        text = f"{text.removesuffix('.')} ({unit})."
+    if isinstance(what, Positions):
+        text += " X,Y is at z = 0."
+    if isinstance(what, Names | Positions | Several):
+        text += " Repeat the option for several."
+    return f"{text} [default: {default}]" if default else text
+
+
+def _kind(what: Declared, given: Any) -> dict[str, Any]:
+    """Return how click parses an option."""
+    if isinstance(what, Flag):
+        return {"is_flag": True, "default": None}
+    if isinstance(what, Several):
+        return _kind(what.each, given) | {"multiple": True}
+    if isinstance(what, Choice | Names):
+        words = all(isinstance(each, str) for each in what.allowed)
+        kind = click.Choice(what.allowed) if words else int
+        return {"type": kind, "multiple": isinstance(what, Names)}
+    return {"type": given or _TYPES[type(what)], "multiple": isinstance(what, Positions)}
+
+
+def _checked(what: Declared, ctx: click.Context, param: click.Parameter, value: Any) -> Any:
+    """Return the value of an option that is allowed; a usage error otherwise."""
+    if not _is_given(value):
         return value
+    if isinstance(what, Positions):
+        value = [(*position, 0.0)[:3] for position in value]
+    argument = getattr(param, "argument", "")
+    try:
+        return what.check(argument, value)
+    except ArgumentError as error:
+        is_part = error.argument.startswith(f"{argument} ")  # such as "x stop"
+        part = error.argument.removeprefix(argument) if is_part else ""
+        message = error.sentence(part, typed(error.given)).strip()
+        raise click.BadParameter(message, ctx, param) from error
 
-    return callback
 
-
-def unnamed(error: Exception) -> str:
-    """Return the message of an exception without the argument's name, since click names it."""
-    if isinstance(error, ArgumentError):
-        return error.sentence("", described(error.given)).lstrip()
-    return str(error)
+def _default_in_words(source: Callable[..., Any], argument: str, what: Declared) -> str:
+    """Return the default of an argument as --help states it."""
+    value = default_of(source, argument)
+    if value is None or value is inspect.Parameter.empty or isinstance(value, bool):
+        return getattr(what, "default", "")
+    if isinstance(value, tuple):
+        return ", ".join(f"{each:g}" if isinstance(each, float) else str(each) for each in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def output(kind: str) -> Callable:
@@ -94,97 +217,29 @@ def _together(*options: Callable) -> Callable:
 
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Print results as JSON.")
-dynamic_range = click.option(
-    "--dynamic-range-db", "--db", "dynamic_range_db", type=float,
-    help="Dynamic range of the picture, dB. [default: 60]",
-    callback=checked(validate.dynamic_range_db),
+dynamic_range = of(
+    Scale, "dynamic_range_db", into="levels",
+    called={"dynamic_range_db": ("--dynamic-range-db", "--db")},
 )  # fmt: skip
-colour_map = click.option(
-    "--colour-map", "--colours", "colour_map",
-    help="Colours of the picture: sonar (black, copper, cream), gray, cividis or any other colour "
-    "map of Matplotlib. [default: inferno]",
-)  # fmt: skip
-levels = _together(
-    dynamic_range,
-    click.option(
-        "--percentiles", type=PERCENTILES,
-        help="Let the colours span these percentiles of the levels instead, such as 1,99.5.",
-    ),
-    colour_map,
-)  # fmt: skip
-map_marks = _together(
-    click.option("--north-arrow", is_flag=True, help="Draw an arrow to the north into a picture."),
-    click.option("--scale-bar", is_flag=True, help="Draw a scale bar into a picture."),
+colour_map = of(
+    Scale, "colour_map", into="levels", called={"colour_map": ("--colour-map", "--colours")}
 )
+levels = _together(dynamic_range, of(Scale, "percentiles", into="levels"), colour_map)
+map_marks = of(ExportOptions, "north_arrow", "scale_bar", into="marks")
 scene = click.option("--scene", type=INPUT, help="Scene file. Options override its values.")
 device = click.option(
     "--device",
     help="Device to use: its index, kind (cpu, gpu), platform (pocl, intel, nvidia) or part of its "
     "name, as `clsas devices` lists them.",
 )
-bank = click.option(
-    "--bank", type=click.IntRange(min=0),
-    help="Use only the lines of this receiver bank, counted from 0. [default: all lines]",
-)  # fmt: skip
-axes = _together(
-    click.option(
-        "--x", type=AXIS, help="First and last pixel centre along x (m), and number of pixels."
-    ),
-    click.option("--y", type=AXIS, help="The same along y."),
-    click.option(
-        "--z", type=float, callback=checked(partial(validate.number, "z", unit="m")),
-        help="With --x and --y, the height of the plane (m). [default: 0]",
-    ),
-)  # fmt: skip
+bank = of(RangeLines.bank, "number", into="of_bank", called={"number": ("--bank",)})
+axes = of(Grid.plane, "x", "y", "z", into="axes", types={"x": AXIS, "y": AXIS})
 grid = _together(scene, axes)
-check_tolerance_db = checked(checked_tolerance_db)
-tolerance_of_images = click.option(
-    "--tolerance-db", type=float, default=-40.0, show_default=True, callback=check_tolerance_db,
-    help="Largest relative rms error of the images (dB).",
-)  # fmt: skip
-check_accuracy_db = checked(
-    partial(validate.number, "accuracy_db", unit="dB", least=BEST_ACCURACY_DB, below=0.0)
+method = of(
+    Request, *PLAN_KEYS, into="request", types={"tolerance_wavelengths": RATIO, "stages": STAGES}
 )
-check_idle_s = checked(partial(validate.positive, "idle_s", unit="s"))
-method = _together(
-    click.option(
-        "--tolerance-db", type=float, callback=check_tolerance_db,
-        help="Largest relative rms error against the exact image (dB). [default: -50]",
-    ),
-    click.option(
-        "--tolerance-wavelengths", type=RATIO,
-        callback=checked(
-            partial(
-                validate.number, "tolerance_wavelengths", unit="wavelengths",
-                least=wavelengths(BEST_TOLERANCE_DB), most=wavelengths(WORST_TOLERANCE_DB),
-            )
-        ),
-        help="The tolerance, stated as a range error in wavelengths, such as 1/30.",
-    ),
-    click.option(
-        "--stages", type=STAGES, metavar="QRxQI,...",
-        help="Use the thesis's method with this QR and QI in each stage, such as 2x2,2x2.",
-    ),
-)  # fmt: skip
-beam = _together(
-    click.option(
-        "--beam-deg", type=float, help="Weight channels with a beam of this full width (degrees)."
-    ),
-    click.option(
-        "--beam-shape", type=click.Choice(SHAPES),
-        help="Shape of the beam. Images with 'hann' are the fastest. [default: rectangular]",
-    ),
-    click.option(
-        "--squint-deg", type=float,
-        help="Squint of the beam's axis, positive forward (degrees). [default: 0]",
-    ),
-    click.option(
-        "--element-length-m", type=float,
-        help="Element length (m) for the shape 'inverse', which divides by the two-way pattern.",
-    ),
-    click.option(
-        "--track-pings", type=int,
-        help="Number of pings over which the direction of the track is smoothed. [default: a "
-        "quarter of all, at most 101]",
-    ),
+exactly = of(ExactImage, *EXACT_KEYS, into="request")
+beam = of(
+    BeamWindow, "width_deg", "shape", "squint_deg", "element_length_m", "track_pings", into="beam",
+    called={"width_deg": ("--beam-deg",), "shape": ("--beam-shape",)},
 )  # fmt: skip

@@ -84,3 +84,18 @@ def warn(message: str) -> None:
 def print_json(results: Any, indent: int | None = 2) -> None:
     """Print results as JSON, on a single line if `indent` is None."""
     click.echo(json.dumps(json_able(results), indent=indent, allow_nan=False))
+
+
+_LISTED = 3  # patches that are listed for each flag; arbitrary
+
+
+def described_flags(flagged: dict[tuple[int, int], tuple[str, ...]]) -> list[str]:
+    """Return one line for every flag, with the patches that have it."""
+    alike: dict[str, list[str]] = {}
+    for (row, column), flags in flagged.items():
+        alike.setdefault(printable("; ".join(flags)), []).append(f"{row},{column}")
+    lines = []
+    for words, patches in alike.items():
+        more = f" and {len(patches) - _LISTED} more" if len(patches) > _LISTED else ""
+        lines.append(f"  patch {'; '.join(patches[:_LISTED])}{more}: {words}")
+    return lines

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,10 @@ import clsas
 from clsas.cli import options
 from clsas.cli.inputs import load_banks, load_heights, read_beam
 from clsas.cli.outputs import printable, report
-from clsas.cli.parameters import HDF5_OR_STORE, INPUT, POSITION, keep_out
+from clsas.cli.parameters import HDF5_OR_STORE, INPUT, keep_out
 from clsas.cli.wording import command
-from clsas.engine.data import validate
 from clsas.files.scene_files import SceneFile
-from clsas.interferometry.pair_errors_result import UNKNOWNS, with_bank
+from clsas.interferometry.pair_errors_result import with_bank
 from clsas.mosaics.stored_heights import check_heights
 
 
@@ -24,19 +22,10 @@ from clsas.mosaics.stored_heights import check_heights
 @click.argument("lines_file", metavar="LINES.H5", type=INPUT)
 @click.argument("heights_file", metavar="HEIGHTS", type=HDF5_OR_STORE)
 @options.output("Corrected range lines")
-@click.option(
-    "--known-height-m",
-    type=float,
-    help="Height of a level seabed above the grid of HEIGHTS (m).",
-)
-@click.option(
-    "--point",
-    "points",
-    multiple=True,
-    type=POSITION,
-    help="Position of a control point on the seabed (m), at z = 0 by default; repeat the option "
-    "for several.",
-)
+@options.of(
+    clsas.pair_errors, "known_height_m", "points_m", into="known",
+    called={"points_m": ("--point",)},
+)  # fmt: skip
 @click.option(
     "--other",
     nargs=2,
@@ -44,23 +33,10 @@ from clsas.mosaics.stored_heights import check_heights
     metavar="LINES.H5 HEIGHTS",
     help="Range lines of the same sonar on another track, and heights of the same seabed.",
 )
-@click.option(
-    "--known-sd-m",
-    type=float,
-    default=0.0,
-    show_default=True,
-    callback=options.checked(partial(validate.number, "known_sd_m", unit="m", least=0.0)),
-    help="Standard deviation of known heights (m).",
-)
-@click.option(
-    "--unknown",
-    "unknowns",
-    multiple=True,
-    type=click.Choice(UNKNOWNS),
-    help="Error to estimate, the most important first; repeat the option for several. "
-    "[default: phase, delay, roll]",
-)
-@options.tolerance_of_images
+@options.of(
+    clsas.pair_errors, "known_sd_m", "unknowns", "tolerance_db", into="request",
+    called={"unknowns": ("--unknown",)},
+)  # fmt: skip
 @options.beam
 @options.device
 @options.as_json
@@ -68,15 +44,12 @@ def pair_errors(
     lines_file: Path,
     heights_file: Path,
     output: Path,
-    known_height_m: float | None,
-    points: tuple[tuple[float, ...], ...],
+    known: dict[str, Any],
     other: tuple[Path, Path] | None,
-    known_sd_m: float,
-    unknowns: tuple[str, ...],
-    tolerance_db: float,
+    request: dict[str, Any],
+    beam: dict[str, Any],
     device: str | None,
     as_json: bool,
-    **given: Any,
 ) -> None:
     """Correct phase, delay and roll of two receiver banks.
 
@@ -88,9 +61,8 @@ def pair_errors(
     \b
     Example:  clsas pair-errors lines.h5 heights.h5 --known-height-m 0 -o corrected.h5
     """
-    beam = read_beam(SceneFile(name=""), given)
-    sources = {"--known-height-m": known_height_m, "--point": points, "--other": other}
-    used = [option for option, value in sources.items() if value not in (None, ())]
+    used = ["--point" if name == "points_m" else options.option_of(name) for name in known]
+    used += ["--other"] if other else []
     if len(used) != 1:
         raise click.UsageError(
             "give one of --known-height-m, --point and --other, got "
@@ -107,11 +79,11 @@ def pair_errors(
             keep_out("--output", output, "the store", store)
     lines, numbers = load_banks(lines_file)
     first, second = (lines.bank(number) for number in numbers)
+    if other:
+        known["other"] = _measured(*other)
     found = clsas.pair_errors(
-        first, second, load_heights(heights_file), known_height_m=known_height_m,
-        points_m=[(*point, 0.0)[:3] for point in points] or None,
-        other=_measured(*other) if other else None, known_sd_m=known_sd_m,
-        unknowns=unknowns or UNKNOWNS, tolerance_db=tolerance_db, beam=beam, device=device,
+        first, second, load_heights(heights_file), **known, **request,
+        beam=read_beam(SceneFile(name=""), beam), device=device,
     )  # fmt: skip
     clsas.save(output, with_bank(lines, numbers[1], found.corrected(first, second)))
     described = found.describe().replace("\n", "\n  ")

@@ -75,18 +75,9 @@ def _counts(text: str) -> tuple[int, int]:
     return rows, columns
 
 
-def _percentiles(text: str) -> tuple[float, float]:
-    low, high = map(float, text.split(","))
-    if not 0 <= low < high <= 100:
-        raise ValueError
+def _span(text: str) -> tuple[float, float]:
+    low, high = map(float, text.split(":"))
     return low, high
-
-
-def _range(text: str) -> tuple[float, float]:
-    near, far = map(float, text.split(":"))
-    if not 0 <= near < far < float("inf"):
-        raise ValueError
-    return near, far
 
 
 def _ratio(text: str) -> float:
@@ -104,10 +95,7 @@ ORIGIN = Parsed(
 )
 RATIO = Parsed("NUMBER", _ratio, "a number or a fraction such as 1/30")
 STAGES = Parsed("stages", _stages, "QRxQI for every stage, such as 2x2,2x2")
-PERCENTILES = Parsed(
-    "LOW,HIGH", _percentiles, "LOW,HIGH from 0 to 100, without a space, such as 1,99.5"
-)
-RANGE = Parsed("NEAR:FAR", _range, "NEAR:FAR, two ascending ranges in metres, such as 30:60")
+SPAN = Parsed("LOW:HIGH", _span, "LOW:HIGH, two numbers, such as 30:60")
 COUNTS = Parsed("ROWSxCOLUMNS", _counts, "ROWSxCOLUMNS, at least 1x1, such as 8x8")
 
 

@@ -13,7 +13,6 @@ from clsas.cli.inputs import read_scene
 from clsas.cli.outputs import printable, report, step_bar
 from clsas.cli.parameters import INPUT, keep_apart
 from clsas.cli.wording import command
-from clsas.files.process_tables import STEPS
 from clsas.interferometry.pair_errors_result import in_words as error_in_words
 from clsas.navigation.calibration_result import in_words as correction_in_words
 from clsas.processing.record import StepRecord
@@ -28,14 +27,7 @@ from clsas.processing.record import StepRecord
     type=click.Path(file_okay=False, path_type=Path),
     help="Folder for the results. [default: `output` of the scene, or the name of its file]",
 )
-@click.option(
-    "--step",
-    "steps",
-    multiple=True,
-    type=click.Choice(STEPS),
-    help="Bring only this step up to date, and the steps before it that correct its lines; repeat "
-    "the option for several.",
-)
+@options.of(clsas.process, "steps", into="chosen", called={"steps": ("--step",)})
 @options.device
 @options.as_json
 @options.refusing_unreached
@@ -43,7 +35,7 @@ def process(
     scene: Path,
     lines_path: Path | None,
     output: Path | None,
-    steps: tuple[str, ...],
+    chosen: dict[str, Any],
     device: str | None,
     as_json: bool,
 ) -> None:
@@ -63,7 +55,7 @@ def process(
     keep_apart("the recording", lines_path or described.process.get("lines"), "output", folder)
     with step_bar() as progress:
         found = clsas.process(
-            described, lines=lines_path, output=folder, steps=steps or None, device=device,
+            described, lines=lines_path, output=folder, **chosen, device=device,
             progress=progress,
         )  # fmt: skip
     rows = [f"  {printable(_row(step, step.name in found.repeated))}" for step in found.steps]

@@ -10,13 +10,15 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import read_levels, read_plan
+from clsas.cli.inputs import check_levels, read_plan
+from clsas.cli.options import option_of
 from clsas.cli.outputs import printable, report
 from clsas.cli.parameters import POSITION, File, Output, keep_out, need_matplotlib
 from clsas.cli.wording import command
-from clsas.engine.data import validate
 from clsas.files.formats import SUFFIXES
 from clsas.plot.canvas import SUFFIXES as PICTURES
+from clsas.plot.levels import amplitude_at
+from clsas.plot.windows import window_around
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,35 +46,23 @@ _MARKS = ("--north-arrow", "--scale-bar")
     help="Picture to write, as PNG, PDF or SVG. [default: FILE with the suffix .png]",
 )  # fmt: skip
 @options.dynamic_range
-@click.option(
-    "--percentile", type=float,
-    callback=options.checked(
-        lambda value: validate.number("percentile", value, above=0.0, most=100.0)
-    ),
-    help="Percentile of the amplitudes that are not 0 to draw at 0 dB. [default: 100, the largest]",
-)  # fmt: skip
+@options.of(amplitude_at, "percentile", into="of_amplitudes")
 @options.colour_map
 @click.option(
     "--near", type=POSITION,
-    help="Draw the part around this position on the image's axes, or around x, y, z (m).",
+    help="Draw the part around this position on the image's axes, or around x, y, z.",
 )  # fmt: skip
-@click.option(
-    "--extent-m", type=float,
-    callback=options.checked(lambda value: validate.positive("extent_m", value, "m")),
-    help="With --near, the distance on either side that is drawn (m). [default: 32 pixels]",
-)  # fmt: skip
+@options.of(window_around, "extent_m", into="within", beside="--near")
 @options.map_marks
 @options.as_json
 def show(
     file: Path,
     output: Path | None,
-    dynamic_range_db: float | None,
-    percentile: float | None,
-    colour_map: str | None,
+    levels: dict[str, Any],
+    of_amplitudes: dict[str, Any],
     near: tuple[float, ...] | None,
-    extent_m: float | None,
-    north_arrow: bool,
-    scale_bar: bool,
+    within: dict[str, Any],
+    marks: dict[str, Any],
     as_json: bool,
 ) -> None:
     """Draw an image, heights, lines, a plan or a recording.
@@ -85,32 +75,23 @@ def show(
     \b
     Example:  clsas show image.h5 --near 0,42.5 --extent-m 0.2 --db 40
     """
-    if extent_m is not None and near is None:
+    if within and near is None:
         raise click.UsageError("--extent-m requires --near")
-    levels = read_levels(dynamic_range_db, None, colour_map)
+    check_levels(levels)
     need_matplotlib()
     output = output or _beside(file)
     if file.is_dir():
         keep_out("--output", output, "the store", file)
     shown = _read(file)
-    given = {
-        "--dynamic-range-db": dynamic_range_db,
-        "--percentile": percentile,
-        "--colour-map": colour_map,
-        "--near": near,
-        "--extent-m": extent_m,
-        "--north-arrow": north_arrow or None,
-        "--scale-bar": scale_bar or None,
-    }
-    _check_options(shown, {option for option, value in given.items() if value is not None})
+    given = {option_of(name) for name in (*levels, *of_amplitudes, *within, *marks)}
+    _check_options(shown, given | ({"--near"} if near is not None else set()))
     from clsas import plot
 
     title = printable(file.name).replace("$", r"\$")  # matplotlib would read mathematics
+    percentile, extent_m = of_amplitudes.get("percentile"), within.get("extent_m")
     if percentile is not None:
         title += f" (0 dB: percentile {percentile:g})"
-    if north_arrow or scale_bar:
-        levels |= {"north_arrow": north_arrow, "scale_bar": scale_bar}
-    figure, words = _drawn(shown, near, extent_m, percentile, title, levels)
+    figure, words = _drawn(shown, near, extent_m, percentile, title, levels | marks)
     plot.save(figure, output)
     kind = "mosaic" if isinstance(shown, clsas.Store) else type(shown).__name__
     formed = shown.formed if isinstance(shown, clsas.Image) else None
@@ -184,7 +165,6 @@ def _drawn(
 ) -> tuple[Figure, str]:
     """Return the picture of an object, and what it shows in words."""
     from clsas import plot
-    from clsas.plot.levels import amplitude_at
 
     if isinstance(shown, clsas.Plan):
         return plot.plan(shown, title=title), repr(shown)
@@ -219,8 +199,6 @@ def _window(
     store: clsas.Store, near: tuple[float, ...] | None, extent_m: float | None
 ) -> tuple[slice, ...]:
     """Return the rows and columns around a position; none, which stands for all, without one."""
-    from clsas.plot.windows import window_around
-
     return () if near is None else window_around(store.grid, near, extent_m)
 
 
@@ -228,8 +206,6 @@ def _part(
     image: clsas.Image, near: tuple[float, ...] | None, extent_m: float | None
 ) -> clsas.Image:
     """Return an image, or the part around a position."""
-    from clsas.plot.windows import window_around
-
     if near is None:
         return image
     rows, columns = window_around(image.grid, near, extent_m)

@@ -15,7 +15,7 @@ import click
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, read_levels
+from clsas.cli.inputs import check_levels, load
 from clsas.cli.outputs import printable, progress_bar, report, warn
 from clsas.cli.parameters import File, keep_out, need_matplotlib
 from clsas.cli.wording import command
@@ -52,8 +52,7 @@ def view(
     source: Path,
     folder: Path | None,
     against: Path | None,
-    dynamic_range_db: float | None,
-    colour_map: str | None,
+    levels: dict[str, Any],
     no_open: bool,
     as_json: bool,
 ) -> None:
@@ -70,7 +69,7 @@ def view(
     if no_open and folder is None:
         raise click.UsageError("--no-open requires FOLDER")
     need_matplotlib()
-    levels = read_levels(dynamic_range_db, None, colour_map)
+    check_levels(levels)
     paths = [source] if against is None else [source, against]
     for path in paths:
         if path.is_dir():

@@ -26,7 +26,6 @@ _PARAMETERS = {
     "a": ("first_file",),
     "b": ("second_file",),
     "beam": ("scene_path",),
-    "cutoff_hz": ("high_pass_hz",),
     "follow_s": ("follow",),
     "found": ("heights_file",),
     "georeference": ("crs",),
@@ -35,18 +34,12 @@ _PARAMETERS = {
     "image": ("image_file",),
     "images": ("source",),
     "latitude_deg": ("origin",),
-    "length_m": ("taper_m",),
     "lines": ("lines_path", "lines_file", "first_file", "recording"),
     "longitude_deg": ("origin",),
     "memory_bytes": ("memory_mib",),
-    "number": ("bank",),
     "path": ("output",),
     "plan": ("plan_path",),
-    "points_m": ("points",),
-    "shape": ("beam_shape",),
     "source": ("source", "lines_path"),
-    "width_deg": ("beam_deg",),
-    "yaw_sd_rad": ("yaw_sd_deg",),
 }
 # What the option says in a message, where its name alone is not enough.
 _SAID = {
@@ -125,7 +118,7 @@ def error_message(error: BaseException) -> str:
     if error.where:  # names are keys of a file
         return in_options(str(error), _CODE)
     argument = _worded(error.argument, running) or error.argument
-    return in_options(error.sentence(argument, _typed(error.given)))
+    return in_options(error.sentence(argument, typed(error.given)))
 
 
 def in_options(text: str, code: re.Pattern = _NAMES_AND_CODE) -> str:
@@ -157,7 +150,7 @@ def _worded(code: str, running: click.Context) -> str | None:
         return f"{'--bank' if has_bank else 'clsas convert --bank'} {bank[1]}"
     name, value = code.split("=", 1) if "=" in code else (code, "")
     if name in options:
-        return f"{options[name]} {_typed(_evaluated(value))}"
+        return f"{options[name]} {typed(_evaluated(value))}"
     name, *part = re.split(r"(?=[ \[])", code, maxsplit=1)  # such as "x stop" or "stages[0]"
     return options[name] + "".join(part) if name in options else None
 
@@ -175,7 +168,7 @@ def _evaluated(text: str) -> Any:
         return text
 
 
-def _typed(value: Any) -> str:
+def typed(value: Any) -> str:
     """Return a value as it is typed: LOW:HIGH, or words without quotes."""
     if not isinstance(value, tuple):
         return described(value)
@@ -186,7 +179,11 @@ def _typed(value: Any) -> str:
 
 def _options(running: click.Context) -> dict[str, str]:
     """Return what stands for every argument of the library in a command."""
-    params = {param.name: param for param in running.command.params if param.name}
+    params = {
+        getattr(param, "argument", param.name): param
+        for param in running.command.params
+        if param.name
+    }
     options = {
         name: option_name(param)
         for name, param in params.items()
@@ -197,6 +194,6 @@ def _options(running: click.Context) -> dict[str, str]:
         if found is not None:
             options[argument] = _SAID.get(argument, option_name(found))
     if {"x", "scene"} <= params.keys():
-        is_given = running.get_parameter_source("x") is ParameterSource.COMMANDLINE
+        is_given = running.get_parameter_source("axes__x") is ParameterSource.COMMANDLINE
         options["grid"] = "the grid of --x and --y" if is_given else "[grid]"
     return options

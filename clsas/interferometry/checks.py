@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from clsas.engine.data import validate
+from clsas.engine.data.declared import Number, Span
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, antennas_of
@@ -16,45 +17,34 @@ from clsas.interferometry.baseline import Baseline
 from clsas.interferometry.errors import UnmeasurableError
 
 _APART = 0.1  # relative change of the distance between banks that waves of the track may cause
-_MOST_SEARCH_M = 1e8  # from the grid; positions may be up to ten times as large
 _MOST_CYCLES = 1e3  # of phase within the search; more need more planes than anyone has time for
 _POINTS = 5  # along either side of a grid, whose geometry is checked; arbitrary
 _LEAST_PHASE_RAD = 0.1  # over the whole search; less is not above the noise of usual coherences
 
 
-def checked_search(search_m: ArrayLike) -> tuple[float, float]:
-    """Return the lowest and the highest height to search, metres."""
-    low_m, high_m = map(float, validate.array("search_m", search_m, np.float64, (2,)))
-    if not low_m < high_m:
-        raise ArgumentError("search_m", "be (lowest, highest) in m", (low_m, high_m))
-    if max(-low_m, high_m) > _MOST_SEARCH_M:
-        allowed = f"lie within {_MOST_SEARCH_M:g} m of the grid"
-        raise ArgumentError("search_m", allowed, (low_m, high_m))
-    return low_m, high_m
-
-
-def checked_coherence(least_coherence: float) -> float:
-    """Return the smallest coherence of a valid height."""
-    return validate.number("least_coherence", least_coherence, least=0.1, most=0.99)
-
-
-def checked_level(known_height_m: float) -> float:
-    """Return the height of a level seabed above the grid, metres."""
-    limit_m = validate.FARTHEST_M
-    return validate.number("known_height_m", known_height_m, "m", least=-limit_m, most=limit_m)
-
-
-def checked_points(points_m: ArrayLike) -> NDArray[np.float64]:
-    """Return control points on the seabed, metres, float64 [points, 3]."""
-    checked_m = validate.array("points_m", points_m, np.float64, (None, 3))
-    farthest_m = float(np.abs(checked_m).max())
-    validate.number("points_m", farthest_m, "m", most=validate.FARTHEST_M)
-    return checked_m
-
-
-def checked_known_sd(known_sd_m: float) -> float:
-    """Return the standard deviation of known heights, metres."""
-    return validate.number("known_sd_m", known_sd_m, "m", least=0.0, most=validate.FARTHEST_M)
+SEARCH = Span(
+    "m", least=-1e8, most=1e8, help="Heights above the grid between which the seabed lies."
+)
+"""Declares the heights to search. Positions may lie up to ten times as far away."""
+WINDOW = Number(
+    "m",
+    above=0.0,
+    help="Side of the windows, which is the resolution of the heights.",
+    default="that of about 50 independent samples",
+)
+"""Declares the windows in which the phase between the banks is averaged."""
+PATCH = Number("m", above=0.0, help="Side of the patches of a store.", default="1024 pixels")
+"""Declares the approximate side of the patches of a mosaic of heights."""
+COHERENCE = Number(least=0.1, most=0.99, help="Smallest coherence of a valid height.")
+"""Declares the coherence from which on heights are valid."""
+KNOWN_HEIGHT = Number(
+    "m",
+    least=-validate.FARTHEST_M,
+    most=validate.FARTHEST_M,
+    help="Height of a level seabed above the grid of the heights.",
+    default="not known",
+)
+"""Declares the height of a level seabed."""
 
 
 def check_grid(grid: Grid) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
-from clsas.interferometry.checks import checked_level, checked_points
+from clsas.interferometry.checks import KNOWN_HEIGHT
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.displaced import Displaced
 from clsas.interferometry.error_fit import Equations, Places
@@ -62,7 +62,7 @@ def _checked_heights(known_height_m: ArrayLike, shape: tuple[int, int]) -> NDArr
     """Return known heights as float64 [rows, columns]; NaN is allowed."""
     name = "known_height_m"
     if isinstance(known_height_m, Real):
-        known_height_m = checked_level(known_height_m)
+        known_height_m = KNOWN_HEIGHT.check("known_height_m", known_height_m)
     given = np.asanyarray(known_height_m)
     if np.ma.isMaskedArray(given) or given.dtype.kind not in "iuf":
         allowed = "be a real number or an array of real numbers, NaN where heights are not known"
@@ -83,9 +83,9 @@ def _checked_heights(known_height_m: ArrayLike, shape: tuple[int, int]) -> NDArr
     return known_m
 
 
-def at_points(surface: Displaced, points_m: ArrayLike, known_sd_m: float) -> Comparison:
+def at_points(surface: Displaced, points_m: NDArray[np.float64], known_sd_m: float) -> Comparison:
     """Compare heights with control points."""
-    return _against(surface, checked_points(points_m), known_sd_m, "one of `points_m`")
+    return _against(surface, points_m, known_sd_m, "one of `points_m`")
 
 
 def _against(

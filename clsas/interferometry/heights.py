@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,9 +24,13 @@ from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at
 from clsas.engine.device.device import Device, open_device
+from clsas.engine.factorized.planner import TOLERANCE
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.interferometry.baseline import Baseline, Lattice, sight_lattice
 from clsas.interferometry.checks import (
+    COHERENCE,
+    SEARCH,
+    WINDOW,
     check_echoes,
     check_geometry,
     check_grid,
@@ -73,10 +77,10 @@ def heights(
     b: RangeLines,
     grid: Grid,
     *,
-    search_m: ArrayLike,
-    window_m: float | None = None,
-    tolerance_db: float = -40.0,
-    least_coherence: float = LEAST_COHERENCE,
+    search_m: Annotated[ArrayLike, SEARCH],
+    window_m: Annotated[float | None, WINDOW] = None,
+    tolerance_db: Annotated[float, TOLERANCE] = -40.0,
+    least_coherence: Annotated[float, COHERENCE] = LEAST_COHERENCE,
     beam: BeamWindow | None = None,
     device: Device | str | int | None = None,
     progress: Callable[[int, int], None] | None = None,

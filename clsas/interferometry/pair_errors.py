@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.declared import Names, Number, Positions, check_declared
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device, open_device
-from clsas.engine.factorized.planner import checked_tolerance_db
+from clsas.engine.factorized.planner import TOLERANCE
 from clsas.engine.signal.spectrum import middle_cycles_per_m
-from clsas.interferometry.checks import check_pair, checked_known_sd
+from clsas.interferometry.checks import KNOWN_HEIGHT, check_pair
 from clsas.interferometry.comparisons import Comparison, at_pixels, at_points, in_overlap
 from clsas.interferometry.displaced import Displaced
 from clsas.interferometry.estimate import MOST_SD_RAD, Estimate, estimated
@@ -23,7 +25,6 @@ from clsas.interferometry.misregistration import ConstantPhase, constant_phase
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.pair_errors_result import UNKNOWNS, PairErrors
 from clsas.interferometry.result import Heights
-from clsas.navigation.checks import checked_unknowns
 
 _MRAD = 1e-3
 # Deviations by which heights may differ from expected ones without a warning; dunes reach 2.
@@ -36,12 +37,21 @@ def pair_errors(
     b: RangeLines,
     found: Heights,
     *,
-    known_height_m: ArrayLike | None = None,
-    points_m: ArrayLike | None = None,
+    known_height_m: Annotated[ArrayLike | None, KNOWN_HEIGHT] = None,
+    points_m: Annotated[
+        ArrayLike | None, Positions(help="Positions of control points on the seabed.")
+    ] = None,
     other: tuple[RangeLines, RangeLines, Heights] | None = None,
-    known_sd_m: float = 0.0,
-    unknowns: Sequence[str] = UNKNOWNS,
-    tolerance_db: float = -40.0,
+    known_sd_m: Annotated[
+        float,
+        Number(
+            "m", least=0.0, most=validate.FARTHEST_M, help="Standard deviation of known heights."
+        ),
+    ] = 0.0,
+    unknowns: Annotated[
+        Sequence[str], Names(UNKNOWNS, help="Errors to estimate, the most important first.")
+    ] = UNKNOWNS,
+    tolerance_db: Annotated[float, TOLERANCE] = -40.0,
     beam: BeamWindow | None = None,
     device: Device | str | int | None = None,
 ) -> PairErrors:
@@ -159,17 +169,17 @@ def pair_errors(
     >>> print(f"{abs(np.median(right.height_m[right.mask])):.1f} m after")
     0.0 m after
     """
-    unknowns = checked_unknowns(unknowns, UNKNOWNS)
-    tolerance_db = checked_tolerance_db(tolerance_db)
+    options = {"known_sd_m": known_sd_m, "unknowns": unknowns, "tolerance_db": tolerance_db}
+    known_sd_m, names, tolerance_db = check_declared(pair_errors, options).values()
     validate.instance("beam", beam, BeamWindow, type(None))
-    known_sd_m = checked_known_sd(known_sd_m)
+    control_m = check_declared(pair_errors, {"points_m": points_m})["points_m"]
     given = {"known_height_m": known_height_m, "points_m": points_m, "other": other}
-    names = [name for name, value in given.items() if value is not None]
-    if len(names) != 1:
+    used = [name for name, value in given.items() if value is not None]
+    if len(used) != 1:
         raise ArgumentError(
             "known_height_m",
             "be given, or one of `points_m` and `other`, and only one",
-            " and ".join(f"`{name}`" for name in names) or "none",
+            " and ".join(f"`{name}`" for name in used) or "none",
         )
     measured = [(a, b, found)]
     _check_measured(a, b, found, "found")
@@ -184,25 +194,25 @@ def pair_errors(
         _check_belongs(surface, name)
     if other is not None:
         comparison = in_overlap(*surfaces)
-    elif points_m is not None:
-        comparison = at_points(surfaces[0], points_m, known_sd_m)
+    elif control_m is not None:
+        comparison = at_points(surfaces[0], control_m, known_sd_m)
         _warn_of_points(comparison)
     else:
         assert known_height_m is not None
         comparison = at_pixels(surfaces[0], known_height_m, known_sd_m)
-    estimate = estimated(comparison, unknowns, names[0])
+    estimate = estimated(comparison, names, used[0])
     constant = None
-    if {"phase", "delay"} <= set(unknowns) and 0 in estimate.columns:
+    if {"phase", "delay"} <= set(names) and 0 in estimate.columns:
         constant = _mean_phase(
             [constant_phase(pair, each.found) for pair, each in zip(pairs, surfaces, strict=True)]
         )
-    errors = _errors(estimate, unknowns, constant, _middle_hz(a), surfaces[0])
+    errors = _errors(estimate, names, constant, _middle_hz(a), surfaces[0])
     for sentence in errors.held_in_words():
         validate.warn(sentence)
     if errors.misfit > _MOST_MISFIT:
         validate.warn(
             f"heights still differ from those expected by {errors.residual_m:.2g} m rms, "
-            f"{errors.misfit:.0f} of their standard deviations: `{names[0]}` may not be that of "
+            f"{errors.misfit:.0f} of their standard deviations: `{used[0]}` may not be that of "
             "this seabed, and the estimates may be wrong"
         )
     return errors

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.grid import Grid
-from clsas.engine.factorized.planner import checked_tolerance_db
-from clsas.interferometry.checks import checked_coherence, checked_search
+from clsas.engine.factorized.planner import TOLERANCE
+from clsas.interferometry.checks import COHERENCE, SEARCH, WINDOW
 from clsas.interferometry.interferogram import window_within
 
 
@@ -45,11 +45,11 @@ class Request:
         beam: BeamWindow | None,
     ) -> Self:
         """Return the request; raise TypeError or ValueError unless it is valid for a grid."""
-        search = checked_search(search_m)
-        tolerance_db = checked_tolerance_db(tolerance_db)
-        least_coherence = checked_coherence(least_coherence)
+        search = SEARCH.check("search_m", search_m)
+        tolerance_db = TOLERANCE.check("tolerance_db", tolerance_db)
+        least_coherence = COHERENCE.check("least_coherence", least_coherence)
         validate.instance("beam", beam, BeamWindow, type(None))
         if window_m is not None:
-            window_m = validate.positive("window_m", window_m, "m")
+            window_m = WINDOW.check("window_m", window_m)
             window_within(grid, window_m)
         return cls(search, window_m, tolerance_db, least_coherence, beam)

@@ -7,8 +7,10 @@ from typing import Annotated, Any
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.decibels import DYNAMIC_RANGE, REFERENCE
+from clsas.engine.data.declared import Choice, Flag, Number, check_fields
 from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.validate import ArgumentError, Choice, Flag, Number
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.factorized.plan import Plan
 from clsas.maps import geotiff, netcdf, sicd
 from clsas.maps.encoding import KINDS
@@ -34,26 +36,37 @@ class ExportOptions:
         If a value has the wrong type or is outside its limits.
     """
 
-    kind: Annotated[str | None, Choice(KINDS, help="Pixels of a GeoTIFF.")] = None
-    dynamic_range_db: float | None = None
-    reference: Annotated[float | None, Number(above=0.0, help="Amplitude of 0 dB.")] = None
+    kind: Annotated[
+        str | None,
+        Choice(
+            KINDS,
+            help="Pixels of a GeoTIFF of an image: amplitude in dB, complex numbers, or 8-bit "
+            "levels with colours.",
+            default="db",
+        ),
+    ] = None
+    dynamic_range_db: Annotated[float | None, DYNAMIC_RANGE] = None
+    reference: Annotated[float | None, REFERENCE] = None
     colour_map: str | None = None
-    north_up: Annotated[bool, Flag(help="Resample a GeoTIFF so that its rows run east.")] = False
+    north_up: Annotated[
+        bool,
+        Flag("Resample a GeoTIFF so that its rows run east. Without it, its transform is rotated."),
+    ] = False
     pixel_m: Annotated[
-        float | None, Number("m", above=0.0, help="Size of the pixels of a resampled GeoTIFF.")
+        float | None,
+        Number(
+            "m", above=0.0, help="Size of the pixels.", default="the distance of those of the input"
+        ),
     ] = None
     plan: Plan | None = None
     lines: RangeLines | None = None
     beam: BeamWindow | None = None
-    north_arrow: Annotated[bool, Flag(help="Draw an arrow that points north.")] = False
-    scale_bar: Annotated[bool, Flag(help="Draw a scale bar.")] = False
+    north_arrow: Annotated[bool, Flag("Draw an arrow to the north into a picture.")] = False
+    scale_bar: Annotated[bool, Flag("Draw a scale bar into a picture.")] = False
 
     def __post_init__(self) -> None:
         """Check every field, and convert those that are declared."""
-        validate.check_fields(self)
-        if self.dynamic_range_db is not None:
-            range_db = validate.dynamic_range_db(self.dynamic_range_db)
-            object.__setattr__(self, "dynamic_range_db", range_db)
+        check_fields(self)
         if self.colour_map is not None:
             validate.text("colour_map", self.colour_map)
         validate.instance("plan", self.plan, Plan, type(None))

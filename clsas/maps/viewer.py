@@ -16,7 +16,7 @@ import numpy as np
 
 from clsas.engine.data import validate
 from clsas.engine.data.atomic import replacing_folder
-from clsas.engine.data.decibels import largest_amplitude
+from clsas.engine.data.decibels import DYNAMIC_RANGE, largest_amplitude
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
@@ -108,7 +108,7 @@ def write(
         raise ArgumentError("names", f"have {len(sources)} entries", str(len(names)))
     range_db = DYNAMIC_RANGE_DB
     if dynamic_range_db is not None:
-        range_db = validate.dynamic_range_db(dynamic_range_db)
+        range_db = DYNAMIC_RANGE.check("dynamic_range_db", dynamic_range_db)
     colour_map = COLOUR_MAP if colour_map is None else validate.text("colour_map", colour_map)
     tables = {name: _table(name) for name in dict.fromkeys((colour_map, *_COLOURS))}
     validate.instance("georeference", georeference, Georeference, type(None))

@@ -8,12 +8,14 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
+from clsas.engine.data.declared import Count, check_declared
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, band_wavelength_m
@@ -29,8 +31,7 @@ from clsas.engine.factorized.planner import TOLERANCE_DB, checked_tolerance_db
 from clsas.engine.forming import form
 from clsas.engine.imaging import plan
 from clsas.engine.scene import Scene
-from clsas.engine.signal.compression import Window
-from clsas.engine.signal.compression import check_options as check_compression
+from clsas.engine.signal.compression import Window, compress
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.engine.water.refraction import homogeneous
 from clsas.measures.assessment_result import Assessment, Effect
@@ -63,7 +64,10 @@ def assess(
     element_pattern: bool = True,
     device: Device | str | int | None = None,
     costs: Costs | None = None,
-    repeats: int = 0,
+    repeats: Annotated[
+        int,
+        Count(0, help="Also time the image with and without each effect, in this many runs."),
+    ] = 0,
     ends: bool = True,
 ) -> Assessment:
     """Return which effects an image needs, by its error and its time without each of them.
@@ -139,7 +143,7 @@ def assess(
     True
     """
     tolerance_db = checked_tolerance_db(tolerance_db)
-    repeats = validate.count("repeats", repeats, least=0)
+    repeats = check_declared(assess, {"repeats": repeats})["repeats"]
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
     start, water = time.perf_counter(), None
@@ -269,7 +273,7 @@ def survey_lines(
     """
     geometry = channels(sonar, track, motion_in_flight=motion_in_flight)
     validate.instance("grid", grid, Grid)
-    check_compression(window=window, oversampling=oversampling)
+    check_declared(compress, {"window": window, "oversampling": oversampling})
     if validate.flag("phase_centres", phase_centres):
         middle_m = (geometry.tx_m + geometry.rx_m) / 2
         geometry = geometry._replace(tx_m=middle_m, rx_m=middle_m)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.declared import check_declared
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import some_channels
@@ -22,8 +23,7 @@ from clsas.engine.data.system import Sonar
 from clsas.engine.data.track import Pointing, Track, channels
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import sines
-from clsas.engine.signal.compression import Window
-from clsas.engine.signal.compression import check_options as check_compression
+from clsas.engine.signal.compression import Window, compress
 from clsas.inspection.sampling import corners_of, course, grating_lobe_m
 from clsas.measures.resolution import (
     View,
@@ -66,7 +66,7 @@ class Survey:
                 allowed = "be 0 <= nearest < farthest in m"
                 raise ArgumentError("range_m", allowed, (near_m, far_m))
             object.__setattr__(self, "range_m", (near_m, far_m))
-        check_compression(window=self.window)
+        check_declared(compress, {"window": self.window})
         for name in ("element_pattern", "motion_in_flight"):
             object.__setattr__(self, name, validate.flag(name, getattr(self, name)))
         if self.distance_m == 0:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.declared import Number, check_declared
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Axis, Grid
 from clsas.engine.data.image import Image
@@ -61,8 +63,19 @@ def measure_point(
     image: Image,
     near: Sequence[float],
     *,
-    search_m: float | None = None,
-    extent_m: float | None = None,
+    search_m: Annotated[
+        float | None,
+        Number(
+            "m",
+            above=0.0,
+            most=validate.FARTHEST_M,
+            help="Largest distance of the peak from the position.",
+        ),
+    ] = None,
+    extent_m: Annotated[
+        float | None,
+        Number("m", above=0.0, help="Distance from the peak within which side lobes count."),
+    ] = None,
 ) -> PointResponse:
     """Return the response of a point in an image: its position, resolution and side lobes.
 
@@ -175,8 +188,7 @@ def _find_peak(
 ) -> tuple[int, int]:
     """Return row and column of the largest pixel near coordinates on the axes."""
     if search_m is not None:
-        validate.positive("search_m", search_m, "m")
-        validate.number("search_m", search_m, "m", most=validate.FARTHEST_M)
+        check_declared(measure_point, {"search_m": search_m})
     windows = []
     for axis, at in zip(axes, near_m, strict=True):
         count, index = len(axis.places_m), (at - axis.places_m[0]) / axis.step_m

@@ -9,11 +9,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count, product
+from typing import Annotated
 
 import numpy as np
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.declared import Count, Flag, Several
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.image_error import relative_error_db
@@ -25,6 +27,8 @@ from clsas.engine.factorized.filters import ALIGN_TAPS, APERTURE_TAPS
 from clsas.engine.factorized.plan import Plan
 from clsas.engine.factorized.planner import (
     BEST_TOLERANCE_DB,
+    THESIS_STAGES,
+    TOLERANCE,
     WORST_TOLERANCE_DB,
     Request,
     checked_pairs,
@@ -54,12 +58,23 @@ def tradeoff(
     lines: RangeLines,
     grid: Grid,
     *,
-    tolerances_db: Sequence[float] = TOLERANCES_DB,
-    stages: Sequence[Sequence[tuple[int, int]]] | None = None,
+    tolerances_db: Annotated[
+        Sequence[float], Several(TOLERANCE, help="Tolerances of the images.")
+    ] = TOLERANCES_DB,
+    stages: Annotated[
+        Sequence[Sequence[tuple[int, int]]] | None,
+        Several(
+            THESIS_STAGES,
+            help="Stages of the thesis's method for an image.",
+            default="1 to 5 of 2x2, 2 of 2x4",
+        ),
+    ] = None,
     beam: BeamWindow | None = None,
     device: Device | str | int | None = None,
-    repeats: int = 3,
-    study: bool = False,
+    repeats: Annotated[int, Count(help="Timed runs of each image.")] = 3,
+    study: Annotated[
+        bool, Flag("Also vary the taps of the filters, and the number of stages.")
+    ] = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Tradeoff:
     """Return the measured time and error of one image formed by many methods.

@@ -12,6 +12,7 @@ import numpy as np
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import MOST_TRACK_PINGS, BeamWindow
+from clsas.engine.data.declared import Number
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.simplify import shift_error
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
@@ -49,11 +50,19 @@ def checked_request(
     return request or {"tolerance_db": TOLERANCE_DB}
 
 
+FOLLOW = Number(
+    "s",
+    above=0.0,
+    help="Stop after this time without a new file. A file named `end` stops it at once.",
+)
+"""Declares for how long the folder of a survey is followed."""
+
+
 def checked_growth(source: RangeLines | Path, follow_s: float | None) -> Growth | None:
     """Return the folder to follow, or None without `follow_s`; other sources raise ValueError."""
     if follow_s is None:
         return None
-    idle_s = validate.positive("follow_s", follow_s, "s")
+    idle_s = FOLLOW.check("follow_s", follow_s)
     if isinstance(source, RangeLines) or not source.is_dir():
         got = "lines in memory" if isinstance(source, RangeLines) else repr(str(source))
         raise ArgumentError("source", "be a folder if `follow_s` is given", got)

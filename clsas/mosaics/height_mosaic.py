@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,8 +26,9 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, first_two_banks
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device
+from clsas.engine.factorized.planner import TOLERANCE
 from clsas.interferometry import heights
-from clsas.interferometry.checks import check_grid, check_pair
+from clsas.interferometry.checks import COHERENCE, PATCH, SEARCH, WINDOW, check_grid, check_pair
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.doubts import BEYOND
 from clsas.interferometry.heights import LEAST_COHERENCE
@@ -59,12 +60,12 @@ def mosaic_heights(
     grid: Grid,
     store: str | os.PathLike,
     *,
-    search_m: ArrayLike,
-    window_m: float | None = None,
-    tolerance_db: float = -40.0,
-    least_coherence: float = LEAST_COHERENCE,
+    search_m: Annotated[ArrayLike, SEARCH],
+    window_m: Annotated[float | None, WINDOW] = None,
+    tolerance_db: Annotated[float, TOLERANCE] = -40.0,
+    least_coherence: Annotated[float, COHERENCE] = LEAST_COHERENCE,
     beam: BeamWindow | None = None,
-    patch_m: float | None = None,
+    patch_m: Annotated[float | None, PATCH] = None,
     device: Device | str | int | Sequence[Device | str | int] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Store:
@@ -171,7 +172,7 @@ def mosaic_heights(
     check_grid(grid)
     request = Request.checked(grid, search_m, window_m, tolerance_db, least_coherence, beam)
     if patch_m is not None:
-        patch_m = validate.positive("patch_m", patch_m, "m")
+        patch_m = PATCH.check("patch_m", patch_m)
     validate.progress(progress)
     opened = Store.at(validate.path("store", store))
     beam = request.beam

@@ -13,7 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ from clsas.engine.data.version import __version__
 from clsas.engine.device.device import Device
 from clsas.engine.signal.doubts import warn_before_imaging
 from clsas.mosaics.arguments import (
+    FOLLOW,
     beam_of_mosaic,
     check_client,
     checked_growth,
@@ -274,7 +275,7 @@ def mosaic(
     memory_bytes: int | None = None,
     device: Device | str | int | Sequence[Device | str | int] | None = None,
     client: Client | None = None,
-    follow_s: float | None = None,
+    follow_s: Annotated[float | None, FOLLOW] = None,
 ) -> Mosaic:
     """Return a mosaic, an image of any size that is formed patch by patch.
 

@@ -2,17 +2,32 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import validate
-from clsas.engine.data.validate import ArgumentError
+from clsas.engine.data.declared import Number
 
-_LEAST_DEVIATION = 1e-9  # smallest standard deviation accepted, metres or radians
-_MOST_DEVIATION_M = 1e3
+SWAY_SD = Number(
+    "m", least=1e-9, most=1e3, help="Standard deviation of the sway in the navigation data."
+)
+YAW_SD = Number(
+    "degrees", least=1e-7, most=180.0, help="Standard deviation of the yaw in the navigation data."
+)
+SURGE_SD = Number(
+    "m", least=1e-9, most=1e3, help="Standard deviation of the surge in the navigation data."
+)
+"""Declare the accuracy of the navigation that is corrected."""
+CORRELATION = Number(
+    "pings",
+    least=0.5,
+    help="Pings over which errors of the navigation persist.",
+    default="the whole recording",
+)
+"""Declares for how long errors of the navigation persist."""
+
 _IMPLAUSIBLE = 3.0  # rms correction above which a warning is given, in standard deviations
 
 
@@ -36,7 +51,7 @@ class Accuracy:
         cls,
         pings: int,
         sway_sd_m: ArrayLike,
-        yaw_sd_rad: ArrayLike,
+        yaw_sd_deg: ArrayLike,
         surge_sd_m: ArrayLike,
         correlation_pings: float | None,
     ) -> Accuracy:
@@ -46,22 +61,19 @@ class Accuracy:
         """
         if correlation_pings is None:
             correlation_pings = pings
-        correlation_pings = validate.number(
-            "correlation_pings", correlation_pings, "pings", least=0.5
-        )
+        correlation_pings = CORRELATION.check("correlation_pings", correlation_pings)
         deviations = []
-        for name, value, unit, most in (
-            ("sway_sd_m", sway_sd_m, "m", _MOST_DEVIATION_M),
-            ("yaw_sd_rad", yaw_sd_rad, "rad", math.pi),
-            ("surge_sd_m", surge_sd_m, "m", _MOST_DEVIATION_M),
+        for name, value, what in (
+            ("sway_sd_m", sway_sd_m, SWAY_SD),
+            ("yaw_sd_deg", yaw_sd_deg, YAW_SD),
+            ("surge_sd_m", surge_sd_m, SURGE_SD),
         ):
             checked = validate.array(name, value, np.float64, (pings,), broadcast=True)
-            if checked.min() < _LEAST_DEVIATION or checked.max() > most:
-                outside = checked.min() if checked.min() < _LEAST_DEVIATION else checked.max()
-                allowed = f"be from {_LEAST_DEVIATION:g} to {most:.4g} {unit}"
-                raise ArgumentError(name, allowed, f"{outside:g} {unit}")
+            for end in (checked.min(), checked.max()):
+                what.check(name, end)
             deviations.append(checked)
-        return cls(np.stack(deviations, axis=1), correlation_pings)
+        sway_m, yaw_deg, surge_m = deviations
+        return cls(np.stack([sway_m, np.radians(yaw_deg), surge_m], axis=1), correlation_pings)
 
 
 def check_plausible(states: NDArray[np.float64], accuracy: Accuracy) -> None:
@@ -69,7 +81,7 @@ def check_plausible(states: NDArray[np.float64], accuracy: Accuracy) -> None:
     ratio = np.sqrt(np.mean((states / accuracy.deviations) ** 2, axis=0))
     worst = int(np.argmax(ratio))
     if ratio[worst] > _IMPLAUSIBLE:
-        name, option = (("sway", "sway_sd_m"), ("yaw", "yaw_sd_rad"), ("surge", "surge_sd_m"))[
+        name, option = (("sway", "sway_sd_m"), ("yaw", "yaw_sd_deg"), ("surge", "surge_sd_m"))[
             worst
         ]
         validate.warn(

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.contrast import contrast
+from clsas.engine.data.declared import Names, check_declared
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
@@ -34,7 +36,6 @@ from clsas.engine.water.refraction import homogeneous
 from clsas.navigation.autofocus_result import Autofocus
 from clsas.navigation.checks import (
     check_navigation,
-    checked_unknowns,
     first_bank,
     mean_wavelength_m,
     range_cell_m,
@@ -88,7 +89,9 @@ def autofocus(
     grid: Grid,
     *,
     beam: BeamWindow | None = None,
-    unknowns: Sequence[str] = ("sway",),
+    unknowns: Annotated[
+        Sequence[str], Names(UNKNOWNS, help="Displacements of the track to solve for.")
+    ] = ("sway",),
     device: Device | str | int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Autofocus:
@@ -190,7 +193,7 @@ def autofocus(
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
     validate.progress(progress)
-    names = checked_unknowns(unknowns, UNKNOWNS)
+    names = check_declared(autofocus, {"unknowns": unknowns})["unknowns"]
     check_navigation(lines, 10, "autofocus", may_stand=True)
     bank = first_bank(lines)
     # Antennas move alike in the water of a profile and in the homogeneous water that replaces it.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from clsas.engine.data import validate
@@ -38,15 +36,6 @@ def range_cell_m(readout: Readout) -> float:
     """Return the range resolution of the lines."""
     oversampling = min(max(readout.spectrum.oversampling, 1.0), _MOST_OVERSAMPLING)
     return readout.lines.range_step_m * oversampling
-
-
-def checked_unknowns(unknowns: Sequence[str], allowed: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of unknowns; refuse none at all, repeated ones and those not allowed."""
-    names = validate.named("unknowns", unknowns, allowed)
-    if not names or len(set(names)) < len(names):
-        allowed_words = f"be one or several of {', '.join(allowed)}, each once"
-        raise ArgumentError("unknowns", allowed_words, names or "none")
-    return names
 
 
 def first_bank(lines: RangeLines) -> RangeLines:

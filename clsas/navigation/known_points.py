@@ -9,17 +9,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.declared import Names, Number, Positions, check_declared
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.track import Track
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.interpolation import Readout
 from clsas.navigation.calibration_result import UNITS, Calibration
-from clsas.navigation.checks import checked_unknowns
 from clsas.navigation.range_fit import MOST_CONDITION, Ambiguity, Fit, fitted
 from clsas.navigation.range_model import UNKNOWNS, Model
 from clsas.navigation.reflectors import LEAST_SNR, Reader
@@ -42,10 +43,21 @@ share."""
 
 def calibrate_track(
     lines: RangeLines,
-    points_m: ArrayLike,
+    points_m: Annotated[ArrayLike, Positions(help="Positions of reflectors.")],
     *,
-    unknowns: Sequence[str] = DEFAULT_UNKNOWNS,
-    search_m: float | None = None,
+    unknowns: Annotated[
+        Sequence[str], Names(UNKNOWNS, help="Unknowns to solve for, the most important first.")
+    ] = DEFAULT_UNKNOWNS,
+    search_m: Annotated[
+        float | None,
+        Number(
+            "m",
+            above=0.0,
+            help="Largest range error to search for.",
+            default="50 resolution cells, or 70 % of the smallest distance in range between two "
+            "reflectors if that is less",
+        ),
+    ] = None,
     track: Track | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Calibration:
@@ -135,8 +147,8 @@ def calibrate_track(
             hint="ranges of known points determine a constant speed; calibrate near the sonar, "
             "without the profile, and add it then",
         )
-    points = validate.array("points_m", points_m, np.float64, (None, 3))
-    names = checked_unknowns(unknowns, UNKNOWNS)
+    given = {"points_m": points_m, "unknowns": unknowns}
+    points, names = check_declared(calibrate_track, given).values()
     validate.progress(progress)
     reader = Reader.of(Readout.of(lines))
     model = Model(lines, points, _axes(lines, names, track))

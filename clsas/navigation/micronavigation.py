@@ -2,31 +2,38 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.declared import Choice, Names, Number, Span
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.track import Track
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.compression import compress
 from clsas.engine.signal.echoes import Echoes
 from clsas.engine.water.ray_delays import at_speed
-from clsas.navigation.accuracy import Accuracy, check_plausible
+from clsas.navigation.accuracy import (
+    CORRELATION,
+    SURGE_SD,
+    SWAY_SD,
+    YAW_SD,
+    Accuracy,
+    check_plausible,
+)
 from clsas.navigation.checks import check_navigation, first_bank, mean_wavelength_m
 from clsas.navigation.correlation import DEAD_DB, Correlator
 from clsas.navigation.overlap import Array, moved
 from clsas.navigation.passes import LEAST_ECHOES, Displacements, measured
 from clsas.navigation.smoother import Step, persistence, shape_deviation_m, smooth
-from clsas.navigation.swath import Swath, check_sizes, checked_swath
+from clsas.navigation.swath import SIDES, Swath, check_sizes, checked_swath
 
 UNKNOWNS = ("sway", "yaw", "surge")
-YAW_SD_RAD = math.radians(1.0)
 """Default standard deviation of a navigation's yaw."""
 
 _LEAST_BLOCKS = 4  # blocks of range that are needed to estimate a variance from their scatter
@@ -119,17 +126,48 @@ class Micronavigation:
 def micronavigate(
     lines: RangeLines | Echoes,
     *,
-    range_m: tuple[float, float] | None = None,
-    window_m: float | None = None,
-    side: str = "port",
-    seabed_z_m: float | None = None,
-    element_length_m: float | tuple[float, float] | None = None,
-    sway_sd_m: ArrayLike = 0.1,
-    yaw_sd_rad: ArrayLike = YAW_SD_RAD,
-    surge_sd_m: ArrayLike = 0.1,
-    correlation_pings: float | None = None,
-    unknowns: Sequence[str] = UNKNOWNS,
-    most_step_m: float = 0.1,
+    range_m: Annotated[
+        tuple[float, float] | None,
+        Span(
+            "m",
+            least=0.0,
+            help="Nearest and farthest range to use.",
+            default="nearly all that the channels share",
+        ),
+    ] = None,
+    window_m: Annotated[
+        float | None,
+        Number(
+            "m",
+            above=0.0,
+            help="Length of a window in range.",
+            default="about 150 resolution cells",
+        ),
+    ] = None,
+    side: Annotated[str, Choice(SIDES, help="Side on which the seabed lies.")] = "port",
+    seabed_z_m: Annotated[
+        float | None,
+        Number("m", help="Height of the seabed.", default="rays are horizontal"),
+    ] = None,
+    element_length_m: Annotated[
+        float | tuple[float, float] | None,
+        Number(
+            "m",
+            above=0.0,
+            help="Length of the elements, which wide beams need for accurate yaw.",
+            default="a narrow beam",
+        ),
+    ] = None,
+    sway_sd_m: Annotated[ArrayLike, SWAY_SD] = 0.1,
+    yaw_sd_deg: Annotated[ArrayLike, YAW_SD] = 1.0,
+    surge_sd_m: Annotated[ArrayLike, SURGE_SD] = 0.1,
+    correlation_pings: Annotated[float | None, CORRELATION] = None,
+    unknowns: Annotated[
+        Sequence[str], Names(UNKNOWNS, help="Displacements between pings to solve for.")
+    ] = UNKNOWNS,
+    most_step_m: Annotated[
+        float, Number("m", above=0.0, help="Largest displacement between pings.")
+    ] = 0.1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Micronavigation:
     """Return the track of an array, corrected by echoes that consecutive pings have in common.
@@ -154,7 +192,7 @@ def micronavigate(
         Lengths of the elements, which are needed if the beam is wide: far from broadside, echoes
         change their range less, and separate transmitters and receivers shift their phases. Both
         pings are then aligned for every direction of the beam.
-    sway_sd_m, yaw_sd_rad, surge_sd_m : float or array_like [pings]
+    sway_sd_m, yaw_sd_deg, surge_sd_m : float or array_like [pings]
         Standard deviations of the navigation's sway, yaw and surge.
     correlation_pings : float, optional
         Number of pings over which errors of the navigation persist. By default they persist over
@@ -261,7 +299,7 @@ def micronavigate(
         array_lines = at_speed(array_lines, speed_m_s)
     array = Array.of(array_lines)
     swath = checked_swath(array_lines, range_m, window_m, side, seabed_z_m, element_length_m)
-    accuracy = Accuracy.of(array.pings, sway_sd_m, yaw_sd_rad, surge_sd_m, correlation_pings)
+    accuracy = Accuracy.of(array.pings, sway_sd_m, yaw_sd_deg, surge_sd_m, correlation_pings)
     longest_m = float(np.diff(swath.edges_m).max())
     most_step_m = validate.number("most_step_m", most_step_m, "m", above=0.0, most=longest_m)
     correlator = Correlator(array_lines, swath)

@@ -13,6 +13,8 @@ from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.navigation.overlap import Array
 
+SIDES = ("port", "starboard")
+"""Sides of the track on which the seabed may lie."""
 _LEAST_WINDOW = 16  # samples
 _WINDOW_CELLS = 150.0  # default length of a window, range resolution cells
 _LONGEST_ARRAY = 4.0  # farthest ranges
@@ -69,7 +71,7 @@ def checked_swath(
     element_length_m: float | tuple[float, float] | None,
 ) -> Swath:
     """Return the swath that the arguments of `micronavigate` describe, after checking them."""
-    side = validate.one_of("side", side, ("port", "starboard"))
+    side = validate.one_of("side", side, SIDES)
     near_m, far_m = _checked_ranges(lines, range_m)
     if window_m is None:
         cell_m = lines.range_step_m * max(measure_spectrum(lines).oversampling, 1.0)

@@ -6,17 +6,18 @@ import base64
 from dataclasses import dataclass
 from html import escape
 from io import BytesIO
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import validate
-from clsas.engine.data.decibels import level_db
+from clsas.engine.data.decibels import DYNAMIC_RANGE, DYNAMIC_RANGE_DB, REFERENCE, level_db
+from clsas.engine.data.declared import Number, Other, Span, check_fields
 from clsas.engine.data.extras import is_installed
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
+from clsas.engine.data.validate import ArgumentError
 from clsas.plot.canvas import (
     axis_label,
     drawable,
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-DYNAMIC_RANGE_DB = 60.0
-"""Default dynamic range of a picture, in dB below the reference."""
 FLAT = 0.4
 """Height relative to width, below which the colour bar is drawn below an image."""
 
@@ -53,34 +52,31 @@ _PREVIEW_LEVELS, _PREVIEW_GREYS = 208, 48  # 0.3 dB each over 60 dB, and 48 for 
 class Scale:
     """Levels and colours of a picture. The fields are arguments of `image`."""
 
-    dynamic_range_db: float | None = None
-    percentiles: tuple[float, float] | None = None
-    reference: float | None = None
-    colour_map: str | Colormap = COLOUR_MAP
+    dynamic_range_db: Annotated[float | None, DYNAMIC_RANGE] = None
+    percentiles: Annotated[
+        tuple[float, float] | None,
+        Span(
+            "%",
+            least=0.0,
+            most=100.0,
+            help="Let the colours span these percentiles of the levels instead.",
+        ),
+    ] = None
+    reference: Annotated[float | None, REFERENCE] = None
+    colour_map: Annotated[
+        Any,
+        Other(
+            lambda _, name: name,  # checked when it is used, which needs Matplotlib
+            help="Colours of the picture: sonar (black, copper, cream), gray, cividis or any other "
+            "colour map of Matplotlib.",
+        ),
+    ] = COLOUR_MAP
 
     def __post_init__(self) -> None:
-        """Check and convert all fields but the colours, which need matplotlib."""
-
-        def put(name: str, value: object) -> None:
-            object.__setattr__(self, name, value)
-
-        if self.reference is not None:
-            put("reference", validate.positive("reference", self.reference))
-        if self.percentiles is None:
-            if self.dynamic_range_db is not None:
-                put("dynamic_range_db", validate.dynamic_range_db(self.dynamic_range_db))
-            return
-        if self.dynamic_range_db is not None:
+        """Check and convert all fields but the colours."""
+        check_fields(self)
+        if self.percentiles is not None and self.dynamic_range_db is not None:
             raise ArgumentError("percentiles", "be left out if `dynamic_range_db` is given")
-        given = validate.entries("percentiles", self.percentiles, "(low, high)")
-        if len(given) != 2:
-            shown = validate.shown(self.percentiles)
-            raise ArgumentTypeError("percentiles", "be (low, high)", shown)
-        low = validate.number("low of percentiles", given[0], least=0.0, below=100.0)
-        put(
-            "percentiles",
-            (low, validate.number("high of percentiles", given[1], above=low, most=100.0)),
-        )
 
     @property
     def label(self) -> str:
@@ -101,7 +97,19 @@ class Scale:
         return min(low, high - 1.0), high  # colours need a range even if all pixels are equal
 
 
-def amplitude_at(values: NDArray, percentile: float) -> float | None:
+def amplitude_at(
+    values: NDArray,
+    percentile: Annotated[
+        float,
+        Number(
+            "%",
+            above=0.0,
+            most=100.0,
+            help="Percentile of the amplitudes that are not 0 to draw at 0 dB.",
+            default="100, the largest",
+        ),
+    ],
+) -> float | None:
     """Return a percentile of the amplitudes that are not 0, or None if all are 0.
 
     Of very many values, some all over the array are taken.

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 
-from clsas.engine.data import validate
+from clsas.engine.data.declared import Number, check_declared
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.validate import ArgumentError
 from clsas.measures.quality import on_axes
@@ -16,7 +17,17 @@ _ROUNDING = 1e-6  # of a step, so that a pixel at the very end is drawn
 
 
 def window_around(
-    grid: Grid, near: Sequence[float], extent_m: float | None = None
+    grid: Grid,
+    near: Sequence[float],
+    extent_m: Annotated[
+        float | None,
+        Number(
+            "m",
+            above=0.0,
+            help="The distance on either side that is drawn.",
+            default="32 pixels",
+        ),
+    ] = None,
 ) -> tuple[slice, slice]:
     """Return the rows and columns of a grid within a distance of a position.
 
@@ -39,7 +50,7 @@ def window_around(
     place_m = on_axes(grid, axes, near)
     if extent_m is None:
         extent_m = _AROUND * max(abs(axis.step_m) for axis in axes) or 1.0
-    extent_m = validate.positive("extent_m", extent_m, "m")
+    check_declared(window_around, {"extent_m": extent_m})
     parts = []
     for axis, at_m in zip(axes, place_m, strict=True):
         distance_m = np.abs(axis.places_m - at_m)

@@ -10,10 +10,11 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.atomic import staging, sync_folder
+from clsas.engine.data.declared import Names
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ClsasWarning
@@ -21,8 +22,8 @@ from clsas.engine.device.device import Device, open_device
 from clsas.engine.signal.echoes import Echoes
 from clsas.files.hdf5 import save
 from clsas.files.json_types import json_able
-from clsas.files.process_tables import CORRECTIONS, STEPS, checked_steps
 from clsas.files.scene_files import SceneFile, read_scene
+from clsas.files.scene_tables import CORRECTIONS, STEPS, checked_steps
 from clsas.files.tables import located
 from clsas.interferometry.checks import check_grid
 from clsas.interferometry.result import Heights
@@ -126,7 +127,13 @@ def process(
     *,
     lines: RangeLines | Echoes | str | os.PathLike | None = None,
     output: str | os.PathLike | None = None,
-    steps: Sequence[str] | None = None,
+    steps: Annotated[
+        Sequence[str] | None,
+        Names(
+            STEPS,
+            help="Bring only this step up to date, and the steps before it that correct its lines.",
+        ),
+    ] = None,
     device: Device | str | int | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Processed:

@@ -24,8 +24,8 @@ from clsas.engine.data.digests import DIGEST, digest, is_intact, with_digest
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
 from clsas.files.json_types import json_able
-from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
+from clsas.files.scene_tables import CORRECTIONS
 
 NAME = "process.json"
 _FORMAT, _VERSION = "clsas processing", 3

@@ -21,9 +21,8 @@ from clsas.engine.device.device import Device
 from clsas.engine.factorized.planner import TOLERANCE_DB
 from clsas.engine.imaging import backproject, factorize, plan
 from clsas.files.hdf5 import save
-from clsas.files.process_tables import CORRECTIONS
 from clsas.files.scene_files import SceneFile
-from clsas.files.scene_tables import EXACT_KEYS
+from clsas.files.scene_tables import CORRECTIONS, EXACT_KEYS
 from clsas.files.tables import located
 from clsas.inspection.inspection import inspect
 from clsas.interferometry.heights import heights

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
-from clsas.engine.data.validate import ArgumentError, Count, Number
+from clsas.engine.data.declared import Count, Number, check_fields
+from clsas.engine.data.validate import ArgumentError
 from clsas.simulation.height_field import BentRays, HeightField
 from clsas.simulation.refraction import Sightlines
 from clsas.simulation.scatterers import Scatterers, draw_scatterers
@@ -211,15 +212,23 @@ class Seabed:
     y_m: tuple[float, float]
     heights_m: NDArray[np.float64]
     texture: NDArray[np.float64] = 1.0  # type: ignore[assignment]
-    density_m2: Annotated[float, Number("per m2", above=0.0, help="Density of scatterers.")] = 600.0
-    seed: Annotated[int, Count(0, help="Seed of positions and amplitudes.")] = 0
+    density_m2: Annotated[
+        float, Number("per m2", above=0.0, help="Scatterers per square metre of the surface.")
+    ] = 600.0
+    seed: Annotated[int, Count(0, help="Seed of sand, scatterers and boulders.")] = 0
     floor_db: Annotated[
-        float, Number("dB", least=-200.0, most=-10.0, help="Floor of the two-way element pattern.")
+        float,
+        Number(
+            "dB",
+            least=-200.0,
+            most=-10.0,
+            help="Scatterers whose two-way element pattern is below this level are left out.",
+        ),
     ] = -50.0
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""
-        validate.check_fields(self)
+        check_fields(self)
         for name in ("x_m", "y_m"):
             object.__setattr__(self, name, checked_extent(name, getattr(self, name)))
         heights = validate.array("heights_m", self.heights_m, np.float64, (None, None))

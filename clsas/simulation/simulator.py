@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import validate
+from clsas.engine.data.declared import Count, Flag, Number, Span, check_declared
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.sound_speed import SoundSpeed, check_reaches
 from clsas.engine.data.system import PASSBAND, Sonar
 from clsas.engine.data.track import Channels, Pointing, Track, channels
-from clsas.engine.data.validate import ArgumentError, Count, Flag, Number
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.compression import Window, compress
-from clsas.engine.signal.compression import check_options as check_compression
 from clsas.engine.signal.echoes import Echoes
 from clsas.simulation.paths import Paths, scene_parts
 from clsas.simulation.patterns import ElementPatterns
@@ -32,13 +32,40 @@ def simulate(
     scene: Scene,
     *,
     pointing: Pointing | None = None,
-    spreading: bool = False,
-    motion_in_flight: bool = False,
-    element_pattern: bool = True,
-    phase_centres: bool = False,
-    range_m: tuple[float, float] | None = None,
-    snr_db: float | None = None,
-    seed: int = 0,
+    spreading: Annotated[bool, Flag("Divide echoes by the path lengths in metres.")] = False,
+    motion_in_flight: Annotated[
+        bool, Flag("Let the receivers move while the sound travels.")
+    ] = False,
+    element_pattern: Annotated[
+        bool, Flag("Apply the patterns of elements that have sizes.")
+    ] = True,
+    phase_centres: Annotated[
+        bool,
+        Flag(
+            "Put transmitter and receiver of every channel at their phase centre, as in a "
+            "monostatic sonar."
+        ),
+    ] = False,
+    range_m: Annotated[
+        tuple[float, float] | None,
+        Span(
+            "m",
+            least=0.0,
+            help="Nearest and farthest range that is recorded, the same for every channel.",
+            default="just what the echoes need",
+        ),
+    ] = None,
+    snr_db: Annotated[
+        float | None,
+        Number(
+            "dB",
+            least=-200.0,
+            most=300.0,
+            help="Power of the strongest sample relative to the noise, before compression.",
+            default="no noise",
+        ),
+    ] = None,
+    seed: Annotated[int, Count(0, help="Seed of the noise.")] = 0,
     sound_speed: SoundSpeed | None = None,
     workers: int | None = None,
     progress: Progress = None,
@@ -153,11 +180,9 @@ def simulate(
     validate.instance("sonar", sonar, Sonar)
     validate.instance("track", track, Track)
     validate.progress(progress)
-    check_options(
-        pointing=pointing, spreading=spreading, motion_in_flight=motion_in_flight,
-        element_pattern=element_pattern, phase_centres=phase_centres,
-        range_m=range_m, snr_db=snr_db, seed=seed, sound_speed=sound_speed,
-    )  # fmt: skip
+    check_declared(simulate, locals())
+    validate.instance("pointing", pointing, Pointing, type(None))
+    validate.instance("sound_speed", sound_speed, SoundSpeed, type(None))
     check_size(sonar, track, range_m)
     parts = scene_parts(scene)
     patterns, look = None, None
@@ -207,31 +232,6 @@ def simulate(
         geometry.rx_velocity_m_s, look, track.georeference, sonar.channel_banks(track.pings),
         sound_speed,
     )  # fmt: skip
-
-
-def check_options(
-    *,
-    pointing: Pointing | None = None,
-    spreading: Annotated[bool, Flag(help="Apply 1/(R_tx R_rx).")] = False,
-    motion_in_flight: Annotated[bool, Flag(help="Move receivers while sound travels.")] = False,
-    element_pattern: Annotated[bool, Flag(help="Apply the elements' patterns.")] = True,
-    phase_centres: Annotated[bool, Flag(help="Place antennas at the phase centres.")] = False,
-    range_m: ArrayLike | None = None,
-    snr_db: Annotated[
-        float | None,
-        Number("dB", least=-200.0, most=300.0, help="Largest echo relative to the noise."),
-    ] = None,
-    seed: Annotated[int, Count(0, help="Seed of the noise.")] = 0,
-    sound_speed: SoundSpeed | None = None,
-) -> None:
-    """Raise TypeError or ValueError for options that `simulate` refuses for every survey."""
-    validate.check_declared(check_options, locals())
-    validate.instance("pointing", pointing, Pointing, type(None))
-    validate.instance("sound_speed", sound_speed, SoundSpeed, type(None))
-    if range_m is not None:
-        near, far = validate.array("range_m", range_m, np.float64, (2,))
-        if not 0 <= near < far:
-            raise ArgumentError("range_m", "be 0 <= near < far in m", (near, far))
 
 
 def check_size(sonar: Sonar, track: Track, range_m: ArrayLike | None = None) -> None:
@@ -335,7 +335,7 @@ def simulate_lines(
     band = validate.number(
         "bandwidth_hz", bandwidth_hz, "Hz", least=_LEAST_BAND_HZ, most=validate.MOST_HZ
     )
-    check_compression(window=window, oversampling=oversampling)
+    check_declared(compress, {"window": window, "oversampling": oversampling})
     validate.progress(progress)
     parts = scene_parts(scene)
     sound = validate.number(

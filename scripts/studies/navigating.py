@@ -233,7 +233,7 @@ def navigated(voyage: Voyage, window_m: float | None = None) -> Micronavigation:
         window_m=window_m,
         element_length_m=_ANTENNA_M,
         sway_sd_m=0.2,
-        yaw_sd_rad=0.02,
+        yaw_sd_deg=1.15,
     )
 
 

@@ -378,7 +378,7 @@ def test_tradeoff_of_a_built_in_case(monkeypatch):
     assert [(channels, shape) for channels, shape, _ in seen] == [(48, (64, 64))] * 2
     options = seen[0][2]
     assert options["beam"].width_deg == 1.0
-    assert (options["stages"], options["repeats"]) == (None, 3)
+    assert not {"stages", "repeats"} & options.keys()
     assert (seen[1][2]["beam"].width_deg, seen[1][2]["beam"].shape) == (1.0, "hann")
 
 
@@ -564,8 +564,8 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         ),
         (
             ["image", "lines.h5", "--x", "0:1:1", *GRID[2:], "-o", "new.h5"],
-            1,
-            "x must start and stop at one position for 1 pixel, got 0.0 m to 1.0 m",
+            2,
+            "'--x': must start and stop at one position for 1 pixel, got 0.0 m to 1.0 m",
         ),
         (["simulate", "lines.h5", "-o", "new.h5"], 1, "lines.h5: an HDF5 file, not a scene file"),
         (["simulate", "typo.toml", "-o", "new.h5"], 1, "in [grid]: did you mean 'z_m'?"),
@@ -626,8 +626,8 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         ),
         (
             ["image", "lines.h5", "--x", "0:1:9", "--y", f"0:1:{10**30}", "-o", "new.h5"],
-            1,
-            "y count must be at most ",
+            2,
+            "'--y': count must be at most ",
         ),
         (
             ["image", "lines.h5", *GRID, "-o", "new.h5", *FIXED, "--accuracy-db", "-60"],
@@ -676,7 +676,7 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
             2,
             "--element-length-m must be given for --beam-shape inverse",
         ),
-        (["plan", "lines.h5", *GRID, "--beam-deg", "-3"], 2, "--beam-deg must be finite"),
+        (["plan", "lines.h5", *GRID, "--beam-deg", "-3"], 2, "'--beam-deg': must be finite"),
         (["plan", "lines.h5"], 2, "no grid given: use --scene, or --x and --y"),
         (["tradeoff", *GRID], 2, "give either LINES.H5 or --case"),
         (

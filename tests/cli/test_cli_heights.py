@@ -129,7 +129,7 @@ def test_a_store_is_measured_drawn_and_exported(files, tmp_path):
 def test_mistakes_are_reported(files, tmp_path):
     output = "-o", tmp_path / "heights.h5"
     crossed = run("heights", *files, *GRID, "--search-m", "1:-1", *output, code=2)
-    assert "LOW:HIGH, two ascending heights in metres" in crossed.stderr
+    assert "must be two ascending numbers in m" in crossed.stderr
     alone = run("heights", files[0], files[0], *GRID, "--search-m", "-1:1", *output, code=1)
     assert "apart across the line of sight" in alone.stderr
     assert not (tmp_path / "heights.h5").exists()

@@ -109,17 +109,17 @@ def test_mistakes_are_reported(files, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "message"),
+    ("option", "value", "code", "message"),
     [
-        ("--known-height-m", 1e300, "--known-height-m must be finite and >= -1e+09"),
-        ("--known-height-m", 1e9, "--known-height-m must lie close enough to the heights"),
-        ("--point", "0,32,1e300", "--point must be finite and <= 1e+09"),
-        ("--point", "0,32,1e9", "--point must lie close enough to the heights"),
+        ("--known-height-m", 1e300, 2, "'--known-height-m': must be finite and >= -1e+09"),
+        ("--known-height-m", 1e9, 1, "--known-height-m must lie close enough to the heights"),
+        ("--point", "0,32,1e300", 2, "'--point': must be finite and <= 1e+09"),
+        ("--point", "0,32,1e9", 1, "--point must lie close enough to the heights"),
     ],
 )
-def test_heights_beyond_all_reason_give_one_message(option, value, message, files, tmp_path):
+def test_heights_beyond_all_reason_give_one_message(option, value, code, message, files, tmp_path):
     given = files / "lines.h5", files / "heights.h5", "-o", tmp_path / "corrected.h5"
-    refused = run("pair-errors", *given, option, value, "--unknown", "phase", code=1)
+    refused = run("pair-errors", *given, option, value, "--unknown", "phase", code=code)
     assert message in refused.stderr
     assert "Warning" not in refused.stderr
 

@@ -46,7 +46,7 @@ def test_levels_and_colours_of_an_image(folder, figures):
     run("image", "lines.h5", *GRID, "-o", "a.h5", "--picture", "a.png", "--dynamic-range-db", 30)
     run(
         "image", "lines.h5", *GRID, "-o", "b.h5", "--picture", "b.png",
-        "--percentiles", "5,99", "--colour-map", "sonar",
+        "--percentiles", "5:99", "--colour-map", "sonar",
     )  # fmt: skip
     one, other = (figure.axes[0].get_images()[0] for figure in figures)
     assert one.get_clim() == (-30, 0)
@@ -58,9 +58,9 @@ def test_levels_and_colours_of_an_image(folder, figures):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--percentiles", "99"), "'99' must be LOW,HIGH from 0 to 100"),
-        (("--percentiles", "99,1"), "'99,1' must be LOW,HIGH from 0 to 100"),
-        (("--percentiles", "1,99", "--dynamic-range-db", 40), "exclude each other"),
+        (("--percentiles", "99"), "'99' must be LOW:HIGH, two numbers"),
+        (("--percentiles", "99:1"), "must be two ascending numbers in % from 0 to 100, got 99:1"),
+        (("--percentiles", "1:99", "--dynamic-range-db", 40), "exclude each other"),
         (("--colour-map", "sonnar"), "--colour-map must be 'sonar' or one of matplotlib's"),
     ],
 )

@@ -13,6 +13,7 @@ from reliefs import flat_banks
 
 import clsas
 from clsas import cli
+from clsas.cli.options import DeclaredOption
 from clsas.cli.wording import command, error_message, in_options
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 
@@ -59,7 +60,7 @@ def folder(tmp_path_factory):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ((*HEIGHTS, "0:1e9"), "--search-m must lie within 1e+08 m of the grid, got 0:1e+09"),
+        ((*HEIGHTS, "0:1e9"), "two ascending numbers in m from -1e+08 to 1e+08, got 0:1e+09"),
         ((*HEIGHTS, "-9:40"), "--search-m must end below the sonar"),
         ((*HEIGHTS, "0:0.001"), "the two banks must be apart across the line of sight"),
         ((*HEIGHTS, "0:0.001"), "or more over --search-m, got phase"),
@@ -70,15 +71,15 @@ def folder(tmp_path_factory):
         ((*NAVIGATE, "--range-m", "1:99"), "20 to 21.99 m, with the nearest first, got 1:99"),
         ((*NAVIGATE, "--unknown", "yaw"), "--unknown must include 'sway', got yaw"),
         ((*NAVIGATE, "--window-m", -1), "'--window-m': must be finite and > 0 m, got -1"),
-        ((*NAVIGATE, "--yaw-sd-deg", 200), "must be finite and > 0 and <= 180 degrees, got 200"),
-        ((*PLAN, "--beam-deg", 700), "--beam-deg must be finite and >= 0.001 and <= 180 degrees"),
+        ((*NAVIGATE, "--yaw-sd-deg", 200), "<= 180 degrees, got 200"),
+        ((*PLAN, "--beam-deg", 700), "'--beam-deg': must be finite and >= 0.001 and <= 180"),
         ((*PLAN, "--stages", "999x999"), "--stages must leave a line and a pixel"),
         ((*PLAN, "--z", "nan"), "'--z': must be finite m, got nan"),
-        ((*PLAN, "--x", "1e9:2e9:3"), "--x stop must be finite"),
+        ((*PLAN, "--x", "1e9:2e9:3"), "'--x': stop must be finite"),
         ((*PLAN, "--device", "abacus"), "No device matches 'abacus' (--device)"),
         (("image", "image.h5", *GRID, "-o", "new.h5"), "must hold range lines (clsas compress"),
         (("convert", "banks.h5", "new.cphd"), "FILE must be of one bank, got 2: write --bank 0"),
-        (("compress", "low.h5", "-o", "new.h5", "--window", "oak"), "SciPy without parameters"),
+        (("compress", "low.h5", "-o", "new.h5", "--window", "oak"), "a window of SciPy, such"),
         (("mosaic", "--lines", "low.h5", *GRID, "-o", "m.zarr", "--memory-mib", 1),
          "--memory-mib must be"),
         (("quality", "image.h5", "--near", "9,9"), "--near must be inside the image"),
@@ -112,7 +113,8 @@ def said(text, options=("search_m", "unknowns", "beam", "scene", "bank"), word=i
 
     for name in options:
         option = "--unknown" if name == "unknowns" else f"--{name.replace('_', '-')}"
-        run.params.append(click.Option([option, name]))
+        argument = "number" if name == "bank" else name
+        run.params.append(DeclaredOption([option, name], argument=argument))
     run.main([], standalone_mode=False)
     return found[0]
 

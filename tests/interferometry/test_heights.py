@@ -468,7 +468,7 @@ class TestBadInput:
         self.refused("within the range of the lines", search_m=(-60, 1))
         self.refused("must end below the sonar", search_m=(-1e6, 1e6))
         self.refused("within the range of the lines", search_m=(-1e6, 1))
-        self.refused("lowest, highest", search_m=(1, -1))
+        self.refused("search_m must be two ascending numbers in m", search_m=(1, -1))
         self.refused("search_m must have shape", search_m=(1, 2, 3))
         self.refused("search_m must be finite", search_m=(np.nan, 1))
 

@@ -581,7 +581,7 @@ class TestBadInput:
         self.refused(tmp_path, match, tmp_path / "a.h5", tmp_path / "b.h5")
 
     def test_options(self, tmp_path):
-        self.refused(tmp_path, "search_m must be .lowest, highest.", search_m=(1, 0))
+        self.refused(tmp_path, "search_m must be two ascending", search_m=(1, 0))
         self.refused(tmp_path, "patch_m must be finite and > 0", patch_m=-1)
         self.refused(tmp_path, "patch_m must be at least the side of a window", patch_m=0.05)
         self.refused(tmp_path, "window_m must be", window_m=9.0)

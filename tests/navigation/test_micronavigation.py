@@ -88,7 +88,7 @@ def moving():
     lines = recorded(sonar, true, nominal, (points, target), 12, 20)
     right = said_to_be_on(lines, sonar, true)
     found = micronavigate(
-        lines, range_m=(12, 20), element_length_m=WAVELENGTH_M, sway_sd_m=0.1, yaw_sd_rad=0.02
+        lines, range_m=(12, 20), element_length_m=WAVELENGTH_M, sway_sd_m=0.1, yaw_sd_deg=1.15
     )
     return lines, right, found, {name: f(np.arange(pings)) for name, f in motion.items()}
 
@@ -198,14 +198,14 @@ def test_unsuitable_lines_are_refused(straight):
         ({"window_m": 100.0}, "window_m"),
         ({"element_length_m": -1.0}, "element_length_m"),
         ({"sway_sd_m": 0.0}, "sway_sd_m"),
-        ({"yaw_sd_rad": np.ones(3)}, "yaw_sd_rad"),
+        ({"yaw_sd_deg": np.ones(3)}, "yaw_sd_deg"),
         ({"most_step_m": 0.0}, "most_step_m"),
         ({"correlation_pings": 0.0}, "correlation_pings"),
         ({"seabed_z_m": np.nan}, "seabed_z_m"),
         ({"unknowns": ("roll",)}, "unknowns"),
         ({"most_step_m": 1e3}, "most_step_m"),
-        ({"sway_sd_m": 1e-200}, "sway_sd_m must be from"),
-        ({"yaw_sd_rad": 1e200}, "yaw_sd_rad must be from"),
+        ({"sway_sd_m": 1e-200}, "sway_sd_m must be finite"),
+        ({"yaw_sd_deg": 1e200}, "yaw_sd_deg must be finite"),
         ({"seabed_z_m": -1000.0}, "seabed_z_m must differ .* by less than the nearest range"),
         ({"unknowns": ("yaw",)}, "unknowns must include 'sway'"),
     ],
@@ -320,7 +320,7 @@ def test_deviations_are_no_larger_than_those_of_the_navigation(swaying):
         for correlation in (None, 2.0, 1e4):
             found = micronavigate(
                 swaying, range_m=(12, 15), element_length_m=WAVELENGTH_M, unknowns=unknowns,
-                sway_sd_m=0.1, yaw_sd_rad=0.02, surge_sd_m=0.05, correlation_pings=correlation,
+                sway_sd_m=0.1, yaw_sd_deg=1.15, surge_sd_m=0.05, correlation_pings=correlation,
             )  # fmt: skip
             assert found.sway_sd_m.max() <= 0.1 * (1 + 1e-6)
             assert found.yaw_sd_rad.max() <= 0.02 * (1 + 1e-6)
@@ -346,9 +346,9 @@ def test_implausible_corrections_are_reported():
     """They far exceed the accuracy given for the navigation."""
     lines = small(yaw_rad=np.radians(3) * np.sin(np.arange(8)))
     options = {"range_m": (12, 15), "element_length_m": WAVELENGTH_M}
-    with pytest.warns(ClsasWarning, match="the yaw found is .* times the accuracy.*yaw_sd_rad"):
-        micronavigate(lines, yaw_sd_rad=np.radians(0.2), **options)
-    micronavigate(lines, yaw_sd_rad=np.radians(3), **options)
+    with pytest.warns(ClsasWarning, match="the yaw found is .* times the accuracy.*yaw_sd_deg"):
+        micronavigate(lines, yaw_sd_deg=0.2, **options)
+    micronavigate(lines, yaw_sd_deg=3, **options)
 
 
 @pytest.mark.parametrize(
@@ -356,8 +356,11 @@ def test_implausible_corrections_are_reported():
     [
         ({"element_length_m": 30.0}, "element_length_m must be from .* got 30 m"),
         ({"element_length_m": 1e-9}, "element_length_m must be from .* twentieth"),
-        ({"yaw_sd_rad": 20.0}, "yaw_sd_rad must be from 1e-09 to 3.142 rad, got 20 rad"),
-        ({"sway_sd_m": 1e4}, "sway_sd_m must be from 1e-09 to 1000 m, got 10000 m"),
+        (
+            {"yaw_sd_deg": 200.0},
+            "yaw_sd_deg must be .* <= 180 degrees",
+        ),
+        ({"sway_sd_m": 1e4}, "sway_sd_m must be finite and >= 1e-09 and <= 1000 m, got 10000"),
         ({"range_m": (12.0, 12.05)}, "range_m must be at least 16 samples long"),
         ({"range_m": (15.0, 12.0)}, "the nearest first"),
     ],

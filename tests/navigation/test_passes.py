@@ -39,7 +39,7 @@ def test_coarse_arrays_do_not_lock_onto_grating_lobes(coarse):
     lines, sway_m = coarse
     reported = []
     found = clsas.micronavigate(
-        lines, range_m=(30, 38), element_length_m=0.2, yaw_sd_rad=0.05,
+        lines, range_m=(30, 38), element_length_m=0.2, yaw_sd_deg=2.9,
         progress=lambda *each: reported.append(each),
     )  # fmt: skip
     assert np.abs(found.yaw_steps_rad).max() < 2e-3

@@ -14,7 +14,7 @@ from clsas.cli import main
 from clsas.engine.data.atomic import locked
 from clsas.engine.data.digests import with_digest
 from clsas.engine.data.validate import ClsasWarning
-from clsas.files.process_tables import STEPS
+from clsas.files.scene_tables import STEPS
 from clsas.processing import folders
 from clsas.processing import steps as steps_module
 

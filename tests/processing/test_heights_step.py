@@ -15,8 +15,8 @@ import clsas
 from clsas.cli import main
 from clsas.cli.processing import _in_words
 from clsas.engine.data.validate import ClsasWarning
-from clsas.files.process_tables import checked_steps
 from clsas.files.scene_files import read_scene
+from clsas.files.scene_tables import checked_steps
 from clsas.mosaics.document import Document
 from clsas.processing.record import StepRecord
 from clsas.processing.steps import is_mosaic
@@ -235,7 +235,7 @@ def test_heights_run_only_if_asked_for(scene):
     ("old", "new", "message"),
     [
         ("search_m = [-0.5, 0.5]\n", "", r"missing key 'search_m' in \[process.heights\]"),
-        ("[-0.5, 0.5]", "[0.5, -0.5]", r"\[process.heights\] search_m must be \(lowest, highest\)"),
+        ("[-0.5, 0.5]", "[0.5, -0.5]", r"\[process.heights\] search_m must be two ascending"),
         ("[-0.5, 0.5]", "[0.5]", "search_m"),
         ("window_m = 0.2", "window_m = 0.0", r"\[process.heights\] window_m must be"),
         ("window_m = 0.2", "least_coherence = 1.0", r"\[process.heights\] least_coherence must be"),

@@ -16,9 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import correlate1d
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.declared import Choice, Count, Flag, Number, check_fields
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.system import element_pattern
-from clsas.engine.data.validate import ArgumentError, Choice, Count, Flag, Number
+from clsas.engine.data.validate import ArgumentError
 
 SHAPES = ("rectangular", "hann", "hamming", "taylor", "tukey", "inverse")
 
@@ -110,25 +111,50 @@ class BeamWindow:
     '5.08 degrees'
     """
 
-    width_deg: Annotated[float, Number("degrees", least=_NARROWEST, most=180.0, help="Full width.")]
-    shape: Annotated[str, Choice(SHAPES, help="Shape. Images with 'hann' are the fastest.")] = (
-        "rectangular"
-    )
-    squint_deg: Annotated[float, Number("degrees", help="Squint, positive forward.")] = 0.0
-    taper: Annotated[float, Number(least=0.0, most=1.0, help="Share of a Tukey taper.")] = 0.5
+    width_deg: Annotated[
+        float,
+        Number(
+            "degrees",
+            least=_NARROWEST,
+            most=180.0,
+            help="Full width of the beam, beyond which channels have no weight.",
+        ),
+    ]
+    shape: Annotated[
+        str, Choice(SHAPES, help="Shape of the beam. Images with 'hann' are the fastest.")
+    ] = "rectangular"
+    squint_deg: Annotated[
+        float, Number("degrees", help="Squint of the beam's axis, positive forward.")
+    ] = 0.0
+    taper: Annotated[
+        float,
+        Number(least=0.0, most=1.0, help="For 'tukey': share of the width that both edges take."),
+    ] = 0.5
     element_length_m: Annotated[
-        float | None, Number("m", above=0.0, help="Length of the elements, for shape 'inverse'.")
+        float | None,
+        Number(
+            "m",
+            above=0.0,
+            help="For 'inverse', which divides by the two-way pattern: length of the elements.",
+        ),
     ] = None
     along: NDArray[np.float64] | None = None
-    normalise: Annotated[bool, Flag(help="Divide by the sum of the weights.")] = False
+    normalise: Annotated[bool, Flag("Divide every pixel by the mean weight of the channels.")] = (
+        False
+    )
     track_pings: Annotated[
-        int | None, Count(5, help="Pings over which the track's direction is smoothed.")
+        int | None,
+        Count(
+            5,
+            help="Pings over which the direction of the track is smoothed.",
+            default="a quarter of all, at most 101",
+        ),
     ] = None
 
     __repr__ = reprs.of_fields
 
     def __post_init__(self) -> None:  # noqa: D105
-        validate.check_fields(self)
+        check_fields(self)
         room = 90 - self.width_deg / 2
         validate.number("squint_deg", self.squint_deg, "degrees", least=-room, most=room)
         if self.shape == "inverse" and self.element_length_m is None:

@@ -8,6 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import validate
+from clsas.engine.data.declared import Number
+
+DYNAMIC_RANGE_DB = 60.0
+"""Default dynamic range of a picture, in dB below the reference."""
+DYNAMIC_RANGE = Number(
+    "dB",
+    above=0.0,
+    most=2000.0,
+    help="Dynamic range of the picture.",
+    default=f"{DYNAMIC_RANGE_DB:g}",
+)
+"""Declares the dynamic range of a picture, which float32 amplitudes can span."""
+REFERENCE = Number(above=0.0, help="Amplitude of 0 dB.", default="1 for db, otherwise the largest")
+"""Declares the amplitude to which levels are relative."""
 
 
 def power(error_db: float) -> float:

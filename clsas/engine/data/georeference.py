@@ -8,18 +8,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.declared import Number
 from clsas.engine.data.validate import ArgumentError
 
 if TYPE_CHECKING:
     import pyproj
 
     from clsas import Grid
+
+HEADING = Number(
+    "degrees", least=-360.0, most=360.0, help="Heading of the x axis, clockwise from true north."
+)
+"""Declares the heading of a local georeference."""
 
 _LOCAL = ("latitude_deg", "longitude_deg", "height_m", "heading_deg")
 _MOST_HEIGHT_M = 1e5
@@ -170,7 +176,7 @@ class Georeference:
         longitude_deg: float,
         height_m: float = 0.0,
         *,
-        heading_deg: float,
+        heading_deg: Annotated[float, HEADING],
         vertical_datum: str | None = None,
     ) -> Georeference:
         """Return the georeference of coordinates about an origin.
@@ -492,7 +498,7 @@ def _height(name: str, value: Any) -> float:
 
 
 def _heading(name: str, value: Any) -> float:
-    return validate.number(name, value, "degrees", least=-360.0, most=360.0) % 360.0
+    return HEADING.check(name, value) % 360.0
 
 
 def _positions(name: str, value: ArrayLike) -> NDArray[np.float64]:

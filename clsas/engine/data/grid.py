@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.declared import Number, Other
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 
@@ -143,9 +144,9 @@ class Grid:
     @classmethod
     def plane(
         cls,
-        x: tuple[float, float, int],
-        y: tuple[float, float, int],
-        z: float = 0.0,
+        x: Annotated[tuple[float, float, int], AXIS],
+        y: Annotated[tuple[float, float, int], AXIS],
+        z: Annotated[float, Number("m", help="Height of the plane.")] = 0.0,
         *,
         georeference: Georeference | None = None,
     ) -> Self:
@@ -454,6 +455,18 @@ def spread_indices(grid: Grid, most: int) -> NDArray[np.int64]:
 def _coordinate(name: str, value: float) -> float:
     """Return a coordinate in metres; raises TypeError or ValueError."""
     return validate.number(name, value, "m", least=-validate.FARTHEST_M, most=validate.FARTHEST_M)
+
+
+def _checked_axis(name: str, axis: tuple[float, float, int]) -> tuple[float, float, int]:
+    """Return an axis if it is (start, stop, count)."""
+    _axis(name, axis)
+    return axis
+
+
+AXIS = Other(
+    _checked_axis, unit="m", help="First and last pixel centre, and number of pixels, of this axis."
+)
+"""Declares an axis of a horizontal plane."""
 
 
 def _axis(name: str, axis: tuple[float, float, int]) -> tuple[float, float, int]:

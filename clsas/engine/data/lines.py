@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from clsas.engine.data import pings, reprs, validate
+from clsas.engine.data.declared import Choice, Count, Number, check_declared
 from clsas.engine.data.fourier import EDGE_PRODUCT, smooth_edge
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.sound_speed import SoundSpeed, check_reaches
@@ -263,7 +264,10 @@ class RangeLines:
             raise ArgumentError("channels", "select at least one line", "none")
         return self._selected(index)
 
-    def bank(self, number: int) -> RangeLines:
+    def bank(
+        self,
+        number: Annotated[int, Count(0, help="Receiver bank to use, from 0.", default="all banks")],
+    ) -> RangeLines:
         """Return the lines of one receiver bank, whose `bank_numbers` are None.
 
         Parameters
@@ -323,7 +327,18 @@ class RangeLines:
             raise ArgumentError("channels", allowed, len(given))
         return np.flatnonzero(given)
 
-    def high_passed(self, cutoff_hz: float) -> RangeLines:
+    def high_passed(
+        self,
+        cutoff_hz: Annotated[
+            float,
+            Number(
+                "Hz",
+                above=0.0,
+                help="Keep frequencies of the recorded signal above this one, and remove those "
+                "below half of it.",
+            ),
+        ],
+    ) -> RangeLines:
         """Return the lines without frequencies below a cutoff.
 
         Recorders add constants and slow drifts. In lines on their carrier these lie near 0 Hz,
@@ -345,7 +360,7 @@ class RangeLines:
         """
         rate = self.sound_speed_m_s / (2 * self.range_step_m)
         lowest = max(0.0, self.carrier_hz - rate / 2)
-        cutoff = validate.positive("cutoff_hz", cutoff_hz, "Hz")
+        cutoff = check_declared(RangeLines.high_passed, {"cutoff_hz": cutoff_hz})["cutoff_hz"]
         if cutoff <= lowest:
             raise ArgumentError(
                 "cutoff_hz",
@@ -373,7 +388,12 @@ class RangeLines:
             samples[block] = filtered[:, : self.length]
         return replace(self, samples=samples)
 
-    def tapered_ends(self, length_m: float) -> RangeLines:
+    def tapered_ends(
+        self,
+        length_m: Annotated[
+            float, Number("m", above=0.0, help="Fade the lines over this range at either end.")
+        ],
+    ) -> RangeLines:
         """Return the lines with both ends faded to zero.
 
         Lines that end abruptly within strong echoes cannot be interpolated well, even far from
@@ -398,7 +418,12 @@ class RangeLines:
         return replace(self, samples=self.samples * taper.astype(np.float32))
 
     def without_background(
-        self, statistic: str = "mean", *, receivers: int | None = None
+        self,
+        statistic: Annotated[
+            str, Choice(STATISTICS, help="Subtract this statistic of all pings from every ping.")
+        ] = "mean",
+        *,
+        receivers: int | None = None,
     ) -> RangeLines:
         """Return the lines without the background that all pings have in common.
 
@@ -421,7 +446,7 @@ class RangeLines:
             If there are fewer than 2 pings, pings have different numbers of channels, or the lines
             of a receiver do not begin at the same range in all pings.
         """
-        statistic = validate.one_of("statistic", statistic, STATISTICS)
+        check_declared(RangeLines.without_background, {"statistic": statistic})
         if receivers is None:
             counts = pings.channels_per_ping(self.ping_starts, self.channels)
             if np.ptp(counts):

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.declared import Number, check_fields
 from clsas.engine.data.fourier import fourier_integral
 from clsas.engine.data.lines import bank_members, banks_of, checked_bank_numbers
-from clsas.engine.data.validate import ArgumentError, Number
+from clsas.engine.data.validate import ArgumentError
 
 BARKER_13 = (1, 1, 1, 1, 1, -1, -1, 1, 1, -1, 1, -1, 1)
 
@@ -66,15 +67,24 @@ class Pulse:
     """
 
     carrier_hz: Annotated[float, Number("Hz", above=0.0, help="Centre frequency.")]
-    bandwidth_hz: Annotated[float, Number("Hz", above=0.0, help="Bandwidth, or chips/duration.")]
-    duration_s: Annotated[float, Number("s", above=0.0, help="Length of the pulse.")]
+    bandwidth_hz: Annotated[
+        float, Number("Hz", above=0.0, help="Band that a chirp sweeps.", default="chips/duration")
+    ]
+    duration_s: Annotated[float, Number("s", above=0.0, help="Length.")]
     code: str | tuple[int, ...] = "up"
-    taper: Annotated[float, Number(least=0.0, most=1.0, help="Share with a cosine taper.")] = 0.0
+    taper: Annotated[
+        float,
+        Number(
+            least=0.0,
+            most=1.0,
+            help="Share of the duration over which a cosine taper rises and falls.",
+        ),
+    ] = 0.0
 
     __repr__ = reprs.of_fields
 
     def __post_init__(self) -> None:  # noqa: D105
-        validate.check_fields(self)
+        check_fields(self)
         band, duration = self.bandwidth_hz, self.duration_s
         validate.number("bandwidth_hz", band, "Hz", most=2 * self.carrier_hz)
         if isinstance(self.code, str):
@@ -248,15 +258,27 @@ class Sonar:
     tx_m: NDArray[np.float64] = (0.0, 0.0, 0.0)  # type: ignore[assignment]
     sample_rate_hz: float = None  # type: ignore[assignment]
     sound_speed_m_s: Annotated[float, Number("m/s", above=0.0, help="Speed of sound.")] = 1500.0
-    tx_length_m: Annotated[float | None, Number("m", above=0.0, help="Transmitter length.")] = None
-    rx_length_m: Annotated[float | None, Number("m", above=0.0, help="Receiver length.")] = None
-    tx_height_m: Annotated[float | None, Number("m", above=0.0, help="Transmitter height.")] = None
-    rx_height_m: Annotated[float | None, Number("m", above=0.0, help="Receiver height.")] = None
+    tx_length_m: Annotated[
+        float | None,
+        Number("m", above=0.0, help="Length of the transmitter along x.", default="no directivity"),
+    ] = None
+    rx_length_m: Annotated[
+        float | None,
+        Number("m", above=0.0, help="Length of the receivers along x.", default="no directivity"),
+    ] = None
+    tx_height_m: Annotated[
+        float | None,
+        Number("m", above=0.0, help="Height of the transmitter.", default="no directivity"),
+    ] = None
+    rx_height_m: Annotated[
+        float | None,
+        Number("m", above=0.0, help="Height of the receivers.", default="no directivity"),
+    ] = None
     bank_numbers: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:  # noqa: D105
         validate.instance("pulse", self.pulse, Pulse)
-        validate.check_fields(self)
+        check_fields(self)
         band = self.pulse.bandwidth_hz
         rate = 2 * band if self.sample_rate_hz is None else self.sample_rate_hz
         # A rate of exactly 1.25 bandwidths may be rounded down.

@@ -15,12 +15,10 @@ import re
 import reprlib
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
-from functools import cache
+from collections.abc import Sequence
 from numbers import Real
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -167,111 +165,9 @@ def number(
     return result
 
 
-@dataclass(frozen=True)
-class Number:
-    """Limits, unit and help of a number, declared once, in the type of what takes it.
-
-    A field of a dataclass, or a parameter of a function, declares
-    `Annotated[float, Number("Hz", above=0.0, help="Carrier frequency.")]`. Its checks, and options
-    and tables of scene files that set it, are made from that.
-    """
-
-    unit: str = ""
-    _: KW_ONLY
-    above: float | None = None
-    below: float | None = None
-    least: float | None = None
-    most: float | None = None
-    help: str = ""
-
-    def check(self, name: str, value: float) -> float:
-        """Return a value as `number` does."""
-        limits = {each: getattr(self, each) for each in ("above", "below", "least", "most")}
-        return number(name, value, self.unit, **limits)
-
-
-@dataclass(frozen=True)
-class Count:
-    """Limits and help of a whole number; see `Number`."""
-
-    least: int = 1
-    _: KW_ONLY
-    most: int | None = None
-    help: str = ""
-
-    def check(self, name: str, value: int) -> int:
-        """Return a value as `count` does."""
-        return count(name, value, least=self.least, most=self.most)
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Allowed values, and help of their choice; see `Number`."""
-
-    allowed: tuple[Any, ...]
-    _: KW_ONLY
-    help: str = ""
-
-    def check(self, name: str, value: Any) -> Any:
-        """Return a value as `one_of` does."""
-        return one_of(name, value, self.allowed)
-
-
-@dataclass(frozen=True)
-class Flag:
-    """Help of what is true or false; see `Number`."""
-
-    help: str = ""
-
-    def check(self, name: str, value: object) -> bool:
-        """Return a value as `flag` does."""
-        return flag(name, value)
-
-
-Declared = Number | Count | Choice | Flag
-
-
-@cache
-def declared(source: Callable[..., Any]) -> dict[str, Declared]:
-    """Return what a dataclass or a function declares of its fields or parameters, by name."""
-    return {
-        name: each
-        for name, kind in get_type_hints(source, include_extras=True).items()
-        for each in getattr(kind, "__metadata__", ())
-        if isinstance(each, Declared)
-    }
-
-
-@cache
-def _optional(source: Callable[..., Any]) -> frozenset[str]:
-    kinds = get_type_hints(source)
-    return frozenset(name for name, kind in kinds.items() if type(None) in get_args(kind))
-
-
-def check_declared(source: Callable[..., Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the given values of the arguments that a class or function declares, checked."""
-    return {
-        name: None if given[name] is None and name in _optional(source)
-        else what.check(name, given[name])
-        for name, what in declared(source).items()
-        if name in given
-    }  # fmt: skip
-
-
-def check_fields(instance: object) -> None:
-    """Check the fields that a frozen dataclass declares, and replace them by what was checked."""
-    for name, value in check_declared(type(instance), vars(instance)).items():
-        object.__setattr__(instance, name, value)
-
-
 def positive(name: str, value: float, unit: str = "") -> float:
     """Return `value` as a finite float greater than zero; see `number`."""
     return number(name, value, unit, above=0.0)
-
-
-def dynamic_range_db(value: float) -> float:
-    """Return the dynamic range of a picture, dB, as a float that float32 amplitudes can span."""
-    return number("dynamic_range_db", value, "dB", above=0.0, most=2000.0)
 
 
 def count(name: str, value: int, *, least: int = 1, most: int | None = None) -> int:

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
+from clsas.engine.data.declared import Number
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import cycles_per_m_at, fastest, some_channels, wavelength_m
-from clsas.engine.data.validate import ArgumentError, Number
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import sines
 from clsas.engine.device import kernels
 from clsas.engine.device.device import Device
@@ -41,7 +42,11 @@ ACCURACY_DB = -60.0
 BEST_ACCURACY_DB = BEST_DB
 """Best accuracy that may be requested; float32 does not allow a better one."""
 ACCURACY = Number(
-    "dB", least=BEST_ACCURACY_DB, below=0.0, help="Relative rms error of the exact image."
+    "dB",
+    least=BEST_ACCURACY_DB,
+    below=0.0,
+    help="Relative rms error of the exact image.",
+    default=f"{ACCURACY_DB:g}",
 )
 """Declares accuracies of exact images."""
 

@@ -31,13 +31,14 @@ from numpy.typing import NDArray
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db
+from clsas.engine.data.declared import Choice, Number, check_fields
 from clsas.engine.data.digests import DIGEST, grid_digest, is_intact, lines_digest, with_digest
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.reading import parse_json
 from clsas.engine.data.reprs import Report, Table
 from clsas.engine.data.simplify import EFFECTS
-from clsas.engine.data.validate import ArgumentError, ArgumentTypeError, Choice, Number
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.engine.device.kernels import PHASE_TERMS
 from clsas.engine.exact.decide import ACCURACY
 from clsas.engine.factorized.track import Shape
@@ -471,12 +472,21 @@ class ExactImage:
 
     accuracy_db: Annotated[float, ACCURACY]
     reason: str = ""
-    taps: Annotated[int | None, Choice(TAPS, help="Samples per interpolation; 2 is linear.")] = None
+    taps: Annotated[
+        int | None, Choice(TAPS, help="Samples of a line per interpolation.", default="the fastest")
+    ] = None
     upsampling: Annotated[
         float | None,
-        Number(least=1.0, most=MOST_UPSAMPLING, help="Upsampling of lines before interpolation."),
+        Number(
+            least=1.0,
+            most=MOST_UPSAMPLING,
+            help="Factor by which lines are upsampled before interpolation.",
+            default="the fastest",
+        ),
     ] = None
-    kind: Annotated[Literal["exact"], Choice(("exact",))] = "exact"
+    kind: Annotated[Literal["exact"], Choice(("exact",), help="Tells it from a factorization.")] = (
+        "exact"
+    )
 
     sides: ClassVar[tuple[tuple[int, int], ...]] = ()
     half_precision: ClassVar[bool] = False
@@ -484,7 +494,7 @@ class ExactImage:
 
     def __post_init__(self) -> None:
         """Raise TypeError or ValueError if a field is not allowed."""
-        validate.check_fields(self)
+        check_fields(self)
         _check(self, reason=validate.text)
 
 

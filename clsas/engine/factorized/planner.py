@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
+from clsas.engine.data.declared import Count, Flag, Number, Other, check_fields
 from clsas.engine.data.digests import grid_digest, lines_digest
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, some_channels, wavelength_m
-from clsas.engine.data.validate import ArgumentError, ArgumentTypeError, Count, Flag, Number
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.engine.data.visibility import sines
 from clsas.engine.device.device import Device
 from clsas.engine.exact.decide import ACCURACY_DB
@@ -60,6 +61,7 @@ TOLERANCE = Number(
     least=BEST_TOLERANCE_DB,
     most=WORST_TOLERANCE_DB,
     help="Largest relative rms error against the exact image.",
+    default="-50",
 )
 """Declares tolerances in dB."""
 
@@ -112,8 +114,8 @@ class Request:
     lines: RangeLines
     grid: Grid
     tolerance_db: Annotated[float | None, TOLERANCE] = None
-    tolerance_wavelengths: InitVar[float | None] = None
-    stages: Sequence[tuple[int, int]] | None = None
+    tolerance_wavelengths: InitVar[Annotated[float | None, TOLERANCE_WAVELENGTHS]] = None
+    stages: Annotated[Sequence[tuple[int, int]] | None, THESIS_STAGES] = None
     beam: BeamWindow | None = None
     memory_bytes: Annotated[int | None, Count(help="Device memory that may be used.")] = None
     costs: Costs | None = None
@@ -142,7 +144,7 @@ class Request:
                 f"{given[0]}, {given[1]} and {given[2]}",
             )
         validate.memory("grid", 8 * self.grid.size)
-        validate.check_fields(self)
+        check_fields(self)
         self._set("tolerance_db", tolerance_in_db(self.tolerance_db, tolerance_wavelengths))
         if self.stages is not None:
             self._set("stages", _stages_within(self.stages, self.lines, self.grid))
@@ -161,6 +163,19 @@ class Request:
     def _set(self, name: str, value: object) -> None:
         """Replace an argument by its checked value."""
         object.__setattr__(self, name, value)
+
+
+def _checked_stages(name: str, stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return (QR, QI) of every stage."""
+    return checked_pairs(stages)
+
+
+THESIS_STAGES = Other(
+    _checked_stages,
+    help="QR and QI of every stage of the thesis's method: the number of lines that are summed, "
+    "and of divisions of a side.",
+)
+"""Declares stages of the thesis's method."""
 
 
 def checked_tolerance_db(tolerance_db: float) -> float:
@@ -193,7 +208,7 @@ TOLERANCE_WAVELENGTHS = Number(
     "wavelengths",
     least=wavelengths(BEST_TOLERANCE_DB),
     most=wavelengths(WORST_TOLERANCE_DB),
-    help="The tolerance, stated as a range error in wavelengths, such as 1/30.",
+    help="The tolerance as a range error, evenly distributed up to this many wavelengths.",
 )
 """Declares tolerances in wavelengths."""
 

@@ -16,16 +16,17 @@ from scipy import fft
 from scipy.interpolate import CubicSpline
 
 from clsas.engine.data import validate
+from clsas.engine.data.declared import Flag, Number, Other, check_declared
 from clsas.engine.data.fourier import EDGE_PRODUCT, fourier_integral, smooth_edge
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.system import Pulse
-from clsas.engine.data.validate import ArgumentError, Flag, Number
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.echoes import Echoes
 from clsas.engine.signal.replica import Replica
 
 Window = str | float | tuple
 
-OVERSAMPLING = Number(least=1.0, most=1e4, help="Sample rate of the lines over the bandwidth.")
+OVERSAMPLING = Number(least=1.0, most=1e4, help="Samples of the lines per bandwidth.")
 """Declares the oversampling of lines. Its limit is arbitrary, far beyond what improves them."""
 
 # Width, in bandwidths, of the edges that the band of the filter gets when the filter is truncated.
@@ -50,11 +51,14 @@ _BYTES_FILTERED = 160  # per frequency of the filter
 def compress(
     echoes: Echoes,
     *,
-    window: Window = "none",
-    oversampling: float = 2.0,
+    window: Annotated[Window, WINDOW] = "none",
+    oversampling: Annotated[float, OVERSAMPLING] = 2.0,
     bandwidth_hz: float | None = None,
     replica: Replica | None = None,
-    equalize: bool = False,
+    equalize: Annotated[
+        bool,
+        Flag("Remove the ripples of the pulse's spectrum, and the range side lobes they cause."),
+    ] = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RangeLines:
     """Return the range lines of echoes, compressed by a matched filter or an equalizing one.
@@ -134,7 +138,8 @@ def compress(
     """
     validate.instance("echoes", echoes, Echoes)
     validate.progress(progress)
-    check_options(window=window, oversampling=oversampling, equalize=equalize)
+    options = {"window": window, "oversampling": oversampling, "equalize": equalize}
+    check_declared(compress, options)
     if replica is not None:
         validate.instance("replica", replica, Replica)
     pulse, rate = replica or echoes.pulse, echoes.sample_rate_hz
@@ -201,15 +206,15 @@ def compress(
     )
 
 
-def check_options(
-    *,
-    window: Window = "none",
-    oversampling: Annotated[float, OVERSAMPLING] = 2.0,
-    equalize: Annotated[bool, Flag(help="Remove the ripples of the pulse's spectrum.")] = False,
-) -> None:
-    """Raise TypeError or ValueError for options that `compress` refuses for all echoes."""
+def _checked_window(name: str, window: Window) -> Window:
+    """Return a window if SciPy has it; a list, as TOML has them, becomes a tuple."""
+    window = tuple(window) if isinstance(window, list) else window
     band_window(window, 1.0)
-    validate.check_declared(check_options, {"oversampling": oversampling, "equalize": equalize})
+    return window
+
+
+WINDOW = Other(_checked_window, help="Window over the band, such as hamming or taylor.")
+"""Declares the window over the band of lines."""
 
 
 def band_window(
@@ -240,7 +245,7 @@ def band_window(
             window = validate.number("it", window)
         values = get_window(window, count, fftbins=False)
     except (ValueError, TypeError, IndexError) as error:
-        allowed = "be 'none' or a window of `scipy.signal.get_window`"
+        allowed = "be 'none' or a window of SciPy, such as 'hamming', 'hann' or 'taylor'"
         given = validate.shown(window)
         raise ArgumentError("window", allowed, given, str(error)) from None
     values = validate.array("window", values, np.float64, (count,))

@@ -348,7 +348,7 @@ def navigation(folder: Path) -> dict[str, Call]:
                 "seabed_z_m": 0.0,
                 "element_length_m": (0.1, 0.1),
                 "sway_sd_m": np.full(12, 0.1),
-                "yaw_sd_rad": np.full(12, 0.01),
+                "yaw_sd_deg": np.full(12, 0.5),
                 "surge_sd_m": np.full(12, 0.1),
                 "correlation_pings": 5.0,
                 "unknowns": ("sway", "yaw", "surge"),

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from clsas.engine.data import validate
-from clsas.engine.data.validate import (
-    ArgumentError,
-    ArgumentTypeError,
+from clsas.engine.data.declared import (
     Choice,
     Count,
     Flag,
     Number,
     check_declared,
     check_fields,
+    declared,
 )
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 
 PARTS = ("taper", "be from 0 to 1", "2", "use `beam`", "a.toml [beam]")
 
@@ -164,8 +164,8 @@ def test_parameters_of_functions_are_checked_where_given():
 
 
 def test_declarations_are_found_by_name():
-    found = validate.declared(Declared)
+    found = declared(Declared)
     assert list(found) == ["length_m", "taps", "shape", "even", "width_m"]
     assert found["length_m"] == Number("m", above=0.0, most=5.0, help="Length.")
     assert found["even"] == Flag("Even.")
-    assert validate.declared(function) == {"taps": Count(), "shape": Choice(("hann",))}
+    assert declared(function) == {"taps": Count(), "shape": Choice(("hann",))}
