@@ -43,9 +43,9 @@ from .files.hdf5 import FileFormatError as FileFormatError
 from .files.phase_histories import read_phase_history as read_phase_history
 from .files.sound_speed_files import read_sound_speed as read_sound_speed
 from .files.xarrays import to_xarray as to_xarray
+from .inspection.inspection import Inspection as Inspection
 from .inspection.inspection import inspect as inspect
-from .inspection.result import Inspection as Inspection
-from .inspection.result import PhaseSign as PhaseSign
+from .inspection.phase_sign import PhaseSign as PhaseSign
 from .inspection.sampling import check_sampling as check_sampling
 from .interferometry.heights import heights as heights
 from .interferometry.interferogram import Interferogram as Interferogram

@@ -7,34 +7,52 @@ recordings. A test compares that table with the findings here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
+from scipy.signal.windows import hann
 
 from clsas.engine.data import decibels
+from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.coverage import behind
 from clsas.engine.data.findings import Finding
-from clsas.engine.data.lines import RangeLines, some_channels
-from clsas.engine.data.pings import STILL
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.grid import Grid
+from clsas.engine.data.lines import RangeLines, banks_of, some_channels, wavelength_between_m
+from clsas.engine.data.pings import STILL, Transmissions
 from clsas.engine.data.reprs import measured
+from clsas.engine.device.device import Device
 from clsas.engine.signal.ambiguity import end_powers
 from clsas.engine.signal.doubts import MOST_WAVELENGTHS, doubts
-from clsas.engine.signal.spectrum import NEEDED_OVERSAMPLING
-from clsas.inspection.phase_sign import CLEAR
-from clsas.inspection.recording import (
-    CONSTANT_DB,
-    LEAST_CLIPPED,
-    LEAST_COUNT,
-    Recording,
-    constant_share,
-)
-from clsas.inspection.result import runs
+from clsas.engine.signal.echoes import Echoes
+from clsas.engine.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum, measure_spectrum
+from clsas.inspection.phase_sign import CLEAR, PhaseSign, phase_sign
 from clsas.inspection.sampling import check_sampling
-from clsas.inspection.slips import POINTS, covered, likely_slip, ranges_m
 from clsas.navigation.correlation import DEAD_DB, are_dead
 
+_LEAST_CLIPPED = 8
+"""Fewest samples at its largest level that make a channel count as clipped. Echoes have one or
+two."""
+_SAME_LEVEL = 1e-5
+"""Relative difference up to which two levels count as equal, to allow for rounding. Within 1e-3 of
+the largest level, the beats of overlapping chirps have a dozen samples."""
+_CLIPPED_OVER_NEXT = 5.0
+"""Least ratio of the samples at a ceiling to those at the next lower level. Peaks of echoes have
+ratios of 1 to 3."""
+_CONSTANT_DB = -40.0
+"""Power of a constant relative to the echoes above which it is reported. In an image of N channels,
+the power of a constant grows N times as much as that of echoes."""
+_BESIDE = 8  # frequencies on either side of a constant that it is compared with
+_LEAST_COUNT = 4 * _BESIDE  # samples or pings in which a constant can be measured
+_MAIN_LOBE = 2  # frequencies on either side of a constant that a Hann window fills
+_SPIKE = 2.0  # least power of a constant relative to the largest beside it; speckle reaches 1.2
+_EQUAL_RANGE = 1e-3  # steps by which the first ranges of pings may differ
+_BLOCK = 1 << 22  # samples processed at a time
 _GAP = 1.75
 """Advance relative to that of the pings around, above which pings are missing. One missing ping
 doubles the advance."""
@@ -54,6 +72,197 @@ a quarter of a line exceed it. A full matrix capture reaches 0.12 by surface wav
 along the array and arrive before any echo."""
 _OUTSIDE = 0.01  # share of the pixels that no line reaches, above which it is reported
 _SLIPPED = 0.25  # such a share, above which slips of units are tried
+_POINTS = 16
+"""Grid points sampled along either side."""
+_EXPLAINED = 0.5  # least share of the uncovered grid that a slip must explain
+_LONGEST = 30.0
+"""Length of corrected lines relative to the farthest range of the grid, at most. Longer lines would
+cover any grid."""
+_ALIKE = 0.05  # slips that differ by less than this share of the grid explain it equally well
+_MOST_RUNS = 12  # runs of indices that are written out
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A recording, its measures, and what is known of the image to come.
+
+    Attributes
+    ----------
+    recorded : RangeLines or Echoes
+        The data as given.
+    lines : RangeLines
+        The given lines, or the echoes after compression.
+    grid, beam, element_length_m, device
+        As for `inspect`.
+    """
+
+    recorded: RangeLines | Echoes
+    lines: RangeLines
+    grid: Grid | None
+    beam: BeamWindow | None
+    element_length_m: float | None
+    device: Device | None
+
+    @cached_property
+    def pings(self) -> Transmissions:
+        """Pings of the lines."""
+        return Transmissions.of(self.lines.tx_m, self.lines.rx_m)
+
+    @cached_property
+    def moving(self) -> RangeLines:
+        """Lines of the pings during which the platform advances, or all lines if it never does.
+
+        A halt of hundreds of equal pings would outweigh the rest of the track.
+        """
+        advancing = self.pings.advancing()
+        if not self.pings.usual_step_m or advancing.all():
+            return self.lines
+        return self.lines.select(self.pings.channels(advancing))
+
+    @cached_property
+    def moving_pings(self) -> Transmissions:
+        """Pings of the moving lines."""
+        if self.moving is self.lines:
+            return self.pings
+        return Transmissions.of(self.moving.tx_m, self.moving.rx_m)
+
+    @property
+    def receivers(self) -> int | None:
+        """Channels per ping if all pings have the same number, else None."""
+        counts = self.pings.receivers
+        return None if np.ptp(counts) else int(counts[0])
+
+    @cached_property
+    def spectrum(self) -> Spectrum:
+        """Mean power spectrum of the moving lines."""
+        return measure_spectrum(self.moving)
+
+    @property
+    def rate_hz(self) -> float:
+        """Sample rate of the lines."""
+        return self.lines.sound_speed_m_s / (2 * self.lines.range_step_m)
+
+    @property
+    def band_hz(self) -> tuple[float, float]:
+        """Lower and upper end of the occupied band."""
+        middle_hz = self.lines.carrier_hz + self.spectrum.centre * self.rate_hz
+        half_hz = self.rate_hz / max(self.spectrum.oversampling, 1.0) / 2
+        return middle_hz - half_hz, middle_hz + half_hz
+
+    @property
+    def wavelength_m(self) -> float:
+        """Wavelength at the mean magnitude of the frequencies of the band.
+
+        That is the middle of the band unless it reaches below 0 Hz. The middle of such a band is
+        arbitrary: it may be 0 Hz, where the wavelength is infinite.
+        """
+        return wavelength_between_m(self.lines, *self.band_hz)
+
+    @cached_property
+    def levels(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Power and clipped samples of every channel, [channels] each; see `levels_of`.
+
+        They are those of the data as recorded: compression spreads clipped samples over a line.
+        """
+        is_echoes = isinstance(self.recorded, Echoes)
+        return levels_of(self.recorded.samples, magnitudes=not is_echoes)
+
+    @cached_property
+    def background(self) -> float:
+        """Share of the power that is the same in all moving pings.
+
+        It is 0 if there are too few pings, or the lines of a receiver begin at different ranges.
+        """
+        lines, pings = self.moving, self.moving_pings
+        if pings.count < _LEAST_COUNT or np.ptp(pings.receivers):
+            return 0.0
+        shape = pings.count, int(pings.receivers[0])
+        first_m = lines.first_range_m.reshape(shape)
+        if np.ptp(first_m, axis=0).max() > _EQUAL_RANGE * lines.range_step_m:
+            return 0.0
+        samples = lines.samples.reshape(*shape, lines.length)
+        some = some_channels(shape[1], 8)
+        return float(np.mean([_constant_share(samples[:, receiver], 0.0) for receiver in some]))
+
+    @cached_property
+    def sign(self) -> tuple[PhaseSign | None, str]:
+        """Comparison of both signs of the phase; see `phase_sign`."""
+        # Of the first bank, since those of several may cancel in an image.
+        lines = self.moving.bank(banks_of(self.moving.bank_numbers)[0])
+        if self.background > decibels.power(_CONSTANT_DB):
+            # It is equally bright in every ping, and would be taken for the brightest echoes.
+            per_bank = None if self.receivers is None else self.receivers // self.lines.banks
+            lines = lines.without_background("median", receivers=per_bank)
+        cell_m = lines.range_step_m * max(self.spectrum.oversampling, 1.0)
+        return phase_sign(lines, self.grid, self.wavelength_m, cell_m, self.device)
+
+
+def levels_of(samples: NDArray, magnitudes: bool) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the power and the number of clipped samples of every channel.
+
+    The power is the variance, relative to the squared magnitude of the largest sample of all.
+    Clipped samples lie at the largest level of a channel; their number is 0 if it is no more than
+    echoes have there. Real and imaginary parts may be clipped and, with `magnitudes`, magnitudes
+    too.
+    """
+    scale = max(float(np.abs(block).max()) for block in _blocks(samples)) or 1.0
+    precision = np.complex128 if np.iscomplexobj(samples) else np.float64
+    power, clipped = [], []
+    for block in _blocks(samples):
+        scaled = block / np.float32(scale)
+        if scaled.shape[1] == 1:  # a single sample has no variance
+            scaled = np.concatenate([scaled, -scaled], axis=1)
+        power.append(scaled.var(axis=1, dtype=precision).real)
+        count = _clipped_samples(np.maximum(np.abs(scaled.real), np.abs(scaled.imag)))
+        if magnitudes:
+            count = np.maximum(count, _clipped_samples(np.abs(scaled)))
+        clipped.append(count)
+    return np.concatenate(power), np.concatenate(clipped)
+
+
+def _blocks(samples: NDArray) -> Iterator[NDArray]:
+    rows = max(1, _BLOCK // samples.shape[1])
+    for first in range(0, len(samples), rows):
+        yield samples[first : first + rows]
+
+
+def _clipped_samples(level: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return how many samples of each channel lie at its largest level, or 0 without clipping."""
+    largest = level.max(axis=1, keepdims=True)
+    at_top = level >= (1 - _SAME_LEVEL) * largest
+    counts = at_top.sum(axis=1) * (largest[:, 0] > 0)
+    counts[counts < _LEAST_CLIPPED] = 0
+    for channel in np.flatnonzero(counts):
+        lower = level[channel][~at_top[channel]]
+        margin = _SAME_LEVEL * largest[channel, 0]
+        beside = int((lower >= lower.max() - margin).sum()) if lower.size and lower.any() else 0
+        if counts[channel] < _CLIPPED_OVER_NEXT * beside:
+            counts[channel] = 0
+    return counts
+
+
+def _constant_share(samples: NDArray, frequency: float) -> float:
+    """Return the share of the power of columns at a single frequency, in cycles per sample.
+
+    Echoes have power at this frequency as well, so only what exceeds the power at the frequencies
+    beside it counts. The share is 0 unless the frequency stands out like a spectral line.
+    """
+    count = len(samples)
+    window = hann(count, sym=False)
+    offsets = np.arange(-_BESIDE, _BESIDE + 1)
+    turns = np.exp(-2j * np.pi * np.outer(frequency + offsets / count, np.arange(count))) * window
+    largest = float(np.abs(samples).max()) or 1.0
+    power, total = np.zeros(len(offsets)), 0.0
+    columns = max(1, _BLOCK // count)
+    for first in range(0, samples.shape[1], columns):
+        block = samples[:, first : first + columns] / np.float32(largest)
+        power += (np.abs(turns.astype(np.complex64) @ block) ** 2).sum(axis=1, dtype=np.float64)
+        total += float((np.abs(block) ** 2).sum(dtype=np.float64)) / count
+    others = power[np.abs(offsets) > _MAIN_LOBE]
+    beside, at = float(np.median(others)), float(power[_BESIDE])
+    if not total or at <= _SPIKE * float(others.max()):
+        return 0.0
+    return (at - beside) / float(window.sum()) ** 2 / total
 
 
 def check_aperture(recording: Recording) -> Iterator[Finding]:
@@ -203,7 +412,7 @@ def check_clipping(recording: Recording) -> Iterator[Finding]:
         "(`lines.select(...)`), or silence what overdrives them, such as the transmission"
     )
     where = tuple(np.flatnonzero(clipped).tolist())
-    yield Finding("clipped_channels", message, float(worst), float(LEAST_CLIPPED), remedy, where)
+    yield Finding("clipped_channels", message, float(worst), float(_LEAST_CLIPPED), remedy, where)
 
 
 def _of_channels(defective: NDArray[np.bool_]) -> str:
@@ -224,7 +433,7 @@ def _in_every_ping(defective: NDArray[np.bool_], receivers: int | None) -> str:
 def check_offset(recording: Recording) -> Iterator[Finding]:
     """Yield a constant that a recorder added, at 0 Hz of the lines or of the recorded signal."""
     lines, rate_hz = recording.moving, recording.rate_hz
-    if lines.length < LEAST_COUNT:
+    if lines.length < _LEAST_COUNT:
         return
     part = lines.select(some_channels(lines.channels))
     remove_mean = (
@@ -237,20 +446,20 @@ def check_offset(recording: Recording) -> Iterator[Finding]:
     if 0 < lines.carrier_hz < rate_hz / 2:
         constants.append(("the recorded signal", -lines.carrier_hz / rate_hz, high_pass))
     for signal, frequency, remedy in constants:
-        share = constant_share(part.samples.T, frequency)
-        if share > decibels.power(CONSTANT_DB):
+        share = _constant_share(part.samples.T, frequency)
+        if share > decibels.power(_CONSTANT_DB):
             found_db = decibels.in_db(share)
             message = (
                 f"a constant at 0 Hz of {signal} has {found_db:.1f} dB of the echoes' power; it "
-                f"should be below {CONSTANT_DB:.0f} dB"
+                f"should be below {_CONSTANT_DB:.0f} dB"
             )
-            yield Finding("offset", message, found_db, CONSTANT_DB, remedy)
+            yield Finding("offset", message, found_db, _CONSTANT_DB, remedy)
             return
 
 
 def check_background(recording: Recording) -> Iterator[Finding]:
     """Yield power that is the same in all pings."""
-    share, limit = recording.background, decibels.power(CONSTANT_DB)
+    share, limit = recording.background, decibels.power(_CONSTANT_DB)
     if share > limit:
         message = (
             f"{100 * share:.3g} % of the power is the same in all pings; it should be below "
@@ -258,7 +467,7 @@ def check_background(recording: Recording) -> Iterator[Finding]:
             "range can cause this"
         )
         remedy = "remove it with `lines.without_background('median')`"
-        yield Finding("background", message, decibels.in_db(share), CONSTANT_DB, remedy)
+        yield Finding("background", message, decibels.in_db(share), _CONSTANT_DB, remedy)
 
 
 def check_ends(recording: Recording) -> Iterator[Finding]:
@@ -335,8 +544,9 @@ def check_first_range(recording: Recording) -> Iterator[Finding]:
     if _beyond_any_range(lines):
         limit_m, limit = 0.0, "no range is positive"
         if last_m > 0:
-            limit_m, length = _FARTHEST * _extent_m(lines), measured(_extent_m(lines), "m")
-            limit = f"more than {_FARTHEST:g} times their length of {length}"
+            extent_m = max(lines.length - 1, 1) * lines.range_step_m
+            limit_m = _FARTHEST * extent_m
+            limit = f"more than {_FARTHEST:g} times their length of {measured(extent_m, 'm')}"
         message = f"the lines begin at {first_m:.6g} m and end at {last_m:.6g} m: {limit}"
         remedy = (
             "check the time of the first sample, which must be in seconds, not in samples; "
@@ -366,11 +576,8 @@ def check_first_range(recording: Recording) -> Iterator[Finding]:
 def _beyond_any_range(lines: RangeLines) -> bool:
     """Return True if no range is positive, or all lie far beyond those of any recording."""
     nearest_m = float(np.abs(lines.first_range_m).min())
-    return bool(lines.last_range_m.max() <= 0) or nearest_m > _FARTHEST * _extent_m(lines)
-
-
-def _extent_m(lines: RangeLines) -> float:
-    return max(lines.length - 1, 1) * lines.range_step_m
+    extent_m = max(lines.length - 1, 1) * lines.range_step_m
+    return bool(lines.last_range_m.max() <= 0) or nearest_m > _FARTHEST * extent_m
 
 
 def check_grid(recording: Recording) -> Iterator[Finding]:
@@ -378,10 +585,12 @@ def check_grid(recording: Recording) -> Iterator[Finding]:
     lines, grid = recording.lines, recording.grid
     if grid is None or _beyond_any_range(lines):
         return
-    share = covered(lines, grid)
+    points_m = grid.spread(_POINTS).reshape(-1, 3)
+    share = _covered(lines, points_m)
     if share >= 1 - _OUTSIDE:
         return
-    range_m = ranges_m(lines, grid)
+    part = lines.select(some_channels(lines.channels))
+    range_m = pairwise_range_m(points_m, part.tx_m, part.rx_m)
     near_m, far_m = float(range_m.min()), float(range_m.max())
     message = (
         f"{100 * (1 - share):.3g} % of the grid lies beyond all lines: the grid has ranges from "
@@ -390,20 +599,74 @@ def check_grid(recording: Recording) -> Iterator[Finding]:
     )
     low_m, high_m = grid.bounds_m
     remedy = "choose another grid, or check the time of the first sample and the sound speed"
-    if near_m <= float(np.linalg.norm(high_m - low_m)) / POINTS:
+    if near_m <= float(np.linalg.norm(high_m - low_m)) / _POINTS:
         remedy = "choose another grid: the track runs through this one"
-    elif 1 - share > _SLIPPED and (likely := likely_slip(lines, grid, share)):
+    elif 1 - share > _SLIPPED and (likely := _likely_slip(lines, points_m, share, far_m)):
         slip, corrected = likely
-        remedy = f"check units: {slip.words}. Corrected, the lines would cover "
-        remedy += f"{100 * corrected:.3g} % of the grid"
+        remedy = (
+            f"check units: {slip}. Corrected, the lines would cover {100 * corrected:.3g} % of "
+            "the grid"
+        )
     yield Finding("grid_outside", message, 1 - share, _OUTSIDE, remedy)
+
+
+def _likely_slip(
+    lines: RangeLines, points_m: NDArray[np.float64], share: float, far_m: float
+) -> tuple[str, float] | None:
+    """Return the slip of units or time that best explains why lines reach only a share of points.
+
+    With it comes the share that the corrected lines reach; None if no slip explains it. Among slips
+    that explain it equally well, those that leave the lines shortest come first, since long lines
+    reach any grid; among these, the most common.
+    """
+    half_speed = lines.sound_speed_m_s / 2
+    # The most common first, with the factors of first ranges, range step and positions.
+    slips = [
+        ("`first_range_m` seems to be a time in seconds, not half the sound speed times it",
+         half_speed, 1.0, 1.0),
+        ("the time of the first sample seems to be in milliseconds, not in seconds",
+         1e-3, 1.0, 1.0),
+        ("`first_range_m` seems to be in samples, not in metres", lines.range_step_m, 1.0, 1.0),
+        ("the time of the first sample seems to be in samples, not in seconds",
+         lines.range_step_m / half_speed, 1.0, 1.0),
+        ("ranges seem to be in millimetres, not in metres", 1e-3, 1e-3, 1.0),
+        ("ranges seem to be in kilometres, not in metres", 1e3, 1e3, 1.0),
+        ("ranges seem to be the two-way path, not half of it", 0.5, 0.5, 1.0),
+        ("positions seem to be in millimetres, not in metres", 1.0, 1.0, 1e-3),
+        ("positions seem to be in kilometres, not in metres", 1.0, 1.0, 1e3),
+    ]  # fmt: skip
+    found = [
+        (step, words, _covered(lines, points_m, first, step, positions))
+        for words, first, step, positions in slips
+        if step * lines.range_step_m * lines.length <= _LONGEST * far_m
+    ]
+    most = max((corrected for *_, corrected in found), default=0.0)
+    if most < share + _EXPLAINED * (1 - share):
+        return None
+    alike = [each for each in found if each[2] >= most - _ALIKE]
+    _, words, corrected = min(alike, key=lambda each: each[0])
+    return words, corrected
+
+
+def _covered(
+    lines: RangeLines,
+    points_m: NDArray[np.float64],
+    first: float = 1.0,
+    step: float = 1.0,
+    positions: float = 1.0,
+) -> float:
+    """Return the share of points that some line reaches, once factors correct a slip."""
+    part = lines.select(some_channels(lines.channels))
+    first_m = first * part.first_range_m
+    last_m = first_m + (lines.length - 1) * step * lines.range_step_m
+    range_m = pairwise_range_m(points_m, positions * part.tx_m, positions * part.rx_m)
+    return float(((range_m >= first_m) & (range_m <= last_m)).any(axis=1).mean())
 
 
 def check_side(recording: Recording) -> Iterator[Finding]:
     """Yield that parts of the grid lie behind the elements."""
     grid = recording.grid
-    found = None if grid is None else behind(recording.lines, grid)
-    if found is not None:
+    if grid is not None and (found := behind(recording.lines, grid)) is not None:
         yield found
 
 
@@ -431,6 +694,18 @@ def check_doubts(recording: Recording) -> Iterator[Finding]:
     detailed = ("advance", "held_fixes", "phase_sign")
     found = doubts(recording.lines, recording.grid, recording.beam)
     yield from (each for each in found if each.name not in detailed)
+
+
+def runs(indices: Iterable[int]) -> str:
+    """Return ascending indices as runs, such as "0-12, 40"; at most the first dozen runs."""
+    ordered = np.unique(np.fromiter(indices, np.int64))
+    breaks = [0, *(np.flatnonzero(np.diff(ordered) > 1) + 1).tolist(), len(ordered)]
+    parts = []
+    for start, stop in pairwise(breaks):
+        first, last = ordered[start], ordered[stop - 1]
+        parts.append(f"{first}" if first == last else f"{first}-{last}")
+    rest = len(parts) - _MOST_RUNS
+    return ", ".join(parts[:_MOST_RUNS]) + (f" and {rest} more runs" if rest > 0 else "")
 
 
 CHECKS: tuple[Callable[[Recording], Iterator[Finding]], ...] = (

@@ -19,7 +19,6 @@ from clsas.engine.data.validate import ClsasWarning
 from clsas.engine.device.device import Device
 from clsas.engine.imaging import backproject
 from clsas.engine.scene import check_numbers
-from clsas.inspection.result import PhaseSign
 
 CLEAR = 1.5
 """Least ratio of the two sharpnesses that determines the sign. In speckle it reaches 1.1."""
@@ -43,20 +42,31 @@ _FINER = 4  # factor by which each step of the search is finer
 _ACCURACY_DB = -40.0
 
 
-class _UndeterminedError(Exception):
-    """The sign cannot be determined from a target; the message says why."""
-
-
 @dataclass(frozen=True, eq=False)
-class _Target:
-    """A position with strong echoes, and the channel by which half of its energy has arrived.
+class PhaseSign:
+    """Sharpness of a small image of the lines as given, and of their conjugates.
 
-    If it is not located, only its range is known and its direction is assumed.
+    Attributes
+    ----------
+    as_given, conjugate : float
+        Mean squared intensity along the track over the squared mean: 2 for speckle and for blurred
+        points, more for sharper images.
+    centre_m : (float, float, float)
+        Centre of the image in metres.
+
+    See Also
+    --------
+    Inspection.sign : Where `inspect` reports it.
     """
 
-    position_m: NDArray[np.float64]
-    channel: int
-    is_located: bool
+    as_given: float
+    conjugate: float
+    centre_m: tuple[float, float, float]
+
+    @property
+    def ratio(self) -> float:
+        """Sharpness with conjugate lines relative to that with the lines as given."""
+        return self.conjugate / self.as_given if self.as_given else 1.0
 
 
 def phase_sign(
@@ -82,13 +92,24 @@ def phase_sign(
     except _UndeterminedError as error:
         return None, str(error)
     signs, reasons = [], []
-    for target in targets:
+    for position_m, channel in targets:
         try:
-            part, patch = _patch(lines, target, wavelength_m, cell_m)
+            part, patch = _patch(
+                lines, position_m, channel, wavelength_m, cell_m, is_located=grid is not None
+            )
         except _UndeterminedError as error:
             reasons.append(str(error))
-        else:
-            signs.append(_compared(part, patch, target.position_m, device))
+            continue
+        conjugate = replace(part, samples=part.samples.conj())
+        with warnings.catch_warnings():  # about accuracy, which is not needed here
+            warnings.simplefilter("ignore", ClsasWarning)
+            as_given, of_conjugate = (
+                _sharpness_along(backproject(each, patch, device=device, accuracy_db=_ACCURACY_DB))
+                for each in (part, conjugate)
+            )
+        x, y, z = position_m.tolist()
+        signs.append(PhaseSign(as_given, of_conjugate, centre_m=(x, y, z)))
+
     if not signs:
         return None, reasons[0]
     sharp = [sign for sign in signs if _best_sharpness(sign) >= _SHARP]
@@ -107,45 +128,25 @@ def _best_sharpness(sign: PhaseSign) -> float:
     return max(sign.as_given, sign.conjugate)
 
 
-def _compared(
-    part: RangeLines, patch: Grid, centre_m: NDArray[np.float64], device: Device | None
-) -> PhaseSign:
-    """Return the sharpness of a patch with both signs of the phase."""
-    conjugate = replace(part, samples=part.samples.conj())
-    with warnings.catch_warnings():  # about accuracy, which is not needed here
-        warnings.simplefilter("ignore", ClsasWarning)
-        as_given, of_conjugate = (
-            _sharpness_along(backproject(each, patch, device=device, accuracy_db=_ACCURACY_DB))
-            for each in (part, conjugate)
-        )
-    x, y, z = centre_m.tolist()
-    return PhaseSign(as_given, of_conjugate, centre_m=(x, y, z))
+class _UndeterminedError(Exception):
+    """The sign cannot be determined from a target; the message says why."""
 
 
-def _sharpness_along(image: Image) -> float:
-    """Return the mean squared intensity over the squared mean intensity, row by row.
+def _beside_track(lines: RangeLines, cell_m: float) -> list[tuple[NDArray[np.float64], int]]:
+    """Return positions on both sides of the track, at the ranges of the brightest samples.
 
-    Rows lie along the track. Echoes confined to a few ranges do not count as sharp, since blurred
-    ones are too.
+    Each comes with the channel of its sample.
     """
-    amplitude = np.abs(image.pixels)
-    intensity = (amplitude / (amplitude.max() or 1.0)).astype(np.float64) ** 2
-    squared_mean = float((intensity.mean(axis=1) ** 2).sum())
-    return float((intensity**2).mean(axis=1).sum()) / squared_mean if squared_mean else 0.0
-
-
-def _beside_track(lines: RangeLines, cell_m: float) -> list[_Target]:
-    """Return positions on both sides of the track, at the ranges of the brightest samples."""
     searched = some_channels(lines.channels, _SEARCHED_CHANNELS)
     level = np.abs(lines.samples[searched])
     centres_m = lines.phase_centres_m
-    course = _course(centres_m)
-    across = np.cross([0.0, 0.0, 1.0], course)
+    along = _course(centres_m)
+    across = np.cross([0.0, 0.0, 1.0], along)
     if np.linalg.norm(across) < 0.1:  # the course is vertical
-        across = np.cross([1.0, 0.0, 0.0], course)
+        across = np.cross([1.0, 0.0, 0.0], along)
     across /= np.linalg.norm(across)
     range_m = lines.first_range_m[searched, None] + np.arange(lines.length) * lines.range_step_m
-    targets: list[_Target] = []
+    targets: list[tuple[NDArray[np.float64], int]] = []
     reason = "no samples are left to search"
     for _ in range(_TARGETS):
         row, sample = np.unravel_index(int(level.argmax()), level.shape)
@@ -155,11 +156,9 @@ def _beside_track(lines: RangeLines, cell_m: float) -> list[_Target]:
         # Range is half the path, to one antenna and back to the other.
         apart_m = float(np.linalg.norm(lines.tx_m[channel] - lines.rx_m[channel])) / 2
         if found_m > apart_m:
-            distance_m = math.sqrt(found_m**2 - apart_m**2)
-            targets += [
-                _Target(centres_m[channel] + side * distance_m * across, channel, is_located=False)
-                for side in (1, -1)
-            ]
+            away_m = math.sqrt(found_m**2 - apart_m**2) * across
+            targets.append((centres_m[channel] + away_m, channel))
+            targets.append((centres_m[channel] - away_m, channel))
         elif not targets:
             reason = (
                 f"the brightest echoes have an impossible range of {found_m:.4g} m, since their "
@@ -171,80 +170,90 @@ def _beside_track(lines: RangeLines, cell_m: float) -> list[_Target]:
     return targets
 
 
-def _on_grid(lines: RangeLines, grid: Grid, cell_m: float) -> list[_Target]:
-    """Return the positions on a grid from which channels receive most."""
-    energy = _Energy(lines)
+def _on_grid(lines: RangeLines, grid: Grid, cell_m: float) -> list[tuple[NDArray[np.float64], int]]:
+    """Return the positions on a grid from which channels receive most.
+
+    They are exact to a resolution cell in range. Each comes with the channel by which half of its
+    energy has arrived.
+    """
+    searched = some_channels(lines.channels, _SEARCHED_CHANNELS)
+    part = lines.select(searched)
+    level = np.abs(part.samples)
+    power = (level / (level.max() or np.float32(1))) ** 2
+    centres_m = lines.phase_centres_m
+    along = _course(centres_m)
+
     points_m = grid.spread(_GRID_POINTS)
     pitch_m = 0.0  # the largest distance from a point to its nearest neighbour
     if len(points_m) > 1:
         pitch_m = float(cKDTree(points_m).query(points_m, k=2)[0][:, 1].max())
-    left = energy.around(points_m, pitch_m).sum(axis=1)
+    left = _received(part, power, points_m, pitch_m).sum(axis=1)
     targets = []
     for _ in range(_TARGETS):
         brightest = int(left.argmax())
         if not left[brightest] > 0:
             break
-        targets.append(energy.target(points_m[brightest], pitch_m, cell_m))
-        left[np.linalg.norm(points_m - points_m[brightest], axis=1) < 3 * pitch_m] = 0
+        position_m, fine_m = points_m[brightest], pitch_m
+        left[np.linalg.norm(points_m - position_m, axis=1) < 3 * pitch_m] = 0
+        channel = int(searched[_halfway(_received(part, power, position_m[None], pitch_m)[0])])
+        across = _across(position_m - centres_m[channel], along)
+        if across is not None:
+            while fine_m > cell_m:
+                fine_m /= _FINER
+                offsets_m = fine_m * np.arange(1 - _FINER, _FINER)
+                moves_m = offsets_m[:, None, None] * across + offsets_m[:, None] * along
+                tried_m = position_m + moves_m.reshape(-1, 3)
+                energy = _received(part, power, tried_m, fine_m).sum(axis=1)
+                position_m = tried_m[int(energy.argmax())]
+            channel = int(searched[_halfway(_received(part, power, position_m[None], cell_m)[0])])
+        targets.append((position_m, channel))
     if not targets:
         raise _UndeterminedError("no echoes come from the grid")
     return targets
 
 
-class _Energy:
-    """Power that some channels receive from positions, summed without regard to phase."""
+def _received(
+    part: RangeLines,
+    power: NDArray[np.float32],
+    points_m: NDArray[np.float64],
+    pitch_m: float,
+) -> NDArray[np.float32]:
+    """Return the largest power within a square of side `pitch_m` about each point.
 
-    def __init__(self, lines: RangeLines) -> None:
-        self.lines = lines
-        self.some = some_channels(lines.channels, _SEARCHED_CHANNELS)
-        self.part = lines.select(self.some)
-        level = np.abs(self.part.samples)
-        self.power = (level / (level.max() or np.float32(1))) ** 2
+    The result is [points, channels]. Points at this pitch miss no target between them. A target
+    has power in all channels, but a crossing of the arcs of two targets only in some.
+    """
+    reach = math.ceil(min(math.sqrt(0.5) * pitch_m / part.range_step_m, part.length))
+    largest = maximum_filter1d(power, 2 * reach + 1, axis=1, mode="constant")
+    range_m = pairwise_range_m(points_m, part.tx_m, part.rx_m)
+    index = np.rint((range_m - part.first_range_m) / part.range_step_m)
+    inside = (index >= 0) & (index < part.length)
+    index = np.clip(index, 0, part.length - 1).astype(np.int64)
+    found: NDArray[np.float32] = largest[np.arange(len(largest)), index] * inside
+    return found
 
-    def around(self, points_m: NDArray[np.float64], pitch_m: float) -> NDArray[np.float32]:
-        """Return the largest power within a square of side `pitch_m` about each point.
 
-        The result is [points, channels]. Points at this pitch miss no target between them. A target
-        has power in all channels, but a crossing of the arcs of two targets only in some.
-        """
-        part = self.part
-        reach = math.ceil(min(math.sqrt(0.5) * pitch_m / part.range_step_m, part.length))
-        power = maximum_filter1d(self.power, 2 * reach + 1, axis=1, mode="constant")
-        range_m = pairwise_range_m(points_m, part.tx_m, part.rx_m)
-        index = np.rint((range_m - part.first_range_m) / part.range_step_m)
-        inside = (index >= 0) & (index < part.length)
-        index = np.clip(index, 0, part.length - 1).astype(np.int64)
-        found: NDArray[np.float32] = power[np.arange(len(power)), index] * inside
-        return found
-
-    def channel(self, position_m: NDArray[np.float64], pitch_m: float) -> int:
-        """Return the channel by which half of the energy of a position has arrived."""
-        arrived = np.cumsum(self.around(position_m[None], pitch_m)[0])
-        return int(self.some[np.searchsorted(arrived, arrived[-1] / 2)])
-
-    def target(self, position_m: NDArray[np.float64], pitch_m: float, cell_m: float) -> _Target:
-        """Return the brightest position near a point of a grid, to a resolution cell in range."""
-        centres_m = self.lines.phase_centres_m
-        channel, along = self.channel(position_m, pitch_m), _course(centres_m)
-        across = _across(position_m - centres_m[channel], along)
-        if across is None:
-            return _Target(position_m, channel, is_located=True)
-        while pitch_m > cell_m:
-            pitch_m /= _FINER
-            offsets_m = pitch_m * np.arange(1 - _FINER, _FINER)
-            moves_m = offsets_m[:, None, None] * across + offsets_m[:, None] * along
-            tried_m = position_m + moves_m.reshape(-1, 3)
-            position_m = tried_m[int(self.around(tried_m, pitch_m).sum(axis=1).argmax())]
-        return _Target(position_m, self.channel(position_m, cell_m), is_located=True)
+def _halfway(received: NDArray[np.float32]) -> int:
+    """Return the channel by which half of the energy has arrived."""
+    arrived = np.cumsum(received)
+    return int(np.searchsorted(arrived, arrived[-1] / 2))
 
 
 def _patch(
-    lines: RangeLines, target: _Target, wavelength_m: float, cell_m: float
+    lines: RangeLines,
+    position_m: NDArray[np.float64],
+    channel: int,
+    wavelength_m: float,
+    cell_m: float,
+    is_located: bool,
 ) -> tuple[RangeLines, Grid]:
-    """Return lines near a target, and a patch about it in their slant plane."""
+    """Return the lines near a channel, and a patch about a target in their slant plane.
+
+    Of a target that is not located, only the range is known, and its direction is assumed.
+    """
     centres_m = lines.phase_centres_m
-    middle_m = centres_m[target.channel]
-    look_m = target.position_m - middle_m
+    middle_m = centres_m[channel]
+    look_m = position_m - middle_m
     range_m = float(np.linalg.norm(look_m))
     aperture_m = math.sqrt(_BLUR / 2 * wavelength_m * range_m)
     near = np.flatnonzero(np.linalg.norm(centres_m - middle_m, axis=1) <= aperture_m / 2)
@@ -266,15 +275,16 @@ def _patch(
             f"the track is too short: the brightest echoes, at {range_m:.4g} m, have an effective "
             f"aperture of {length_m:.3g} m"
         )
-    bend_m = length_m**2 / (8 * range_m)
-    if not target.is_located and _bend_m(part, along) > _MOST_BEND * bend_m:
+    away_m = part.phase_centres_m - part.phase_centres_m.mean(axis=0)
+    bend_m = float(np.linalg.norm(away_m - np.outer(away_m @ along, along), axis=1).max())
+    if not is_located and bend_m > _MOST_BEND * length_m**2 / (8 * range_m):
         raise _UndeterminedError("the track is not straight: a grid is needed")
     # There are two pixels per resolution cell. The patch is as long as the blur of a wrong sign.
     pitch_m = wavelength_m * range_m / (2 * length_m) / 2
     columns = min(math.ceil(1.2 * length_m / pitch_m), _PIXELS)
     rows = int(2 * _CELLS)
     steps_m = cell_m / 2 * across, pitch_m * along
-    origin_m = target.position_m - steps_m[0] * (rows - 1) / 2 - steps_m[1] * (columns - 1) / 2
+    origin_m = position_m - steps_m[0] * (rows - 1) / 2 - steps_m[1] * (columns - 1) / 2
     try:
         check_numbers(part, None)
         return part, Grid.oriented(origin_m, *steps_m, (rows, columns))
@@ -289,10 +299,16 @@ def _across(look_m: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[
     return across / size if size > least else None
 
 
-def _bend_m(lines: RangeLines, along: NDArray[np.float64]) -> float:
-    """Return the largest distance of phase centres from a straight line."""
-    away_m = lines.phase_centres_m - lines.phase_centres_m.mean(axis=0)
-    return float(np.linalg.norm(away_m - np.outer(away_m @ along, along), axis=1).max())
+def _sharpness_along(image: Image) -> float:
+    """Return the mean squared intensity over the squared mean intensity, row by row.
+
+    Rows lie along the track. Echoes confined to a few ranges do not count as sharp, since blurred
+    ones are too.
+    """
+    amplitude = np.abs(image.pixels)
+    intensity = (amplitude / (amplitude.max() or 1.0)).astype(np.float64) ** 2
+    squared_mean = float((intensity.mean(axis=1) ** 2).sum())
+    return float((intensity**2).mean(axis=1).sum()) / squared_mean if squared_mean else 0.0
 
 
 def _course(centres_m: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,12 +5,10 @@ Equations in brackets are those of the thesis (Ødegaard 2004), [22]-[32].
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import BeamWindow
@@ -111,117 +109,88 @@ def check_sampling(
         validate.instance("sonar", sonar, Sonar, RangeLines)
         validate.instance("track", track, Track)
         validate.instance("grid", grid, Grid)
-    if sonar.banks > 1:
-        options: dict[str, Any] = {
-            "beam": beam,
-            "element_length_m": element_length_m,
-            "wavelength_m": wavelength_m,
-        }
-        of_banks = [
-            check_sampling(sonar.bank(number), track, grid, **options)
-            for number in banks_of(sonar.bank_numbers)
-        ]
-        return _worst(of_banks)
-    corners = None
+    if sonar.banks > 1:  # the finding of each name that exceeds its limit by most
+        worst: dict[str, Finding] = {}
+        for number in banks_of(sonar.bank_numbers):
+            for finding in check_sampling(
+                sonar.bank(number), track, grid, beam=beam,
+                element_length_m=element_length_m, wavelength_m=wavelength_m,
+            ):  # fmt: skip
+                known = worst.get(finding.name)
+                if known is None or finding.value * known.limit > known.value * finding.limit:
+                    worst[finding.name] = finding
+        return list(worst.values())
+
+    corners_m = None
     if grid is not None:
         validate.instance("grid", grid, Grid)
-        corners = corners_of(grid)
-    tx, rx = _antennas_m(sonar, track)
-    spacing = measure_spacing(
-        sonar,
-        phase_centres_m(tx, rx),
-        corners,
-        beam=beam,
-        element_length_m=element_length_m,
-        wavelength_m=wavelength_m,
-    )
-    ranges = None if corners is None else bistatic_range_m(corners[:, None], tx, rx)
-    found = _check_spacing(spacing, ranges)
-    if isinstance(sonar, Sonar) and isinstance(track, Track) and ranges is not None:
-        found += _check_ping_rate(sonar, track, ranges)
-    return found
-
-
-def _worst(of_banks: list[list[Finding]]) -> list[Finding]:
-    """Return the finding of each name that exceeds its limit by most."""
-    worst: dict[str, Finding] = {}
-    for finding in itertools.chain.from_iterable(of_banks):
-        known = worst.get(finding.name)
-        if known is None or finding.value * known.limit > known.value * finding.limit:
-            worst[finding.name] = finding
-    return list(worst.values())
-
-
-def _antennas_m(survey: Sonar | RangeLines, track: Track | Grid | None) -> tuple[NDArray, NDArray]:
-    """Return positions of transmitters and receivers, [channels, 3]."""
-    if isinstance(survey, RangeLines):
-        return survey.tx_m, survey.rx_m
-    assert isinstance(track, Track)  # for type checkers
-    tx, rx, _ = channels(survey, track)
-    return tx, rx
-
-
-@dataclass(frozen=True)
-class _SpacingLimit:
-    """Wavelength, and the largest spacing of phase centres that the elements or the beam allow.
-
-    `reason` completes the sentence "phase centres should be at most so far apart". It is empty if
-    neither elements nor beam limit the spacing.
-    """
-
-    wavelength_m: float
-    spacing_m: float = np.inf
-    reason: str = ""
-    of_element: bool = False
-
-
-def _spacing_limit(
-    survey: Sonar | RangeLines,
-    beam: BeamWindow | None,
-    element_length_m: float | None,
-    wavelength_m: float | None,
-) -> _SpacingLimit:
-    """Return the limit set by the elements or, if their length is not known, by the beam."""
-    if beam is not None:
-        validate.instance("beam", beam, BeamWindow)
-    if wavelength_m is not None:
-        wavelength = validate.positive("wavelength_m", wavelength_m, "m")
-    elif isinstance(survey, Sonar):
-        wavelength = survey.wavelength_m
-    elif survey.carrier_hz:
-        wavelength = carrier_wavelength_m(survey)
+        corners_m = corners_of(grid)
+    if isinstance(sonar, RangeLines):
+        tx_m, rx_m = sonar.tx_m, sonar.rx_m
     else:
-        raise ArgumentError("wavelength_m", "be given for lines with `carrier_hz` 0")
-    if element_length_m is None and isinstance(survey, Sonar):
-        element_length_m = survey.element_length_m
-    if element_length_m is not None:
-        length = validate.positive("element_length_m", element_length_m, "m")
-        reason = f", half the element length of {reprs.measured(length, 'm')}"
-        return _SpacingLimit(wavelength, length / 2, reason, of_element=True)
-    if beam is not None:
-        low, high = np.sin(np.radians(beam.squint_deg + np.array([-0.5, 0.5]) * beam.width_deg))
-        reason = f" to keep grating lobes out of the beam of {beam.width_deg:.4g} degrees"
-        return _SpacingLimit(wavelength, wavelength / (2 * float(high - low)), reason)
-    return _SpacingLimit(wavelength)
+        assert isinstance(track, Track)  # for type checkers
+        tx_m, rx_m, _ = channels(sonar, track)
+    spacing = measure_spacing(
+        sonar, (tx_m + rx_m) / 2, corners_m, beam=beam,
+        element_length_m=element_length_m, wavelength_m=wavelength_m,
+    )  # fmt: skip
+    near_m = far_m = 0.0  # of the grid; they are not used without one
+    if corners_m is not None:
+        range_m = bistatic_range_m(corners_m[:, None], tx_m, rx_m)
+        near_m, far_m = float(range_m.min()), float(range_m.max())
+
+    found: list[Finding] = []
+    # With a sway of centimetres the principal direction differs a little from the course.
+    if spacing.spacing_m > spacing.limit_m * (1 + SLACK):
+        lobes = ""
+        if corners_m is not None:
+            first_m, last_m = (
+                grating_lobe_m(spacing.wavelength_m, spacing.spacing_m, distance_m)
+                for distance_m in (near_m, far_m)
+            )
+            lobes = (
+                f". Expect grating lobes {first_m:.4g} m to {last_m:.4g} m beside every target "
+                f"(at the ranges of the grid's corners, {near_m:.4g} m to {far_m:.4g} m)"
+            )
+        message = (
+            f"phase centres are up to {reprs.measured(spacing.spacing_m, 'm')} apart along the "
+            f"track, but should be at most {reprs.measured(spacing.limit_m, 'm')} apart"
+            f"{spacing.reason}{lobes}"
+        )
+        remedy = (
+            "survey more slowly, ping faster or use a narrower beam; for lines that are already "
+            "recorded, image with a beam that leaves grating lobes out"
+        )
+        found.append(
+            Finding("along_track_spacing", message, spacing.spacing_m, spacing.limit_m, remedy)
+        )
+
+    if isinstance(sonar, Sonar) and isinstance(track, Track) and track.pings > 1:
+        _, last_s = receive_interval_s(far_m, far_m, sonar.pulse.duration_s, sonar.sound_speed_m_s)
+        rate_hz = float(1 / np.diff(track.time_s).min())
+        if rate_hz * last_s > 1 + 1e-6:
+            message = (
+                f"the ping rate of {rate_hz:.4g} Hz is above {1 / last_s:.4g} Hz: the last echo, "
+                f"from {far_m:.4g} m, ends {last_s:.4g} s after its ping, when the next ping has "
+                "already been sent"
+            )
+            remedy = "ping more slowly, or image a smaller range"
+            found.append(Finding("ping_rate", message, rate_hz, 1 / last_s, remedy))
+    return found
 
 
 @dataclass(frozen=True)
 class Spacing:
     """Largest gap between neighbouring phase centres along the track, and the largest allowed.
 
-    `reason` completes the sentence "phase centres should be at most so far apart".
+    `reason` completes the sentence "phase centres should be at most so far apart". It is empty if
+    nothing limits the spacing.
     """
 
     wavelength_m: float
     spacing_m: float
     limit_m: float
     reason: str
-
-    @property
-    def is_kept(self) -> bool:
-        """True if the gap exceeds the limit by no more than sway explains."""
-        # With a sway of centimetres the principal direction differs a little from the course.
-        return self.spacing_m <= self.limit_m * (1 + SLACK)
 
 
 def measure_spacing(
@@ -233,87 +202,47 @@ def measure_spacing(
     element_length_m: float | None = None,
     wavelength_m: float | None = None,
 ) -> Spacing:
-    """Return the spacing of phase centres, and its limit; see `check_sampling`.
+    """Return the spacing of phase centres [channels, 3], and its limit; see `check_sampling`.
 
-    Parameters
-    ----------
-    survey, beam, element_length_m, wavelength_m
-        As for `check_sampling`.
-    centres_m : float64 [channels, 3]
-    corners_m : float64 [corners, 3] or None
-        Corners of the grid.
+    Elements limit it or, if their length is unknown, the beam and the corners of the grid.
     """
-    known = _spacing_limit(survey, beam, element_length_m, wavelength_m)
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
+    if wavelength_m is not None:
+        wavelength_m = validate.positive("wavelength_m", wavelength_m, "m")
+    elif isinstance(survey, Sonar):
+        wavelength_m = survey.wavelength_m
+    elif survey.carrier_hz:
+        wavelength_m = carrier_wavelength_m(survey)
+    else:
+        raise ArgumentError("wavelength_m", "be given for lines with `carrier_hz` 0")
+
     along = course(centres_m)
-    gaps = np.diff(np.sort(centres_m @ along))
-    spacing = float(gaps.max(initial=0.0))
-    limit, reason = known.spacing_m, known.reason
-    if corners_m is not None and not known.of_element:
-        way = corners_m[:, None] - centres_m
-        distance = np.linalg.norm(way, axis=-1)
-        sine = np.divide(way @ along, distance, out=np.zeros_like(distance), where=distance > 0)
+    spacing_m = float(np.diff(np.sort(centres_m @ along)).max(initial=0.0))
+
+    if element_length_m is None and isinstance(survey, Sonar):
+        element_length_m = survey.element_length_m
+    if element_length_m is not None:
+        length_m = validate.positive("element_length_m", element_length_m, "m")
+        reason = f", half the element length of {reprs.measured(length_m, 'm')}"
+        return Spacing(wavelength_m, spacing_m, length_m / 2, reason)
+
+    limit_m, reason = np.inf, ""
+    if beam is not None:
+        low, high = np.sin(np.radians(beam.squint_deg + np.array([-0.5, 0.5]) * beam.width_deg))
+        limit_m = wavelength_m / (2 * float(high - low))
+        reason = f" to keep grating lobes out of the beam of {beam.width_deg:.4g} degrees"
+    if corners_m is not None:
+        path_m = corners_m[:, None] - centres_m
+        distance_m = np.linalg.norm(path_m, axis=-1)
+        sine = np.divide(
+            path_m @ along, distance_m, out=np.zeros_like(distance_m), where=distance_m > 0
+        )
         spread = float(np.ptp(sine, axis=0).max())
-        of_grid = known.wavelength_m / (2 * spread) if spread else np.inf
-        if of_grid > limit or not reason:
-            limit, reason = of_grid, " to keep grating lobes off the grid"
-    return Spacing(known.wavelength_m, spacing, limit, reason)
-
-
-def _check_spacing(found: Spacing, ranges: NDArray | None) -> list[Finding]:
-    if found.is_kept:
-        return []
-    spacing, limit, reason = found.spacing_m, found.limit_m, found.reason
-    where = ""
-    if ranges is not None:
-        near, far = ranges.min(), ranges.max()
-        lobes = [grating_lobe_m(found.wavelength_m, spacing, distance) for distance in (near, far)]
-        where = (
-            f". Expect grating lobes {lobes[0]:.4g} m to {lobes[1]:.4g} m beside every "
-            f"target (at the ranges of the grid's corners, {near:.4g} m to {far:.4g} m)"
-        )
-    return [
-        Finding(
-            "along_track_spacing",
-            f"phase centres are up to {reprs.measured(spacing, 'm')} apart along the track, but "
-            f"should be at most {reprs.measured(limit, 'm')} apart{reason}{where}",
-            spacing,
-            limit,
-            "survey more slowly, ping faster or use a narrower beam; for lines that are already "
-            "recorded, image with a beam that leaves grating lobes out",
-        )
-    ]
-
-
-def _check_ping_rate(sonar: Sonar, track: Track, ranges: NDArray) -> list[Finding]:
-    if track.pings == 1:
-        return []
-    far = float(ranges.max())
-    _, last = receive_interval_s(far, far, sonar.pulse.duration_s, sonar.sound_speed_m_s)
-    rate = float(1 / np.diff(track.time_s).min())
-    if rate * last <= 1 + 1e-6:
-        return []
-    return [
-        Finding(
-            "ping_rate",
-            f"the ping rate of {rate:.4g} Hz is above {1 / last:.4g} Hz: the last echo, from "
-            f"{far:.4g} m, ends {last:.4g} s after its ping, when the next ping has already been "
-            "sent",
-            rate,
-            1 / last,
-            "ping more slowly, or image a smaller range",
-        )
-    ]
-
-
-def phase_centres_m(tx_m: ArrayLike, rx_m: ArrayLike) -> NDArray[np.float64]:
-    """Return the points midway between transmitters and receivers, [..., 3]; equation [32].
-
-    Equation [32] is u = u_p + (u_rx - u_tx)/2. This is the midpoint if u_p is the position of the
-    transmitter, and u_rx and u_tx are positions on the platform.
-    """
-    tx = validate.array("tx_m", np.atleast_2d(tx_m), np.float64, (None, 3))
-    rx = validate.array("rx_m", np.atleast_2d(rx_m), np.float64, (None, 3))
-    return (tx + rx) / 2
+        of_grid_m = wavelength_m / (2 * spread) if spread else np.inf
+        if of_grid_m > limit_m or not reason:
+            limit_m, reason = of_grid_m, " to keep grating lobes off the grid"
+    return Spacing(wavelength_m, spacing_m, limit_m, reason)
 
 
 def receive_interval_s(
@@ -338,9 +267,9 @@ def grating_lobe_m(wavelength_m: float, spacing_m: float, range_m: float) -> flo
     return validate.positive("range_m", range_m, "m") * wavelength / (2 * spacing)
 
 
-def course(centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit vector along which the phase centres extend farthest."""
-    return np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)[2][0]
+def course(centres_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit vector along which phase centres extend farthest."""
+    return np.linalg.svd(centres_m - centres_m.mean(axis=0), full_matrices=False)[2][0]
 
 
 def corners_of(grid: Grid) -> NDArray[np.float64]:

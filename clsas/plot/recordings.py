@@ -13,7 +13,7 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.pings import Transmissions
 from clsas.engine.signal.spectrum import power_spectrum
-from clsas.inspection.result import Inspection
+from clsas.inspection.inspection import Inspection
 from clsas.plot.canvas import axis_label, length_unit, new_figure, plain_ticks
 from clsas.plot.levels import Scale, draw_levels
 from clsas.plot.survey import outline as outline_of

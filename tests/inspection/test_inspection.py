@@ -16,8 +16,7 @@ import clsas
 from clsas.cli import main
 from clsas.engine.data.pings import Transmissions
 from clsas.engine.data.system import line_array, stacked
-from clsas.inspection.recording import levels_of
-from clsas.inspection.result import runs
+from clsas.inspection.checks import levels_of, runs
 
 PINGS, ADVANCE_M = 200, 0.02
 GRID = clsas.Grid.plane((1.0, 3.0, 100), (18.0, 20.5, 120))
