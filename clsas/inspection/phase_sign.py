@@ -214,7 +214,7 @@ def _on_grid(lines: RangeLines, grid: Grid, cell_m: float) -> list[tuple[NDArray
 
 def _received(
     part: RangeLines,
-    power: NDArray[np.float32],
+    power: NDArray,
     points_m: NDArray[np.float64],
     pitch_m: float,
 ) -> NDArray[np.float32]:
