@@ -19,7 +19,7 @@ from scipy import fft
 from clsas.engine.data import validate
 from clsas.engine.data.system import Sonar, element_pattern
 from clsas.engine.data.track import Channels
-from clsas.simulation.legs import Legs
+from clsas.simulation.refraction import Legs
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""Exact rays between sonar and scene: delays, directions and spreading, by tables."""
+"""Paths between sonar and scene, straight or along exact rays: delays, directions, spreading.
+
+Rays to many points are read from tables.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,6 @@ from clsas.engine.water.ray_tables import (
     table_around,
 )
 from clsas.engine.water.rays import rays, shadow
-from clsas.simulation.legs import Bend, Legs
 
 # Points of a block from which on a table is faster. It takes as long as some thousand rays.
 _WORTH_A_TABLE = 4096
@@ -34,12 +36,73 @@ MOST_FOCUS = 10 ** (10 / 20)
 of 100 kHz have one at 10 to 15 dB."""
 
 
-class _Leg(NamedTuple):
-    """Rays from one antenna: travel times, lengths of straight paths, and directions."""
+class Bend(NamedTuple):
+    """How rays leave an antenna, compared with straight paths, float64 [points] each.
 
-    time_s: NDArray[np.float64]
-    length_m: NDArray[np.float64]
-    bend: Bend
+    Attributes
+    ----------
+    level_1_m : ndarray
+        Factor by which the offset of a point, along any axis, becomes the component of the ray's
+        direction: 1 over the distance in homogeneous water.
+    lift : ndarray
+        Added to this component, times the component of the axis that points up.
+    spreading_m : ndarray
+        Length whose inverse is the amplitude; see `clsas.engine.water.rays.Rays`.
+    speed_m_s : float
+        Sound speed at the antenna.
+    focused : bool
+        True if the amplitude was limited near a caustic.
+    """
+
+    level_1_m: NDArray[np.float64]
+    lift: NDArray[np.float64]
+    spreading_m: NDArray[np.float64]
+    speed_m_s: float
+    focused: bool = False
+
+    def at(self, kept: NDArray[np.bool_]) -> Bend:
+        """Return the rays to some of the points."""
+        return self._replace(
+            level_1_m=self.level_1_m[kept],
+            lift=self.lift[kept],
+            spreading_m=self.spreading_m[kept],
+        )
+
+
+class Legs(NamedTuple):
+    """Paths from a transmitter to points and back to a receiver, float64 [points] each.
+
+    Attributes
+    ----------
+    delay_s : ndarray
+        Two-way delays.
+    out_m, back_m : ndarray
+        Lengths of straight paths; `back_m` ends at the receiver's position when the echo arrives.
+    bends : (Bend, Bend) or None
+        How rays leave transmitter and receiver; None if they are straight.
+    """
+
+    delay_s: NDArray[np.float64]
+    out_m: NDArray[np.float64]
+    back_m: NDArray[np.float64]
+    bends: tuple[Bend, Bend] | None = None
+
+    @property
+    def spreading_m2(self) -> NDArray[np.float64]:
+        """Product of the lengths by which amplitudes fall on both ways."""
+        if self.bends is None:
+            return self.out_m * self.back_m
+        return self.bends[0].spreading_m * self.bends[1].spreading_m
+
+    @property
+    def focused(self) -> bool:
+        """True if an amplitude was limited near a caustic."""
+        return self.bends is not None and any(bend.focused for bend in self.bends)
+
+    def at(self, kept: NDArray[np.bool_]) -> Legs:
+        """Return the paths of some of the points."""
+        bends = self.bends and (self.bends[0].at(kept), self.bends[1].at(kept))
+        return Legs(self.delay_s[kept], self.out_m[kept], self.back_m[kept], bends)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +128,9 @@ class BlockRays:
     z_m: NDArray[np.float64]
     quantities: tuple[Quantity, ...] = TIMES
     error: float = 0.0
-    _latest: dict[bytes, _Leg] = field(default_factory=dict)
+    _latest: dict[bytes, tuple[NDArray[np.float64], NDArray[np.float64], Bend]] = field(
+        default_factory=dict
+    )
 
     def legs(self, elements: Channels, tx_z_m: float, rx_z_m: float, rx_climb_m_s: float) -> Legs:
         """Return the rays to all points for one channel.
@@ -85,44 +150,32 @@ class BlockRays:
         ValueError
             If a point lies in a shadow zone.
         """
-        out = self._outward(elements.tx_m, tx_z_m)
-        if elements.rx_velocity_m_s is None:
-            if np.array_equal(elements.tx_m, elements.rx_m):
-                return _legs(out, out)
-            back = self._leg(self.points_m - elements.rx_m, rx_z_m, self.quantities)
-            return _legs(out, back)
-        back = out
-        offset_m = self.points_m - elements.rx_m
-        for quantities in (*[TIMES] * (_FLIGHT_STEPS - 1), self.quantities):
-            delay = out.time_s + back.time_s
-            moved_m = offset_m - elements.rx_velocity_m_s * delay[:, None]
-            back = self._leg(moved_m, rx_z_m + rx_climb_m_s * delay, quantities)
-        return _legs(out, back)
-
-    @property
-    def _accuracy(self) -> Accuracy:
-        """Accuracy of tables: phases to a tenth of the error at 800 kHz, directions to less."""
-        return Accuracy(
-            USUAL.time_s * max(1.0, 1e4 * self.error), USUAL.other * max(1.0, 1e5 * self.error)
-        )
-
-    def _outward(self, tx_m: NDArray[np.float64], z_m: float) -> _Leg:
-        """Return the leg from a transmitter, which the channels of a ping usually share."""
-        key = tx_m.tobytes()
-        found = self._latest.get(key)
-        if found is None:
-            found = self._leg(self.points_m - tx_m, z_m, self.quantities)
+        key = elements.tx_m.tobytes()
+        if key not in self._latest:  # the channels of a ping usually share their transmitter
+            out = self._rays(self.points_m - elements.tx_m, tx_z_m, self.quantities)
             self._latest.clear()
-            self._latest[key] = found
-        return found
+            self._latest[key] = out
+        out_s, out_m, leaving = self._latest[key]
 
-    def _leg(
+        back_s, back_m, arriving = out_s, out_m, leaving
+        offset_m, velocity_m_s = self.points_m - elements.rx_m, elements.rx_velocity_m_s
+        if velocity_m_s is not None:
+            for quantities in (*[TIMES] * (_FLIGHT_STEPS - 1), self.quantities):
+                delay_s = out_s + back_s
+                moved_m = offset_m - velocity_m_s * delay_s[:, None]
+                height_m = rx_z_m + rx_climb_m_s * delay_s
+                back_s, back_m, arriving = self._rays(moved_m, height_m, quantities)
+        elif not np.array_equal(elements.tx_m, elements.rx_m):
+            back_s, back_m, arriving = self._rays(offset_m, rx_z_m, self.quantities)
+        return Legs(out_s + back_s, out_m, back_m, (leaving, arriving))
+
+    def _rays(
         self,
         offset_m: NDArray[np.float64],
         antenna_z_m: NDArray[np.float64] | float,
         quantities: tuple[Quantity, ...],
-    ) -> _Leg:
-        """Return the rays over some offsets.
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], Bend]:
+        """Return travel times over some offsets, lengths of straight paths, and directions.
 
         The antenna may have another height for every point.
         """
@@ -130,13 +183,20 @@ class BlockRays:
         square = np.einsum("ni,ni->n", offset_m, offset_m)
         length_m = np.maximum(np.sqrt(square), _TINY_M)
         distance_m = np.sqrt(np.maximum(square - rise_m**2, 0.0))
-        found = values_of(
-            self.profile, distance_m, antenna_z_m, self.z_m, quantities, self._accuracy
+        # Phases to a tenth of the error at 800 kHz, directions to less.
+        accuracy = Accuracy(
+            USUAL.time_s * max(1.0, 1e4 * self.error), USUAL.other * max(1.0, 1e5 * self.error)
         )
+        found = values_of(self.profile, distance_m, antenna_z_m, self.z_m, quantities, accuracy)
         values = dict(zip(quantities, found, strict=True))
         time_s = values[Q.TIME]
-        if np.isnan(time_s).any():
-            self._refuse(distance_m, antenna_z_m, time_s)
+        dark = np.flatnonzero(np.isnan(time_s))
+        if dark.size:
+            nearest = int(dark[distance_m[dark].argmin()])
+            at_z = float(np.broadcast_to(antenna_z_m, distance_m.shape)[nearest])
+            why = shadow(self.profile, float(distance_m[nearest]), at_z, float(self.z_m[nearest]))
+            raise ArgumentError("scene", "have no point without a ray", hint=why)
+
         spreading_m, level_1_m, lift = length_m, 1 / length_m, np.zeros_like(length_m)
         focused = False
         if Q.SPREADING in values:
@@ -146,25 +206,7 @@ class BlockRays:
             lift = values[Q.LIFT] + (1 - values[Q.LEVEL]) * rise_m * level_1_m
             level_1_m = level_1_m * values[Q.LEVEL]
         speed_m_s = float(self.profile.at(np.mean(antenna_z_m)))
-        return _Leg(time_s, length_m, Bend(level_1_m, lift, spreading_m, speed_m_s, focused))
-
-    def _refuse(
-        self,
-        distance_m: NDArray[np.float64],
-        antenna_z_m: NDArray[np.float64] | float,
-        time_s: NDArray[np.float64],
-    ) -> None:
-        dark = np.flatnonzero(np.isnan(time_s))
-        nearest = int(dark[distance_m[dark].argmin()])
-        at_z = float(np.broadcast_to(antenna_z_m, distance_m.shape)[nearest])
-        place = float(distance_m[nearest]), at_z, float(self.z_m[nearest])
-        why = shadow(self.profile, *place)
-        raise ArgumentError("scene", "have no point without a ray", hint=why)
-
-
-def _legs(out: _Leg, back: _Leg) -> Legs:
-    delay_s = out.time_s + back.time_s
-    return Legs(delay_s, out.length_m, back.length_m, (out.bend, back.bend))
+        return time_s, length_m, Bend(level_1_m, lift, spreading_m, speed_m_s, focused)
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,15 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import map_coordinates
 
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.declared import Count, Number, check_fields
 from clsas.engine.data.validate import ArgumentError
-from clsas.simulation.height_field import BentRays, HeightField
 from clsas.simulation.refraction import Sightlines
-from clsas.simulation.scatterers import Scatterers, draw_scatterers
+
+_TILE_M = 2.0  # side of the tiles that are kept or left out as a whole, depending on the beam
+_CLEAR = -1e30  # height beyond the lattice, where nothing casts shadows
 
 
 class Observer(NamedTuple):
@@ -134,6 +136,17 @@ class PointTargets:
         return self.positions_m[order], self.amplitudes[order]
 
 
+class _Scatterers(NamedTuple):
+    """Scatterers of a seabed sorted by tile, and the spheres that contain the tiles."""
+
+    positions_m: NDArray[np.float64]  # [3, points]
+    normals: NDArray[np.float32]  # [3, points], of the surface
+    amplitudes: NDArray[np.complex64]  # [points]
+    first: NDArray[np.intp]  # [tiles + 1]: where each tile begins
+    centres_m: NDArray[np.float64]  # [tiles, 3]
+    radii_m: NDArray[np.float64]  # [tiles]
+
+
 @dataclass(frozen=True, eq=False)
 class Seabed:
     """Patch of seabed: a height field covered with scatterers, which casts shadows on itself.
@@ -243,7 +256,7 @@ class Seabed:
         object.__setattr__(self, "heights_m", heights)
         object.__setattr__(self, "texture", texture)
         with np.errstate(over="ignore", invalid="ignore"):
-            area_m2 = self._surface.cell_areas_m2.sum()
+            area_m2 = self._cell_areas_m2().sum()
         validate.memory("density_m2", 100 * self.density_m2 * area_m2)
 
     def __repr__(self) -> str:
@@ -261,7 +274,8 @@ class Seabed:
     @property
     def steps_m(self) -> tuple[float, float]:
         """Distance between the columns and between the rows of the lattice, metres."""
-        return self._surface.steps_m
+        rows, columns = self.heights_m.shape
+        return (self.x_m[1] - self.x_m[0]) / (columns - 1), (self.y_m[1] - self.y_m[0]) / (rows - 1)
 
     @property
     def points(self) -> int:
@@ -298,7 +312,11 @@ class Seabed:
         except ValueError:
             shapes = f"shapes {x_m.shape} and {y_m.shape}"
             raise ArgumentError("x_m", "broadcast with `y_m`", shapes) from None
-        return self._surface.height_m(x_m, y_m)
+        x, y = np.broadcast_arrays(x_m, y_m)
+        dx, dy = self.steps_m
+        where = [((y - self.y_m[0]) / dy).ravel(), ((x - self.x_m[0]) / dx).ravel()]
+        heights = map_coordinates(self.heights_m, where, order=1, mode="constant", cval=np.nan)
+        return heights.reshape(x.shape)
 
     def lit(self, points_m: ArrayLike, eye_m: ArrayLike) -> NDArray[np.bool_]:
         """Return a mask of the points that are not in shadow from a position, bool [points].
@@ -319,7 +337,7 @@ class Seabed:
         """
         points = validate.array("points_m", points_m, np.float64, (None, 3))
         eye = validate.array("eye_m", eye_m, np.float64, (3,))
-        return self._surface.lit(np.ascontiguousarray((points - eye).T), eye)
+        return self._lit(np.ascontiguousarray((points - eye).T), eye)
 
     def spheres(self, observer: Observer) -> tuple[NDArray, NDArray]:
         """Return spheres around all visible points: centres [spheres, 3], and radii [spheres]."""
@@ -342,14 +360,13 @@ class Seabed:
         positions = scatterers.positions_m[:, chosen]
         offsets = positions - observer.position_m[:, None]
         if observer.sightlines is None:
-            rays, bent = offsets.astype(np.float32), None
+            rays, leaving = offsets.astype(np.float32), None
         else:
-            rays, elevations = observer.sightlines.arrivals(offsets)
-            bent = BentRays(elevations, observer.sightlines.elevations)
+            rays, leaving = observer.sightlines.arrivals(offsets)
         # Lambert's law: the amplitude falls with the cosine of the angle of incidence.
         facing = -np.einsum("ip,ip->p", scatterers.normals[:, chosen], rays)
         facing /= np.sqrt(np.einsum("ip,ip->p", rays, rays))
-        in_sight = self._surface.lit(offsets, observer.position_m, bent)
+        in_sight = self._lit(offsets, observer.position_m, observer.sightlines, leaving)
         lit = np.flatnonzero((facing > 0) & in_sight)
         return positions[:, lit].T, scatterers.amplitudes[chosen[lit]] * facing[lit]
 
@@ -371,14 +388,139 @@ class Seabed:
         order = np.argsort(-observer.gain(directions, 0.0), kind="stable")
         return order[gains[order] >= 10 ** (self.floor_db / 20)]
 
-    @cached_property
-    def _surface(self) -> HeightField:
-        return HeightField(self.x_m, self.y_m, self.heights_m)
+    def _lit(
+        self,
+        offsets_m: NDArray[np.float64],
+        eye_m: NDArray[np.float64],
+        sightlines: Sightlines | None = None,
+        leaving: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.bool_]:
+        """Return a mask of points with a clear line of sight to a position, bool [points].
+
+        A polar fan of rays surrounds the position. A point is lit if its elevation is not below the
+        largest elevation on the nearest ray, up to one or two lattice steps before the point.
+
+        Parameters
+        ----------
+        offsets_m : float64 [3, points]
+            Points relative to the position.
+        eye_m : float64 [3]
+            The position.
+        sightlines : Sightlines, optional
+            Bent rays to the position; by default rays are straight.
+        leaving : float64 [points], optional
+            Elevations of the bent rays to the points, NaN without a ray. Such points count as lit,
+            and cast no shadows.
+        """
+        x, y, z = offsets_m
+        level_m = float(self.heights_m.min())
+        lowest = eye_m[2] + min(z.min(initial=0.0), 0.0)
+        if not x.size or (lowest >= level_m and not self._relative_heights.any()):
+            return np.ones(x.size, bool)
+        step = min(self.steps_m)
+        # Azimuth is measured from the direction to the middle of the lattice. Then no ray to a
+        # lattice on one side of the sonar is at +-180 degrees.
+        centre = np.arctan2(sum(self.y_m) / 2 - eye_m[1], sum(self.x_m) / 2 - eye_m[0])
+        cosine, sine = np.cos(centre), np.sin(centre)
+        ground = np.sqrt(x**2 + y**2)
+        azimuth = np.arctan2(cosine * y - sine * x, cosine * x + sine * y)
+        # The rays must not depend on the points. Otherwise whether a point is lit would depend on
+        # the other points.
+        away = np.abs([np.subtract(self.x_m, eye_m[0]), np.subtract(self.y_m, eye_m[1])])
+        ray_step = step / max(np.hypot(*away.max(axis=1)), step)
+        first_ray = np.floor(azimuth.min() / ray_step)
+        ray = np.rint(azimuth / ray_step - first_ray).astype(np.intp)
+        angles = centre + ray_step * (first_ray + np.arange(ray.max() + 1))
+        nearest = max(
+            self.x_m[0] - eye_m[0], eye_m[0] - self.x_m[1],
+            self.y_m[0] - eye_m[1], eye_m[1] - self.y_m[1], step,
+        )  # fmt: skip
+        # Nothing beyond the lattice casts shadows.
+        last = np.ceil((np.hypot(*away.max(axis=1)) - nearest) / step) + 2
+        before = np.floor(np.minimum((ground - nearest) / step, last)).astype(np.intp) - 1
+        ranges = nearest + step * np.arange(max(before.max(), 0) + 1)
+
+        validate.memory("heights_m", 40 * len(angles) * len(ranges))
+        dx, dy = self.steps_m
+        columns = (np.cos(angles)[:, None] * ranges + (eye_m[0] - self.x_m[0])) / dx
+        rows = (np.sin(angles)[:, None] * ranges + (eye_m[1] - self.y_m[0])) / dy
+        fan = map_coordinates(
+            self._relative_heights,
+            [rows, columns],
+            np.float32,
+            order=1,
+            mode="constant",
+            cval=_CLEAR,
+        )
+        fan -= np.float32(eye_m[2] - level_m)
+        if sightlines is None or leaving is None:
+            fan /= ranges.astype(np.float32)
+            elevation = z / np.maximum(ground, np.finfo(float).tiny)
+        else:  # a bent ray passes above whatever has a smaller elevation
+            covered = fan > _CLEAR / 2
+            along, heights = np.broadcast_to(ranges, fan.shape)[covered], fan[covered]
+            fan = np.full(fan.shape, np.float32(_CLEAR))
+            fan[covered] = np.nan_to_num(
+                sightlines.elevations(along, heights.astype(float)), nan=_CLEAR
+            )
+            elevation = np.nan_to_num(leaving, nan=np.inf)
+        highest = np.maximum.accumulate(fan, axis=1)
+        return (before < 0) | (elevation >= highest[ray, np.maximum(before, 0)])
 
     @cached_property
-    def _scatterers(self) -> Scatterers:
+    def _relative_heights(self) -> NDArray[np.float32]:
+        """Heights above the lowest one, so that single precision resolves them."""
+        return (self.heights_m - self.heights_m.min()).astype(np.float32)
+
+    @cached_property
+    def _scatterers(self) -> _Scatterers:
         """The scatterers, which are drawn at first use."""
-        return draw_scatterers(self._surface, self.texture, self.density_m2, self.seed)
+        random = np.random.default_rng(self.seed)
+        counts = random.poisson(self.density_m2 * self._cell_areas_m2())
+        dx, dy = self.steps_m
+        rows, columns = np.indices(counts.shape)
+        tiles = rows // max(1, round(_TILE_M / dy)), columns // max(1, round(_TILE_M / dx))
+        tile = (tiles[0] * (tiles[1].max() + 1) + tiles[1]).ravel()
+        order = np.argsort(tile, kind="stable")
+        cells = np.repeat(order, counts.ravel()[order])
+        if not cells.size:
+            allowed = "put at least one scatterer on the seabed"
+            raise ArgumentError("density_m2", allowed, f"{self.density_m2:g} per m2")
+        row, column = np.divmod(cells, counts.shape[1])
+        u, v = random.random((2, len(cells)))
+        h = self.heights_m
+        corners = [h[row, column], h[row, column + 1], h[row + 1, column], h[row + 1, column + 1]]
+        z = (1 - v) * ((1 - u) * corners[0] + u * corners[1])
+        z += v * ((1 - u) * corners[2] + u * corners[3])
+        slopes = (
+            ((1 - v) * (corners[1] - corners[0]) + v * (corners[3] - corners[2])) / dx,
+            ((1 - u) * (corners[2] - corners[0]) + u * (corners[3] - corners[1])) / dy,
+        )
+        positions = np.stack([self.x_m[0] + dx * (column + u), self.y_m[0] + dy * (row + v), z])
+        normals = np.stack([-slopes[0], -slopes[1], np.ones_like(z)]).astype(np.float32)
+        normals /= np.sqrt(np.einsum("ip,ip->p", normals, normals))
+        deviation = map_coordinates(self.texture, [row + v, column + u], order=1, mode="nearest")
+        deviation /= np.sqrt(2 * self.density_m2)
+        amplitudes = random.standard_normal((len(cells), 2), dtype=np.float32).view(np.complex64)
+        amplitudes = amplitudes[:, 0] * deviation.astype(np.float32)
+
+        first = np.flatnonzero(np.diff(tile[cells], prepend=-1))
+        centres = (
+            np.maximum.reduceat(positions, first, axis=1)
+            + np.minimum.reduceat(positions, first, axis=1)
+        ) / 2
+        ends = np.append(first, len(cells))
+        from_centre = positions - np.repeat(centres, np.diff(ends), axis=1)
+        radii = np.sqrt(np.maximum.reduceat(np.sum(from_centre**2, axis=0), first))
+        return _Scatterers(positions, normals, amplitudes, ends, centres.T, radii)
+
+    def _cell_areas_m2(self) -> NDArray[np.float64]:
+        """Return the surface area of cells between four lattice points, [rows - 1, columns - 1]."""
+        dx, dy = self.steps_m
+        h = self.heights_m
+        along_x = (h[:-1, 1:] - h[:-1, :-1] + h[1:, 1:] - h[1:, :-1]) / (2 * dx)
+        along_y = (h[1:, :-1] - h[:-1, :-1] + h[1:, 1:] - h[:-1, 1:]) / (2 * dy)
+        return dx * dy * np.sqrt(1 + along_x**2 + along_y**2)
 
 
 Scene = PointTargets | Seabed | tuple[PointTargets | Seabed, ...]

@@ -18,9 +18,16 @@ from clsas.engine.data.track import Channels, Pointing, Track, channels
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.compression import Window, compress
 from clsas.engine.signal.echoes import Echoes
-from clsas.simulation.paths import Paths, scene_parts
 from clsas.simulation.patterns import ElementPatterns
-from clsas.simulation.recording import NO_ECHO, RINGING, Progress, ReceiveWindows, record
+from clsas.simulation.recording import (
+    NO_ECHO,
+    RINGING,
+    Paths,
+    Progress,
+    ReceiveWindows,
+    record,
+    scene_parts,
+)
 from clsas.simulation.scenes import PointTargets, Scene, Seabed
 
 _LEAST_BAND_HZ = 1e-6  # arbitrary (a pulse of twelve days), but its inverse must be finite

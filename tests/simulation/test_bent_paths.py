@@ -10,7 +10,6 @@ import clsas
 from clsas import Pointing, PointTargets, Pulse, Sonar, SoundSpeed, Track, simulate, simulate_lines
 from clsas.engine.water.ray_tables import TABLE_ERROR, Q, RayTable, quantity_of, table_around
 from clsas.engine.water.rays import farthest_m, rays
-from clsas.simulation.height_field import BentRays
 from clsas.simulation.recording import FOCUSED
 from clsas.simulation.refraction import MOST_FOCUS, Sightlines
 from clsas.simulation.scenes import Observer, Seabed
@@ -224,8 +223,7 @@ def test_shadows_are_those_of_marched_circles(per_s):
     points = np.random.default_rng(5).uniform([-4, 100, 0], [4, 116, 0], (6000, 3))
     points[:, 2] = seabed.height_m(points[:, 0], points[:, 1])
     sight, offsets = Sightlines(gradient(per_s), -10.0), (points - eye).T
-    bent = BentRays(sight.arrivals(offsets)[1], sight.elevations)
-    found = seabed._surface.lit(offsets, eye, bent)
+    found = seabed._lit(offsets, eye, sight, sight.arrivals(offsets)[1])
     expected = marched(seabed, points, eye, per_s)
     assert 0.02 < 1 - expected.mean() < 0.9
     assert np.mean(found != expected) < 0.035

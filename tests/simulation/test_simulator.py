@@ -140,8 +140,8 @@ def test_result_does_not_depend_on_blocks_or_threads(monkeypatch):
     scene = PointTargets(rng.uniform([-2, 38, -1], [2, 42, 1], (50, 3)))
     sonar = replace(SMOOTH, tx_length_m=0.1, rx_length_m=0.05)
     whole = simulate(sonar, TRACK, scene)
-    monkeypatch.setattr("clsas.simulation.paths._BLOCK", 7)
-    monkeypatch.setattr("clsas.simulation.paths._PATTERN_BLOCK", 3)
+    monkeypatch.setattr("clsas.simulation.recording._BLOCK", 7)
+    monkeypatch.setattr("clsas.simulation.recording._PATTERN_BLOCK", 3)
     parts = simulate(sonar, TRACK, scene, workers=1)
     assert db(whole.samples - parts.samples, whole.samples) < -110
 
@@ -442,10 +442,10 @@ def test_result_does_not_depend_on_threads_or_groups(monkeypatch):
     seabed = box_on_sand()
     one = simulate(NARROW, SWATH, seabed, workers=1).samples
     np.testing.assert_array_equal(one, simulate(NARROW, SWATH, seabed, workers=3).samples)
-    monkeypatch.setattr("clsas.simulation.paths._GROUP", 1)
+    monkeypatch.setattr("clsas.simulation.recording._GROUP", 1)
     # Visibility is found for every channel: only edges of shadows and of the beam change.
     apart = simulate(NARROW, SWATH, seabed, range_m=(30, 46)).samples
-    monkeypatch.setattr("clsas.simulation.paths._GROUP", 8)
+    monkeypatch.setattr("clsas.simulation.recording._GROUP", 8)
     together = simulate(NARROW, SWATH, seabed, range_m=(30, 46)).samples
     assert 0 < np.linalg.norm(apart - together) < 0.15 * np.linalg.norm(together)
 
