@@ -36,12 +36,12 @@ from .engine.signal.replica import Replica as Replica
 from .files.airsas import read_airsas as read_airsas
 from .files.cphd import read_cphd as read_cphd
 from .files.cphd import write_cphd as write_cphd
+from .files.csv_files import read_sound_speed as read_sound_speed
 from .files.formats import load as load
 from .files.formats import save as save
 from .files.full_matrix import read_full_matrix as read_full_matrix
 from .files.hdf5 import FileFormatError as FileFormatError
 from .files.phase_histories import read_phase_history as read_phase_history
-from .files.sound_speed_files import read_sound_speed as read_sound_speed
 from .files.xarrays import to_xarray as to_xarray
 from .inspection.inspection import Inspection as Inspection
 from .inspection.inspection import inspect as inspect

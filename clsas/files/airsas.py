@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -32,8 +32,8 @@ from clsas.files.positions import checked_positions
 
 SHARED = "characterization data"
 ACQUISITION, SENSORS = "acquistionParams.csv", "sensorCoordinates.csv"  # the data set's spelling
-# Rows of the acquisition parameters, from 0. Each has a name, a number, and further columns.
 _SERIES_ERROR_DB = -180.0  # of lines interpolated by Fourier series
+# Rows of the acquisition parameters, from 0. Each has a name, a number, and further columns.
 _RATE, _GROUP_DELAY, _START_HZ, _STOP_HZ, _DURATION, _TAPER = 0, 1, 7, 8, 9, 12
 
 
@@ -102,13 +102,21 @@ def read_airsas(
                 "is an HDF5 file, but not an AirSAS scene: it must contain /na and microphones "
                 f"/ch1, /ch2, ..., got {validate.shown(sorted(file))}"
             )
-    folder = (
-        path.absolute().parent.parent / SHARED
-        if shared is None
-        else validate.path("shared", shared)
+    if shared is None:
+        folder = path.absolute().parent.parent / SHARED
+    else:
+        folder = validate.path("shared", shared)
+    rate_hz, group_delay, pulse = _acquisition(folder / ACQUISITION)
+    # Positions of the loudspeaker and the microphones at the array's home.
+    rows = _rows(folder / SENSORS, 1, 3)
+    if len(rows) < 2:
+        raise FileFormatError(
+            f"{folder / SENSORS} must have rows for a loudspeaker and microphones, got "
+            f"{len(rows)} rows"
+        )
+    sensors_m = np.array(
+        [[_number(folder / SENSORS, row, column) for column in (1, 2, 3)] for row in rows]
     )
-    parameters = _Parameters.read(folder / ACQUISITION)
-    sensors_m = _sensors_m(folder / SENSORS)
     with hdf5.opened(path) as file:
         there = [n for n in range(1, len(sensors_m)) if f"ch{n}" in file]
     numbers = _microphones(path, there, channels)
@@ -124,20 +132,26 @@ def read_airsas(
                     f"{recorded[0].shape[-1]}, got {each.shape}"
                 )
         speed_m_s = _speeds_m_s(_numbers(_dataset(file, "na", "temperature"), budget), pings)
-        pulse = parameters.pulse
-        samples_per_sample = oversampling * pulse.bandwidth_hz / parameters.sample_rate_hz
+        samples_per_sample = oversampling * pulse.bandwidth_hz / rate_hz
         samples = _together(recorded, budget, lines_bytes=8 * samples_per_sample)
+
+    # Remove the constant offset and the transmission, which microphones record directly. The
+    # samples are zero while the pulse is transmitted, and fade in over another pulse length.
+    time_s = (np.arange(samples.shape[-1]) - group_delay) / rate_hz
+    ramp = np.clip(time_s / pulse.duration_s - 1, 0, 1)
+    samples -= samples.mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
+    samples *= np.sin(np.pi / 2 * ramp).astype(np.float32) ** 2
+
     position_m = np.zeros((pings, 1, 3))
     position_m[..., 0] = rail_m[:, None]
     tx_m, rx_m = (
-        np.broadcast_to(position_m + sensors_m[rows], (pings, len(numbers), 3)).reshape(-1, 3)
-        for rows in ([0], numbers)
+        np.broadcast_to(position_m + sensors_m[sensors], (pings, len(numbers), 3)).reshape(-1, 3)
+        for sensors in ([0], numbers)
     )
-    time_s = (np.arange(samples.shape[-1]) - parameters.group_delay) / parameters.sample_rate_hz
     echoes = Echoes(
-        _conditioned(samples, time_s, pulse.duration_s).reshape(-1, len(time_s)),
+        samples.reshape(-1, len(time_s)),
         start_time_s=time_s[0],
-        sample_rate_hz=parameters.sample_rate_hz,
+        sample_rate_hz=rate_hz,
         carrier_hz=pulse.carrier_hz,
         tx_m=tx_m,
         rx_m=rx_m,
@@ -145,77 +159,30 @@ def read_airsas(
         pulse=pulse,
     )
     lines = compress(echoes, window=window, oversampling=oversampling)
-    return checked_positions(path, at_one_speed(lines, np.repeat(speed_m_s, len(numbers))))
+    return checked_positions(path, _at_one_speed(lines, np.repeat(speed_m_s, len(numbers))))
 
 
-def at_one_speed(lines: RangeLines, speed_m_s: NDArray[np.float64]) -> RangeLines:
-    """Return lines with one speed of sound, from channels whose speeds of sound differed.
-
-    Parameters
-    ----------
-    lines : RangeLines
-        Lines whose ranges r assume the one speed c = `lines.sound_speed_m_s`, so that samples are
-        at the times 2 r/c.
-    speed_m_s : float64 array, [channels]
-        True speed of sound of every channel.
-
-    Returns
-    -------
-    RangeLines
-        Lines in which a point at range rho has its echo at rho in every channel.
-
-    Notes
-    -----
-    In channel i the echo of a point at range r arrives at the time 2 r/c_i. The line is therefore
-    interpolated at these times, by a Fourier series, and multiplied by a phasor of phase
-    4 pi fc r (1/c_i - 1/c). A point at rho then has the phase exp(-j 4 pi fc rho/c).
-    """
-    validate.memory("lines at one speed of sound", lines.samples.nbytes)
-    speed = lines.sound_speed_m_s
-    samples = np.array(lines.samples)
-    padded = fft.next_fast_len(lines.length + lines.length // 4)
-    for channel in np.flatnonzero(speed_m_s != speed):
-        range_m = lines.first_range_m[channel] + np.arange(lines.length) * lines.range_step_m
-        at = (range_m * speed / speed_m_s[channel] - range_m[0]) / lines.range_step_m
-        series = fft.fftshift(fft.fft(samples[channel].astype(np.complex128), padded)) / padded
-        line = fourier_series(series, at / padded, _SERIES_ERROR_DB)
-        line *= np.exp(-2j * np.pi * (padded // 2) * at / padded)  # the first frequency
-        line[(at < 0) | (at > lines.length - 1)] = 0
-        cycles = 2 * lines.carrier_hz * range_m * (1 / speed_m_s[channel] - 1 / speed)
-        samples[channel] = line * np.exp(2j * np.pi * cycles)
-    return replace(lines, samples=samples)
-
-
-@dataclass(frozen=True)
-class _Parameters:
-    """Acquisition parameters: sample rate, group delay in samples, and the pulse."""
-
-    sample_rate_hz: float
-    group_delay: float
-    pulse: Pulse
-
-    @classmethod
-    def read(cls, path: Path) -> _Parameters:
-        rows = _rows(path, 1, 1)
-        if len(rows) <= _TAPER:
-            raise FileFormatError(f"{path} must have {_TAPER + 1} parameters, got {len(rows)}")
-
-        def value(row: int) -> float:
-            return _number(path, rows[row], 1)
-
-        start_hz, stop_hz = value(_START_HZ), value(_STOP_HZ)
-        try:
-            pulse = Pulse(
-                carrier_hz=(start_hz + stop_hz) / 2,
-                bandwidth_hz=abs(stop_hz - start_hz),
-                duration_s=value(_DURATION),
-                code="up" if stop_hz > start_hz else "down",
-                taper=value(_TAPER),
-            )
-            rate_hz = validate.positive("the sample rate", value(_RATE), "Hz")
-        except ValueError as error:
-            raise FileFormatError(f"{path}: {error}") from None
-        return cls(rate_hz, value(_GROUP_DELAY), pulse)
+def _acquisition(path: Path) -> tuple[float, float, Pulse]:
+    """Return the sample rate, the group delay in samples, and the pulse."""
+    rows = _rows(path, 1, 1)
+    if len(rows) <= _TAPER:
+        raise FileFormatError(f"{path} must have {_TAPER + 1} parameters, got {len(rows)}")
+    start_hz, stop_hz, duration_s, taper, rate_hz, group_delay = (
+        _number(path, rows[row], 1)
+        for row in (_START_HZ, _STOP_HZ, _DURATION, _TAPER, _RATE, _GROUP_DELAY)
+    )
+    try:
+        pulse = Pulse(
+            carrier_hz=(start_hz + stop_hz) / 2,
+            bandwidth_hz=abs(stop_hz - start_hz),
+            duration_s=duration_s,
+            code="up" if stop_hz > start_hz else "down",
+            taper=taper,
+        )
+        rate_hz = validate.positive("the sample rate", rate_hz, "Hz")
+    except ValueError as error:
+        raise FileFormatError(f"{path}: {error}") from None
+    return rate_hz, group_delay, pulse
 
 
 def _rows(path: Path, first: int, last: int) -> list[list[str]]:
@@ -242,16 +209,6 @@ def _number(path: Path, row: list[str], column: int) -> float:
             f"{path} must have a number in column {column + 1}, got {validate.shown(row)}"
         )
     return float(row[column])
-
-
-def _sensors_m(path: Path) -> NDArray[np.float64]:
-    """Return the loudspeaker's and microphones' positions at the array's home, metres [n, 3]."""
-    rows = _rows(path, 1, 3)
-    if len(rows) < 2:
-        raise FileFormatError(
-            f"{path} must have rows for a loudspeaker and microphones, got {len(rows)} rows"
-        )
-    return np.array([[_number(path, row, column) for column in (1, 2, 3)] for row in rows])
 
 
 def _microphones(path: Path, there: list[int], channels: Sequence[int] | None) -> list[int]:
@@ -331,16 +288,26 @@ def _speeds_m_s(temperature: NDArray, pings: int) -> NDArray[np.float64]:
     return speed
 
 
-def _conditioned(
-    together: NDArray[np.float32], time_s: NDArray, duration_s: float
-) -> NDArray[np.float32]:
-    """Remove the constant offset and the transmission from samples [..., time], in place.
+def _at_one_speed(lines: RangeLines, speed_m_s: NDArray[np.float64]) -> RangeLines:
+    """Return lines with one speed of sound, from channels whose speeds of sound differed.
 
-    While the pulse is transmitted, the microphones record it directly. The samples are zero for
-    that time, and fade in over another pulse length.
+    Ranges r of the lines assume the one speed c, so that samples are at the times 2 r/c. In channel
+    i the echo of a point at range r arrives at the time 2 r/c_i. The line is therefore interpolated
+    at these times, by a Fourier series, and multiplied by a phasor of phase
+    4 pi fc r (1/c_i - 1/c). A point at rho then has its echo at rho in every channel, with the
+    phase exp(-j 4 pi fc rho/c).
     """
-    ramp = np.clip(time_s / duration_s - 1, 0, 1)
-    blanking = np.sin(np.pi / 2 * ramp).astype(np.float32) ** 2
-    together -= together.mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
-    together *= blanking
-    return together
+    validate.memory("lines at one speed of sound", lines.samples.nbytes)
+    speed = lines.sound_speed_m_s
+    samples = np.array(lines.samples)
+    padded = fft.next_fast_len(lines.length + lines.length // 4)
+    for channel in np.flatnonzero(speed_m_s != speed):
+        range_m = lines.first_range_m[channel] + np.arange(lines.length) * lines.range_step_m
+        at = (range_m * speed / speed_m_s[channel] - range_m[0]) / lines.range_step_m
+        series = fft.fftshift(fft.fft(samples[channel].astype(np.complex128), padded)) / padded
+        line = fourier_series(series, at / padded, _SERIES_ERROR_DB)
+        line *= np.exp(-2j * np.pi * (padded // 2) * at / padded)  # the first frequency
+        line[(at < 0) | (at > lines.length - 1)] = 0
+        cycles = 2 * lines.carrier_hz * range_m * (1 / speed_m_s[channel] - 1 / speed)
+        samples[channel] = line * np.exp(2j * np.pi * cycles)
+    return replace(lines, samples=samples)

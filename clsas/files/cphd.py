@@ -170,13 +170,16 @@ def read_cphd(
             _check_sizes(tree, name, header)
             vectors = reader.read_pvps(name)
             signal = reader.read_signal(name)
-            collection = _Collection.read(tree)
+            collection = _collection(tree)
             kept = _usable(path, vectors)
             if not kept.any():
                 raise FileFormatError(
                     "must contain vectors with a signal and complete positions, got none"
                 )
-            vectors, signal = vectors[kept], _complex(signal[kept])
+            vectors, signal = vectors[kept], signal[kept]
+            if signal.dtype.names:
+                signal = signal["real"] + np.complex64(1j) * signal["imag"]
+            signal = signal.astype(np.complex64)
             if "AmpSF" in (vectors.dtype.names or ()):
                 signal *= vectors["AmpSF"].astype(np.float32)[:, None]
             if collection.sign == 1:
@@ -277,27 +280,6 @@ class _Collection:
     is_own: bool
     georeference: Georeference | None
 
-    @classmethod
-    def read(cls, tree: Any) -> _Collection:
-        """Return the collection that the XML describes, given its root."""
-        whole, scene = tree["Global"], tree["SceneCoordinates"]
-        if whole["SGN"] not in (-1, 1):
-            raise FileFormatError(f"must have the phase sign (SGN) +1 or -1, got {whole['SGN']}")
-        own = dict(tree["CollectionID"].findall("Parameter"))
-        axes = _axes(scene)
-        if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-5):
-            raise FileFormatError("must have orthogonal image area axes of length 1")
-        return cls(
-            domain=validate.one_of("its domain", whole["DomainType"], ("FX", "TOA")),
-            sign=whole["SGN"],
-            centre_m=_vector(scene["IARP"]["ECF"]),
-            axes=axes,
-            origin_m=_vector(own.get(ORIGIN, "0 0 0").split()),
-            speed_m_s=validate.positive("its speed", float(own.get(SPEED, speed_of_light)), "m/s"),
-            is_own=SPEED in own,
-            georeference=_georeference(own.get(PLACE)),
-        )
-
     @property
     def frequency_scale(self) -> float:
         """Ratio of the true frequencies to those in the file."""
@@ -308,27 +290,39 @@ class _Collection:
         return (position_m.astype(np.float64) - self.centre_m) @ self.axes.T + self.origin_m
 
 
-def _georeference(text: str | None) -> Georeference | None:
-    """Return the georeference in a parameter of the collection."""
-    if text is None:
-        return None
-    try:
-        return Georeference(**parse_json(text.encode()))
-    except (TypeError, ValueError) as error:
-        raise FileFormatError(f"must have a georeference in {PLACE}: {error}") from None
+def _collection(tree: Any) -> _Collection:
+    """Return the collection that the XML describes, given its root."""
+    whole, scene = tree["Global"], tree["SceneCoordinates"]
+    if whole["SGN"] not in (-1, 1):
+        raise FileFormatError(f"must have the phase sign (SGN) +1 or -1, got {whole['SGN']}")
+    own = dict(tree["CollectionID"].findall("Parameter"))
 
-
-def _axes(scene: Any) -> NDArray[np.float64]:
-    """Return unit vectors of local x, y and z: those of a plane, else east, north and up."""
+    # Local x, y and z: those of a plane, else east, north and up.
     surface = scene["ReferenceSurface"]
     if "Planar" in surface:
         x, y = (_vector(surface["Planar"][name]) for name in ("uIAX", "uIAY"))
-        return np.stack([x, y, np.cross(x, y)])
-    latitude, longitude = np.radians(_vector(scene["IARP"]["LLH"])[:2])
-    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
-    up = np.cos(latitude) * np.array([np.cos(longitude), np.sin(longitude), 0.0])
-    up[2] = np.sin(latitude)
-    return np.stack([east, np.cross(up, east), up])
+        axes = np.stack([x, y, np.cross(x, y)])
+    else:
+        latitude, longitude = np.radians(_vector(scene["IARP"]["LLH"])[:2])
+        east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
+        up = np.cos(latitude) * np.array([np.cos(longitude), np.sin(longitude), 0.0])
+        up[2] = np.sin(latitude)
+        axes = np.stack([east, np.cross(up, east), up])
+    if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-5):
+        raise FileFormatError("must have orthogonal image area axes of length 1")
+
+    domain = validate.one_of("its domain", whole["DomainType"], ("FX", "TOA"))
+    centre_m, origin_m = _vector(scene["IARP"]["ECF"]), _vector(own.get(ORIGIN, "0 0 0").split())
+    speed_m_s = validate.positive("its speed", float(own.get(SPEED, speed_of_light)), "m/s")
+    georeference = None
+    if PLACE in own:
+        try:
+            georeference = Georeference(**parse_json(own[PLACE].encode()))
+        except (TypeError, ValueError) as error:
+            raise FileFormatError(f"must have a georeference in {PLACE}: {error}") from None
+    return _Collection(
+        domain, whole["SGN"], centre_m, axes, origin_m, speed_m_s, SPEED in own, georeference
+    )
 
 
 def _vector(value: Any) -> NDArray[np.float64]:
@@ -386,24 +380,15 @@ def _look_direction(
         sides = [geometry["Monostatic"]["SideOfTrack"]] * 2
     else:
         sides = [geometry["Bistatic"][name]["SideOfTrack"] for name in _PLATFORMS]
-    looks = [_beside(*pair) for pair in zip(velocity, sides, strict=True)]
+    looks = []
+    for along, side in zip(velocity, sides, strict=True):
+        left = np.stack([-along[:, 1], along[:, 0], 0 * along[:, 0]], axis=1)
+        with np.errstate(invalid="ignore"):  # at rest
+            left /= np.linalg.norm(left, axis=1, keepdims=True)
+        looks.append(left if side == "L" else -left)
     if not np.all(np.einsum("ci,ci->c", *looks) > _ALIKE):  # also if one is NaN
         return None
     return looks[0] + looks[1]
-
-
-def _beside(velocity: NDArray[np.float64], side: str) -> NDArray[np.float64]:
-    """Return horizontal unit vectors to the left ("L") or right of velocities; NaN at rest."""
-    aside = np.stack([-velocity[:, 1], velocity[:, 0], 0 * velocity[:, 0]], axis=1)
-    with np.errstate(invalid="ignore"):
-        aside /= np.linalg.norm(aside, axis=1, keepdims=True)
-    return aside if side == "L" else -aside
-
-
-def _complex(signal: NDArray) -> NDArray[np.complex64]:
-    if signal.dtype.names:
-        return (signal["real"] + np.complex64(1j) * signal["imag"]).astype(np.complex64)
-    return signal.astype(np.complex64)
 
 
 def _geometry(vectors: NDArray, collection: _Collection) -> dict[str, Any]:
@@ -660,7 +645,15 @@ def _document(
         "NumSupportArrays": 0,
     }
     root["Channel"] = _channel(vectors)
-    root["PVP"] = _layout(vectors.dtype)
+    # The place of every parameter within a vector, in 64-bit words.
+    assert vectors.dtype.fields is not None  # the type has names
+    places: dict[str, Any] = {
+        name: {"Offset": offset // 8, "Size": dtype.itemsize // 8, "dtype": dtype}
+        for name, (dtype, offset, *_) in vectors.dtype.fields.items()
+    }
+    if LOOK in places:
+        places["AddedPVP"] = [{"Name": LOOK, **places.pop(LOOK)}]
+    root["PVP"] = places
     times = sarkit.compute_t_ref_from_pvps(vectors)
     root["Dwell"] = {
         "NumCODTimes": 1,
@@ -726,15 +719,3 @@ def _scene(vectors: NDArray) -> dict[str, Any]:
             "IAYExtent": {"SampleSpacing": spacing_m, "FirstSample": 0, "NumSamples": _GRID},
         },
     }
-
-
-def _layout(vector: np.dtype) -> dict[str, Any]:
-    """Return the place of every parameter within a vector, in 64-bit words."""
-    assert vector.fields is not None  # the type has names
-    places: dict[str, Any] = {
-        name: {"Offset": offset // 8, "Size": dtype.itemsize // 8, "dtype": dtype}
-        for name, (dtype, offset, *_) in vector.fields.items()
-    }
-    if LOOK in places:
-        places["AddedPVP"] = [{"Name": LOOK, **places.pop(LOOK)}]
-    return places

@@ -166,7 +166,19 @@ def read_samples(path: str | os.PathLike, rows: slice, columns: slice) -> np.nda
 def _opened(path: str | os.PathLike) -> Iterator[h5py.File]:
     """Open a clsas file for reading; any defect raises FileFormatError."""
     with opened(path) as file:
-        _check_header(file)
+        if _attribute(file, "format") != FORMAT:
+            raise FileFormatError(
+                "is an HDF5 file, but was not written by clsas: it lacks the attribute format"
+            )
+        version = _attribute(file, "version")
+        if not isinstance(version, int):
+            raise FileFormatError(
+                f"is damaged: its attribute version must be a number, got {version!r}"
+            )
+        if version != VERSION:
+            raise FileFormatError(
+                f"is of format version {version}, but this clsas reads version {VERSION}"
+            )
         yield file
 
 
@@ -244,7 +256,9 @@ def _read(group: h5py.Group, budget: validate.Budget, **instead: Any) -> Any:
         if (item := find_item(group, field.name, kinds_of_values)) is not None:
             is_group = isinstance(item, h5py.Group)
             # Check the kind before reading, since a group may contain a link to itself.
-            if is_group and _kind_of_field(field.type) != _attribute(item, "kind"):
+            classes = str(field.type).split(" | ")  # such as "Pulse | None"
+            allowed = next((each for each, one in _KINDS.items() if one.__name__ in classes), None)
+            if is_group and allowed != _attribute(item, "kind"):
                 raise FileFormatError(f"contains another object as {field.name} of the {name}")
             values[field.name] = _read(item, budget) if is_group else read_values(item, budget)
         elif "None" in str(field.type):
@@ -252,12 +266,6 @@ def _read(group: h5py.Group, budget: validate.Budget, **instead: Any) -> Any:
         else:
             raise FileFormatError(f"lacks {field.name} of the {name} at {group.name}")
     return kind(**values)
-
-
-def _kind_of_field(annotation: object) -> str | None:
-    """Return the kind of object in a field such as `pulse: Pulse | None`; None for other fields."""
-    classes = str(annotation).split(" | ")
-    return next((name for name, kind in _KINDS.items() if kind.__name__ in classes), None)
 
 
 def find_item(
@@ -343,19 +351,3 @@ def _attribute(group: h5py.Group, name: str) -> Any:
     if isinstance(value, list):
         return [each.decode() if isinstance(each, bytes) else each for each in value]
     return value.decode() if isinstance(value, bytes) else value
-
-
-def _check_header(file: h5py.File) -> None:
-    if _attribute(file, "format") != FORMAT:
-        raise FileFormatError(
-            "is an HDF5 file, but was not written by clsas: it lacks the attribute format"
-        )
-    version = _attribute(file, "version")
-    if not isinstance(version, int):
-        raise FileFormatError(
-            f"is damaged: its attribute version must be a number, got {version!r}"
-        )
-    if version != VERSION:
-        raise FileFormatError(
-            f"is of format version {version}, but this clsas reads version {VERSION}"
-        )

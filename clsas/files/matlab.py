@@ -125,6 +125,7 @@ def numbers(
 
 
 def _variables(content: bytes, budget: validate.Budget) -> dict[str, Any]:
+    """Return the variables of a file by name."""
     order = "<" if content[126:128] == b"IM" else ">"
     found: dict[str, Any] = {}
     place = _HEADER
@@ -134,21 +135,15 @@ def _variables(content: bytes, budget: validate.Budget) -> dict[str, Any]:
         if len(body) < size:
             raise FileFormatError("is damaged: its last variable is cut off")
         place += 8 + size
-        name, value = _variable(kind, body, order, budget)
+        unpacked_bytes = 0
+        if kind == _COMPRESSED:
+            kind, body = _unpacked(body, order, budget)
+            unpacked_bytes = len(body)
+        if kind != _MATRIX:
+            raise FileFormatError(f"is damaged: it contains an element of type {kind}")
+        name, value = _matrix(body, order, 0, budget)
+        budget.give_back(unpacked_bytes)
         found[name] = value
-    return found
-
-
-def _variable(kind: int, body: memoryview, order: str, budget: validate.Budget) -> tuple[str, Any]:
-    """Return the name and value of a variable, which may be compressed."""
-    unpacked_bytes = 0
-    if kind == _COMPRESSED:
-        kind, body = _unpacked(body, order, budget)
-        unpacked_bytes = len(body)
-    if kind != _MATRIX:
-        raise FileFormatError(f"is damaged: it contains an element of type {kind}")
-    found = _matrix(body, order, 0, budget)
-    budget.give_back(unpacked_bytes)
     return found
 
 
@@ -164,6 +159,45 @@ def _unpacked(packed: memoryview, order: str, budget: validate.Budget) -> tuple[
     if unpacker.decompress(unpacker.unconsumed_tail, 1) or not unpacker.eof or len(content) < size:
         raise FileFormatError("is damaged: a variable does not unpack to its size")
     return kind, memoryview(content)
+
+
+def _matrix(body: memoryview, order: str, depth: int, budget: validate.Budget) -> tuple[str, Any]:
+    """Return the name and value of a matrix."""
+    if depth > _DEEPEST:
+        raise FileFormatError(f"must have at most {_DEEPEST} levels of nested structures")
+    parts = _elements(body, order, budget)
+    if not parts:
+        return "", np.zeros(0)
+    flags = struct.unpack_from(f"{order}I", parts[0][1])[0]
+    kind = flags & 0xFF
+    name = bytes(parts[2][1]).decode("latin-1")
+    if kind not in _CLASSES and kind != _STRUCTURE:
+        return name, None
+    shape = [int(n) for n in np.frombuffer(parts[1][1], np.dtype(f"{order}i4"))]
+    if len(shape) < 2 or min(shape) < 0:
+        raise FileFormatError(f"is damaged: a variable has the shape {validate.shown(shape)}")
+    if kind == _STRUCTURE:
+        if math.prod(shape) != 1:
+            return name, None
+        length = struct.unpack_from(f"{order}i", parts[3][1])[0]
+        names = bytes(parts[4][1])
+        if length < 1 or len(names) // length != len(parts) - 5:
+            raise FileFormatError("is damaged: a structure lacks names or values of fields")
+        fields = [
+            names[n : n + length].split(b"\0")[0].decode("latin-1")
+            for n in range(0, len(names) // length * length, length)
+        ]
+        values = [_matrix(part, order, depth + 1, budget)[1] for _, part in parts[5:]]
+        return name, dict(zip(fields, values, strict=True))
+    value = _array(parts[3], shape, kind, order, budget)
+    if flags & _COMPLEX:
+        imaginary = _array(parts[4], shape, kind, order, budget)
+        complex_bytes = math.prod(shape) * np.result_type(value, np.complex64).itemsize
+        with too_large():
+            budget.take("reading complex numbers", complex_bytes, passing_bytes=complex_bytes)
+        budget.give_back(2 * value.nbytes)
+        value = value + np.result_type(value, np.complex64).type(1j) * imaginary
+    return name, value.squeeze()
 
 
 def _elements(
@@ -185,36 +219,6 @@ def _elements(
     return found
 
 
-def _matrix(body: memoryview, order: str, depth: int, budget: validate.Budget) -> tuple[str, Any]:
-    """Return the name and value of a matrix."""
-    if depth > _DEEPEST:
-        raise FileFormatError(f"must have at most {_DEEPEST} levels of nested structures")
-    parts = _elements(body, order, budget)
-    if not parts:
-        return "", np.zeros(0)
-    flags = struct.unpack_from(f"{order}I", parts[0][1])[0]
-    kind = flags & 0xFF
-    name = bytes(parts[2][1]).decode("latin-1")
-    if kind not in _CLASSES and kind != _STRUCTURE:
-        return name, None
-    shape = [int(n) for n in np.frombuffer(parts[1][1], np.dtype(f"{order}i4"))]
-    if len(shape) < 2 or min(shape) < 0:
-        raise FileFormatError(f"is damaged: a variable has the shape {validate.shown(shape)}")
-    if kind == _STRUCTURE:
-        if math.prod(shape) != 1:
-            return name, None
-        return name, _structure(parts[3:], order, depth, budget)
-    value = _array(parts[3], shape, kind, order, budget)
-    if flags & _COMPLEX:
-        imaginary = _array(parts[4], shape, kind, order, budget)
-        complex_bytes = math.prod(shape) * np.result_type(value, np.complex64).itemsize
-        with too_large():
-            budget.take("reading complex numbers", complex_bytes, passing_bytes=complex_bytes)
-        budget.give_back(2 * value.nbytes)
-        value = value + np.result_type(value, np.complex64).type(1j) * imaginary
-    return name, value.squeeze()
-
-
 def _array(
     part: tuple[int, memoryview], shape: list[int], kind: int, order: str, budget: validate.Budget
 ) -> np.ndarray:
@@ -228,18 +232,3 @@ def _array(
         budget.take("reading numbers", count * np.dtype(_CLASSES[kind]).itemsize)
     # MATLAB stores arrays column by column.
     return np.frombuffer(part[1], stored).astype(_CLASSES[kind]).reshape(shape, order="F")
-
-
-def _structure(
-    parts: list[tuple[int, memoryview]], order: str, depth: int, budget: validate.Budget
-) -> dict[str, Any]:
-    length = struct.unpack_from(f"{order}i", parts[0][1])[0]
-    names = bytes(parts[1][1])
-    if length < 1 or len(names) // length != len(parts) - 2:
-        raise FileFormatError("is damaged: a structure lacks names or values of fields")
-    fields = [
-        names[n : n + length].split(b"\0")[0].decode("latin-1")
-        for n in range(0, len(names) // length * length, length)
-    ]
-    values = [_matrix(part, order, depth + 1, budget)[1] for _, part in parts[2:]]
-    return dict(zip(fields, values, strict=True))

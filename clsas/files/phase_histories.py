@@ -102,14 +102,23 @@ def phase_history_lines(
             f"{len(reference)} and {len(frequency)} for fp [{count} frequencies, {pulses} pulses]"
         )
     antenna_m = np.stack(antenna, axis=-1).astype(np.float64)
-    first, step = _equal_steps(path, frequency)
+    # Frequencies in equal steps, except for rounding.
+    exact = np.linspace(float(frequency[0]), float(frequency[-1]), count)
+    first, step = float(exact[0]), float(exact[-1] - exact[0]) / max(count - 1, 1)
+    rounding = 2 * _rounding(frequency) + 1e-3 * abs(step)
+    if not step > 0 or not np.abs(exact - frequency).max() <= rounding:
+        raise FileFormatError(f"{os.fspath(path)} must contain freq in equal, ascending steps")
+    # Prefer distances from the origin to reference ranges that equal them except for rounding.
+    reference_m = np.linalg.norm(antenna_m, axis=1)
+    if not np.abs(reference_m - reference).max() <= 2 * _rounding(reference):
+        reference_m = reference.astype(np.float64)
     with located(f"{os.fspath(path)}:"):
         first_hz, step_hz = _in_hz(path, first, step, count, reference)
         lines = from_phase_history(
             samples,
             first_frequency_hz=first_hz,
             frequency_step_hz=step_hz,
-            reference_range_m=_reference_m(reference, antenna_m),
+            reference_range_m=reference_m,
             tx_m=antenna_m,
             rx_m=antenna_m,
             sound_speed_m_s=speed_of_light,
@@ -117,16 +126,6 @@ def phase_history_lines(
             oversampling=oversampling,
         )
     return checked_positions(path, lines)
-
-
-def _equal_steps(path: str | os.PathLike, frequency: NDArray) -> tuple[float, float]:
-    """Return the first of the frequencies and their step, which are equal except for rounding."""
-    exact = np.linspace(float(frequency[0]), float(frequency[-1]), len(frequency))
-    step = float(exact[-1] - exact[0]) / max(len(exact) - 1, 1)
-    rounding = 2 * _rounding(frequency) + 1e-3 * abs(step)
-    if not step > 0 or not np.abs(exact - frequency).max() <= rounding:
-        raise FileFormatError(f"{os.fspath(path)} must contain freq in equal, ascending steps")
-    return float(exact[0]), step
 
 
 def _in_hz(
@@ -151,13 +150,6 @@ def _in_hz(
             return first * unit, step * unit
     hint = "no radar images below 1 MHz. It may be in MHz or GHz"
     raise ArgumentError("freq", "be in Hz", f"{first:g} to {last:g}", hint)
-
-
-def _reference_m(reference: NDArray, antenna_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    distance = np.linalg.norm(antenna_m, axis=1)
-    if np.abs(distance - reference).max() <= 2 * _rounding(reference):
-        return distance
-    return reference.astype(np.float64)
 
 
 def _rounding(values: NDArray) -> float:

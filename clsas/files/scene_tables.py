@@ -29,10 +29,9 @@ from clsas.engine.data.validate import ArgumentError
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import Request
 from clsas.engine.signal.compression import compress
+from clsas.files.csv_files import read_sound_speed, read_track
 from clsas.files.height_files import read_heights
-from clsas.files.sound_speed_files import read_sound_speed
 from clsas.files.tables import Pair, Table, Vector, keys_of, located
-from clsas.files.track_files import read_track
 from clsas.interferometry.checks import PATCH
 from clsas.interferometry.heights import heights
 from clsas.interferometry.pair_errors import pair_errors

@@ -109,10 +109,9 @@ def to_xarray(obj: Grid | RangeLines | Image | Echoes) -> xarray.DataArray | xar
 def _image_to_xarray(xarray: ModuleType, image: Image) -> xarray.DataArray:
     dims = grid_dims(image.grid)
     coordinates = _grid_coordinates(image.grid)
-    for name, part in (("real", image.pixels.real), ("imag", image.pixels.imag)):
-        words = {"real": "Real", "imag": "Imaginary"}[name]
+    for name, words in (("real", "Real"), ("imag", "Imaginary")):
         attributes = {"units": "1", "long_name": f"{words} part of the pixels"}
-        coordinates[f"pixels_{name}"] = (dims, part, attributes)
+        coordinates[f"pixels_{name}"] = (dims, getattr(image.pixels, name), attributes)
     reference = largest_amplitude(image.pixels)
     of_level = {
         "long_name": "Amplitude re max",
@@ -137,14 +136,30 @@ def grid_dims(grid: Grid) -> tuple[str, ...]:
 
 def _grid_coordinates(grid: Grid) -> dict[str, Any]:
     """Return the coordinates of a grid, and those on the map if it has a georeference."""
-    place = grid.georeference
+    place, dims = grid.georeference, grid_dims(grid)
+    words = _ON_MAP if place is not None and place.is_north_up else _AXES
+    if grid.has_axes:
+        x, y = grid.axes_m
+        z: tuple[Any, Any] = ((), grid.positions_m(slice(1), slice(1))[0, 0, 2])
+        if grid.height_m is not None:
+            z = (dims, grid.positions_m()[..., 2])
+        known: dict[str, Any] = {
+            "x": ("x", x, words["x"] | {"axis": "X"}),
+            "y": ("y", y, words["y"] | {"axis": "Y"}),
+            "z": (*z, dict(words["z"])),
+        }
+    else:
+        positions = np.moveaxis(grid.positions_m(), -1, 0)
+        known = {
+            name: (dims, values, dict(words[name]))
+            for name, values in zip("xyz", positions, strict=True)
+        }
     if place is None:
-        return _coordinates(grid, _AXES)
-    known = _coordinates(grid, _ON_MAP if place.is_north_up else _AXES)
+        return known
     if not place.is_north_up:
         on_map = np.moveaxis(place.to_map(grid.positions_m()), -1, 0)
         for name, axis, values in zip(("easting", "northing"), "xy", on_map, strict=False):
-            known[name] = (grid_dims(grid), values, dict(_ON_MAP[axis]))
+            known[name] = (dims, values, dict(_ON_MAP[axis]))
     return known | {GRID_MAPPING: ((), 0, grid_mapping(place))}
 
 
@@ -161,25 +176,6 @@ def grid_mapping(place: Georeference) -> dict[str, Any]:
     }
     words = {"long_name": "Coordinate reference system", "spatial_ref": of_map["crs_wkt"]}
     return {**of_map, **words, **fields_given}
-
-
-def _coordinates(grid: Grid, words: dict[str, dict[str, str]]) -> dict[str, Any]:
-    dims = grid_dims(grid)
-    if not grid.has_axes:
-        positions = np.moveaxis(grid.positions_m(), -1, 0)
-        return {
-            name: (dims, values, dict(words[name]))
-            for name, values in zip("xyz", positions, strict=True)
-        }
-    x, y = grid.axes_m
-    z: tuple[Any, Any] = ((), grid.positions_m(slice(1), slice(1))[0, 0, 2])
-    if grid.height_m is not None:
-        z = (dims, grid.positions_m()[..., 2])
-    return {
-        "x": ("x", x, words["x"] | {"axis": "X"}),
-        "y": ("y", y, words["y"] | {"axis": "Y"}),
-        "z": (*z, dict(words["z"])),
-    }
 
 
 def _channels_to_xarray(xarray: ModuleType, obj: RangeLines | Echoes) -> xarray.Dataset:

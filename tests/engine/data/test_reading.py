@@ -7,7 +7,7 @@ import pytest
 
 from clsas.engine.data import reading, validate
 from clsas.files import airsas, height_files
-from clsas.files.csv_columns import read_columns
+from clsas.files.csv_files import read_columns
 
 DEEP = 100_000
 
@@ -39,7 +39,7 @@ LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 
 def of_columns(path):
-    return read_columns(path, lambda names: None, "numbers")
+    return read_columns(path, (*"abcd", "\u0100"), lambda names: None, "numbers")
 
 
 def parsed_toml(path):
