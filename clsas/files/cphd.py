@@ -184,13 +184,37 @@ def read_cphd(
                 signal *= vectors["AmpSF"].astype(np.float32)[:, None]
             if collection.sign == 1:
                 np.conj(signal, out=signal)
+
             look = _look_direction(tree, vectors, collection)
+            tx_m, rx_m, point_m = (
+                (vectors[part].astype(np.float64) - collection.centre_m) @ collection.axes.T
+                + collection.origin_m
+                for part in ("TxPos", "RcvPos", "SRPPos")
+            )
+            out_m, back_m = (np.linalg.norm(each - point_m, axis=1) for each in (tx_m, rx_m))
+            reference_m = (out_m + back_m) / 2
+
     if collection.domain == "FX":
+        scale = collection.speed_m_s / speed_of_light  # of true frequencies
         with located(f"{path}:"):
-            lines = _lines_of_fx(signal, vectors, collection, window, oversampling)
+            band_hz = scale * np.stack([vectors["FX1"], vectors["FX2"]], axis=1).astype(np.float64)
+            sampled_hz = signal.shape[1] * vectors["SCSS"]
+            occupied = float(np.max((vectors["FX2"] - vectors["FX1"]) / sampled_hz))
+            lines = from_phase_history(
+                signal,
+                first_frequency_hz=scale * vectors["SC0"].astype(np.float64),
+                frequency_step_hz=scale * vectors["SCSS"].astype(np.float64),
+                tx_m=tx_m,
+                rx_m=rx_m,
+                reference_range_m=reference_m,
+                sound_speed_m_s=collection.speed_m_s,
+                band_hz=band_hz,
+                window=window,
+                oversampling=max(1.0, oversampling * min(1.0, occupied)),
+            )
     else:
         with _defects(path):
-            lines = _lines_of_toa(signal, vectors, collection)
+            lines = _lines_of_toa(signal, vectors, collection.speed_m_s, tx_m, rx_m, reference_m)
     lines = replace(lines, look_direction=look, georeference=collection.georeference)
     return checked_positions(path, lines)
 
@@ -279,15 +303,6 @@ class _Collection:
     speed_m_s: float
     is_own: bool
     georeference: Georeference | None
-
-    @property
-    def frequency_scale(self) -> float:
-        """Ratio of the true frequencies to those in the file."""
-        return self.speed_m_s / speed_of_light
-
-    def local_m(self, position_m: NDArray) -> NDArray[np.float64]:
-        """Return positions in local coordinates."""
-        return (position_m.astype(np.float64) - self.centre_m) @ self.axes.T + self.origin_m
 
 
 def _collection(tree: Any) -> _Collection:
@@ -391,43 +406,15 @@ def _look_direction(
     return looks[0] + looks[1]
 
 
-def _geometry(vectors: NDArray, collection: _Collection) -> dict[str, Any]:
-    """Return the positions of every vector, and its range to the reference point."""
-    tx_m, rx_m, point_m = (
-        collection.local_m(vectors[name]) for name in ("TxPos", "RcvPos", "SRPPos")
-    )
-    range_m = [np.linalg.norm(each - point_m, axis=1) for each in (tx_m, rx_m)]
-    return {"tx_m": tx_m, "rx_m": rx_m, "reference_range_m": (range_m[0] + range_m[1]) / 2}
-
-
-def _lines_of_fx(
+def _lines_of_toa(
     signal: NDArray[np.complex64],
     vectors: NDArray,
-    collection: _Collection,
-    window: Window,
-    oversampling: float,
-) -> RangeLines:
-    scale = collection.frequency_scale
-    sampled_hz = signal.shape[1] * vectors["SCSS"]
-    occupied = float(np.max((vectors["FX2"] - vectors["FX1"]) / sampled_hz))
-    return from_phase_history(
-        signal,
-        first_frequency_hz=scale * vectors["SC0"].astype(np.float64),
-        frequency_step_hz=scale * vectors["SCSS"].astype(np.float64),
-        **_geometry(vectors, collection),
-        sound_speed_m_s=collection.speed_m_s,
-        band_hz=scale * np.stack([vectors["FX1"], vectors["FX2"]], axis=1).astype(np.float64),
-        window=window,
-        oversampling=max(1.0, oversampling * min(1.0, occupied)),
-    )
-
-
-def _lines_of_toa(
-    signal: NDArray[np.complex64], vectors: NDArray, collection: _Collection
+    speed_m_s: float,
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+    reference_m: NDArray[np.float64],
 ) -> RangeLines:
     """Return lines with one carrier and absolute ranges, from signals at the bands' middles."""
-    geometry = _geometry(vectors, collection)
-    reference_m = geometry.pop("reference_range_m")
     step_s, start_s = (vectors[name].astype(np.float64) for name in ("SCSS", "SC0"))
     if np.ptp(step_s) * signal.shape[1] > 1e-3 * step_s[0]:
         raise FileFormatError("must have TOA samples at one step, got several (SCSS)")
@@ -443,9 +430,10 @@ def _lines_of_toa(
         samples,
         first_range_m=reference_m + speed_of_light / 2 * start_s,
         range_step_m=float(speed_of_light / 2 * step_s[0]),
-        **geometry,
-        carrier_hz=carrier_hz * collection.frequency_scale,
-        sound_speed_m_s=collection.speed_m_s,
+        tx_m=tx_m,
+        rx_m=rx_m,
+        carrier_hz=carrier_hz * (speed_m_s / speed_of_light),
+        sound_speed_m_s=speed_m_s,
     )
 
 

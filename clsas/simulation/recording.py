@@ -175,15 +175,16 @@ class Paths:
         def limits(group: range) -> list[tuple[float, float]]:
             observer = self.observer(group)
             spheres = [part.spheres(observer) for part in self.parts]
-
-            def lengths(channel: int) -> Iterator[tuple[float, float]]:
+            ends = []
+            for channel in group:
+                shortest, longest = np.inf, -np.inf
                 for centres, radii in spheres:
                     out, back = legs_m(centres, *self.elements(channel), self.sound_speed_m_s)
                     margin = per_metre * radii
-                    yield np.min(out + back - margin), np.max(out + back + margin)
-
-            both = [zip(*lengths(channel), strict=True) for channel in group]
-            return [(min(nearest), max(farthest)) for nearest, farthest in both]
+                    shortest = min(shortest, float(np.min(out + back - margin)))
+                    longest = max(longest, float(np.max(out + back + margin)))
+                ends.append((shortest, longest))
+            return ends
 
         found = np.array(
             [ends for group in in_threads(limits, self.groups, workers) for ends in group]
