@@ -102,6 +102,7 @@ def read_airsas(
                 "is an HDF5 file, but not an AirSAS scene: it must contain /na and microphones "
                 f"/ch1, /ch2, ..., got {validate.shown(sorted(file))}"
             )
+        groups = set(file)
     if shared is None:
         folder = path.absolute().parent.parent / SHARED
     else:
@@ -117,8 +118,7 @@ def read_airsas(
     sensors_m = np.array(
         [[_number(folder / SENSORS, row, column) for column in (1, 2, 3)] for row in rows]
     )
-    with hdf5.opened(path) as file:
-        there = [n for n in range(1, len(sensors_m)) if f"ch{n}" in file]
+    there = [number for number in range(1, len(sensors_m)) if f"ch{number}" in groups]
     numbers = _microphones(path, there, channels)
     with hdf5.opened(path) as file:
         budget = validate.Budget()
