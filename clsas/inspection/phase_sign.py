@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines, some_channels
 from clsas.engine.data.validate import ClsasWarning
 from clsas.engine.device.device import Device
@@ -100,15 +99,20 @@ def phase_sign(
         except _UndeterminedError as error:
             reasons.append(str(error))
             continue
-        conjugate = replace(part, samples=part.samples.conj())
-        with warnings.catch_warnings():  # about accuracy, which is not needed here
-            warnings.simplefilter("ignore", ClsasWarning)
-            as_given, of_conjugate = (
-                _sharpness_along(backproject(each, patch, device=device, accuracy_db=_ACCURACY_DB))
-                for each in (part, conjugate)
-            )
+        sharpness = []
+        for each in (part, replace(part, samples=part.samples.conj())):
+            with warnings.catch_warnings():  # about accuracy, which is not needed here
+                warnings.simplefilter("ignore", ClsasWarning)
+                image = backproject(each, patch, device=device, accuracy_db=_ACCURACY_DB)
+            # Row by row, that is along the track: echoes confined to a few ranges do not count as
+            # sharp, since blurred ones are too.
+            amplitude = np.abs(image.pixels)
+            intensity = (amplitude / (amplitude.max() or 1.0)).astype(np.float64) ** 2
+            mean_square = float((intensity**2).mean(axis=1).sum())
+            squared_mean = float((intensity.mean(axis=1) ** 2).sum())
+            sharpness.append(mean_square / squared_mean if squared_mean else 0.0)
         x, y, z = position_m.tolist()
-        signs.append(PhaseSign(as_given, of_conjugate, centre_m=(x, y, z)))
+        signs.append(PhaseSign(sharpness[0], sharpness[1], centre_m=(x, y, z)))
 
     if not signs:
         return None, reasons[0]
@@ -297,18 +301,6 @@ def _across(look_m: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[
     across = look_m - along * (look_m @ along)
     size, least = float(np.linalg.norm(across)), 0.1 * float(np.linalg.norm(look_m))
     return across / size if size > least else None
-
-
-def _sharpness_along(image: Image) -> float:
-    """Return the mean squared intensity over the squared mean intensity, row by row.
-
-    Rows lie along the track. Echoes confined to a few ranges do not count as sharp, since blurred
-    ones are too.
-    """
-    amplitude = np.abs(image.pixels)
-    intensity = (amplitude / (amplitude.max() or 1.0)).astype(np.float64) ** 2
-    squared_mean = float((intensity.mean(axis=1) ** 2).sum())
-    return float((intensity**2).mean(axis=1).sum()) / squared_mean if squared_mean else 0.0
 
 
 def _course(centres_m: NDArray[np.float64]) -> NDArray[np.float64]:
