@@ -76,8 +76,8 @@ from .mosaics.mosaic import mosaic as mosaic
 from .mosaics.store import Store as Store
 from .navigation.autofocus import Autofocus as Autofocus
 from .navigation.autofocus import autofocus as autofocus
-from .navigation.known_points import Calibration as Calibration
-from .navigation.known_points import calibrate_track as calibrate_track
+from .navigation.calibration import Calibration as Calibration
+from .navigation.calibration import calibrate_track as calibrate_track
 from .navigation.micronavigation import Micronavigation as Micronavigation
 from .navigation.micronavigation import micronavigate as micronavigate
 from .processing.chain import Processed as Processed

@@ -14,7 +14,7 @@ from clsas.cli.outputs import printable, report, step_bar
 from clsas.cli.parameters import INPUT, keep_apart
 from clsas.cli.wording import command
 from clsas.interferometry.pair_errors_result import in_words as error_in_words
-from clsas.navigation.calibration_result import in_words as correction_in_words
+from clsas.navigation.calibration import in_words as correction_in_words
 from clsas.processing.record import StepRecord
 
 

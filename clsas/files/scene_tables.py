@@ -36,7 +36,7 @@ from clsas.interferometry.checks import PATCH
 from clsas.interferometry.heights import heights
 from clsas.interferometry.pair_errors import pair_errors
 from clsas.navigation.autofocus import autofocus
-from clsas.navigation.known_points import calibrate_track
+from clsas.navigation.calibration import calibrate_track
 from clsas.navigation.micronavigation import micronavigate
 from clsas.simulation.scenes import PointTargets, Seabed
 from clsas.simulation.seabeds import pipeline, rocks, wreck

@@ -2,24 +2,27 @@
 
 An image is formed, and its brightest local maxima are taken as responses. The contribution of each
 ping to each response is read from the lines along the current track. Errors of the track are
-estimated from coarse to fine: from the drift of responses between subapertures
-(`clsas.navigation.drift`), from their phase steps between pings, and from their sharpness as a
-function of each ping (`clsas.navigation.gradient`). Each estimate is a *position* of the sonar, not
-a phase, so that the beam may be wide and the grid and track may have any shape. A correction is
-kept only if it makes the image sharper.
+estimated from coarse to fine: from the drift of responses between subapertures, from their phase
+steps between pings, and from their sharpness as a function of each ping (`responses.py` has these
+estimates). Each estimate is a *position* of the sonar, not a phase, so that the beam may be wide
+and the grid and track may have any shape. A correction is kept only if it makes the image sharper.
+
+Two things would be mistaken for errors of the track, and are detected: pings that the platform
+recorded standing still, and a wrong sound speed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsas.engine.data import validate
+from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.contrast import contrast
 from clsas.engine.data.declared import Names, check_declared
@@ -33,25 +36,23 @@ from clsas.engine.forming import form, scene_of_plan
 from clsas.engine.imaging import plan
 from clsas.engine.signal.interpolation import Readout
 from clsas.engine.water.refraction import homogeneous
-from clsas.navigation.autofocus_result import Autofocus
 from clsas.navigation.checks import (
     check_navigation,
     first_bank,
     mean_wavelength_m,
     range_cell_m,
 )
-from clsas.navigation.drift import drift_m
-from clsas.navigation.gradient import disagreement_m, phase_gradient_m, sharpest_m
-from clsas.navigation.halts import halt
 from clsas.navigation.responses import (
     READ_DB,
     Contributions,
     Passage,
     brightest,
     contributions,
-    received_share,
+    disagreement_m,
+    drift_m,
+    phase_gradient_m,
+    sharpest_m,
 )
-from clsas.navigation.speed_check import check_speed
 
 UNKNOWNS = ("sway", "heave", "surge")
 
@@ -82,6 +83,28 @@ _GAIN, _LARGE_CHANGE = 1.02, 1 / 8
 # change the sharpness by 0.2 % at most.
 _LEAST_CHANGE = 1 / 400
 _NO_RESPONSES = "the scene has no bright responses to focus on"
+
+# Halts: pings that a platform recorded standing still while its navigation moved.
+# Length of a stretch in Fresnel lengths. Over it, an echo from broadside has 1/16 of its power in
+# common, and other echoes less. Over half of it, the share would be 1/5.
+_STRETCH = 4.0
+_LEAST_PINGS = 8  # pings in a stretch
+_READ_PINGS, _READ_RECEIVERS = 32, 4  # most pings and receivers of a stretch that are compared
+# Largest share of the power that pings of a passage have in common. Passages over points and
+# speckle reach 0.03. Halts have 0.56 if noise is as strong as the echoes.
+_MOST_COMMON = 0.3
+# Largest share predicted by the navigation for which halts and passages differ. Straight tracks
+# have up to 0.07, and a circle about the only response has 1.
+_MOST_EXPECTED = 0.2
+
+# A wrong sound speed.
+# Share of the variance of a correction that a parabola must explain before a wrong sound speed is
+# suspected. It is 0.997 for speeds that are off by 1 %, and one smooth random sway in twenty also
+# reaches 0.95.
+_LEAST_PARABOLA = 0.95
+_MOST_SPEED_ERROR = 0.05  # of the sound speed; water has 1400 to 1600 m/s
+_LEAST_BEND = 1 / 50  # rms bend in wavelengths below which an image does not change
+_LEAST_FITTED = 4  # pings that determine a parabola
 
 
 def autofocus(
@@ -199,33 +222,37 @@ def autofocus(
     # Antennas move alike in the water of a profile and in the homogeneous water that replaces it.
     water = homogeneous(bank, grid, beam, IMAGE_TOLERANCE_DB, corrected=False)
     straight = water.lines(bank)
-    readout = Readout.of(_of_unit_level(straight), READ_DB)
+
+    # Samples are scaled to about 1, so that squared intensities stay within float32. Scaling by a
+    # power of two leaves their digits unchanged.
+    scaled, largest = straight, float(np.abs(straight.samples).max())
+    if largest:
+        scale = np.float32(2.0 ** -np.clip(math.frexp(largest)[1], -126, 126))
+        scaled = replace(straight, samples=straight.samples * scale)
+    readout = Readout.of(scaled, READ_DB)
     passage = Passage.of(straight, names, mean_wavelength_m(readout))
-    focus = _Focus(readout, water.grid, passage, water.beam, open_device(device), progress)
+    focus = _Focus(readout, water.grid, passage, water.beam, open_device(device))
     focus.check_geometry(names)
-    return _of_given(focus.result(), straight, lines)
+    obstacle = focus.improve(progress)
+    if obstacle:
+        validate.warn(f"{obstacle}. The lines are left as they were")
+        moved_m, deviation_m = np.zeros_like(focus.moved_m), np.full(passage.pings, np.inf)
+    else:
+        moved_m, deviation_m = focus.moved_m, focus.deviation_m
+        _check_speed(passage, focus.responses, moved_m)
 
-
-def _of_given(found: Autofocus, focused: RangeLines, lines: RangeLines) -> Autofocus:
-    """Return a result for the lines `focused`, applied to all channels of the same pings."""
-    one_of_ping = focused.ping_starts[lines.ping_numbers]
-    moved_m = found.correction_m[one_of_ping]
-    return replace(
-        found,
-        lines=replace(lines, tx_m=lines.tx_m + moved_m, rx_m=lines.rx_m + moved_m),
-        correction_m=moved_m,
-        correction_sd_m=found.correction_sd_m[one_of_ping],
+    # The correction applies to the channels of all banks.
+    ping = lines.ping_numbers
+    vectors_m = passage.vectors_m(moved_m)[straight.ping_starts[ping]]
+    return Autofocus(
+        lines=replace(lines, tx_m=lines.tx_m + vectors_m, rx_m=lines.rx_m + vectors_m),
+        correction_m=vectors_m,
+        correction_sd_m=deviation_m[ping],
+        sharpness_before=focus.before,
+        sharpness_after=focus.before if obstacle else focus.sharpness,
+        sharpness=tuple(focus.steps),
+        focused=not obstacle,
     )
-
-
-def _of_unit_level(lines: RangeLines) -> RangeLines:
-    """Return lines scaled to about 1, so that squared intensities stay within float32."""
-    largest = float(np.abs(lines.samples).max())
-    if not largest:
-        return lines
-    # Scaling by a power of two leaves the digits of all samples unchanged.
-    scale = np.float32(2.0 ** -np.clip(math.frexp(largest)[1], -126, 126))
-    return replace(lines, samples=lines.samples * scale)
 
 
 class _Focus:
@@ -238,30 +265,32 @@ class _Focus:
         passage: Passage,
         beam: BeamWindow | None,
         device: Device,
-        progress: Callable[[int, int], None] | None,
     ) -> None:
-        self.readout, lines = readout, readout.lines
-        self.given, self.grid, self.passage, self.beam = lines, grid, passage, beam
-        self.device, self.progress = device, progress
-        self.moved_m = np.zeros((len(passage.axes), passage.pings))
+        self.readout, self.grid, self.passage, self.beam = readout, grid, passage, beam
+        self.device = device
         self.deviation_m = np.full(passage.pings, np.inf)
-        self.for_drift = _FIRST_RESPONSES
-        self.cell_m = range_cell_m(readout)
         self.steps: list[tuple[str, float]] = []
         # The track changes little between images, so that one plan serves all of them.
-        self.plan = plan(lines, grid, tolerance_db=IMAGE_TOLERANCE_DB, beam=beam, device=device)
-        image = self._form(self.moved_m)
-        self.found: Contributions | None
-        self.before = sharpness(image)
-        self._keep(self.moved_m, image, self.before)
+        self.plan = plan(
+            readout.lines, grid, tolerance_db=IMAGE_TOLERANCE_DB, beam=beam, device=device
+        )
+        moved_m = np.zeros((len(passage.axes), passage.pings))
+        image = self._form(moved_m)
+        self.before = _sharpness(image)
+        self._keep(moved_m, image, self.before)
 
     def check_geometry(self, names: tuple[str, ...]) -> None:
         """Refuse unknowns that the responses do not determine.
 
         Also choose how many responses are needed to estimate drift.
         """
-        found = self._contributions(self.points_m[:_FIRST_RESPONSES])
-        self.for_drift = math.ceil(_RECEIVED_FOR_DRIFT / received_share(found))
+        found = self._contributions(self.points_m[:_FIRST_RESPONSES], self.moved_m)
+        # A response is received by the share (sum p)^2/(n sum p^2) of n channels, for the powers p.
+        # Channels with equal power thus count fully, and weaker ones count less.
+        power = np.square(np.abs(found.values[..., 0]), dtype=np.float64)
+        squares = np.maximum(len(power) * np.sum(power**2, axis=0), 1e-300)
+        share = float(np.median(power.sum(axis=0) ** 2 / squares))
+        self.for_drift = math.ceil(_RECEIVED_FOR_DRIFT / min(max(share, 1 / len(power)), 1.0))
         weights = np.abs(found.values[..., 0]) ** 2
         total = max(float(weights.sum()), 1e-300)
         for name, gradient in zip(names, found.gradient, strict=True):
@@ -288,146 +317,314 @@ class _Focus:
                 f"{condition:.3g}, at most {_MOST_CONDITION:g})",
             )
 
-    def result(self) -> Autofocus:
-        """Estimate the track from coarse to fine, and return the result."""
+    def improve(self, progress: Callable[[int, int], None] | None) -> str:
+        """Estimate the track from coarse to fine; return what makes that impossible, or ""."""
         responses = len(self.points_m) if self.before else 0
         if responses < _LEAST_RESPONSES:
-            return self._unfocused(
+            return (
                 f"{_NO_RESPONSES}: the grid has {responses} responses, and at least "
                 f"{_LEAST_RESPONSES} are needed"
             )
-        stood = halt(self.passage, self.readout, self._responses)
+        stood = halt(self.passage, self.readout, self.responses)
         if stood is not None:
-            return self._unfocused(
+            return (
                 f"pings {stood[0]} to {stood[1]} receive the same echoes, although the navigation "
                 "moves: the platform stood still, or the scene is the same all along the track (a "
                 "wall, a pipe, or a background that all pings share)"
             )
-        stages, dropped = list(self._stages()), ""
-        for number, (name, find) in enumerate(stages, start=1):
+        stages: list[tuple[str, Callable[[], NDArray[np.float64] | None]]] = [
+            *[("drift between subapertures", self._drift)] * _DRIFTS,
+            ("phase gradients", self._phase_gradients),
+            *[("sharpness of single pings", self._single_pings)] * _SWEEPS,
+        ]
+        dropped = ""
+        for number, (name, estimate) in enumerate(stages, start=1):
             # A step that gained little would gain little again.
-            if name != dropped and not self._try(name, find):
+            if name != dropped and not self._try(name, estimate()):
                 dropped = name
-            if self.progress is not None:
-                self.progress(number, len(stages))
-        apart = disagreement_m(self.passage, self._responses) / self.passage.wavelength_m
+            if progress is not None:
+                progress(number, len(stages))
+        apart = disagreement_m(self.passage, self.responses) / self.passage.wavelength_m
         if apart > MOST_DISAGREEMENT:
-            return self._unfocused(
+            return (
                 f"{_NO_RESPONSES}: two halves of the responses give displacements of single pings "
                 f"that differ by {apart:.2g} wavelengths rms, and at most {MOST_DISAGREEMENT:g} is "
                 "expected"
             )
-        check_speed(self.passage, self._responses, self.moved_m)
-        return self._outcome(focused=True)
-
-    def _unfocused(self, why: str) -> Autofocus:
-        """Warn that the track cannot be estimated, and why, and return the lines unchanged."""
-        validate.warn(f"{why}. The lines are left as they were")
-        self.moved_m = np.zeros_like(self.moved_m)
-        self.deviation_m = np.full_like(self.deviation_m, np.inf)
-        return self._outcome(focused=False)
-
-    def _outcome(self, *, focused: bool) -> Autofocus:
-        """Return the result for the current correction."""
-        vectors_m = self.passage.vectors_m(self.moved_m)
-        return Autofocus(
-            lines=self._lines(self.moved_m),
-            correction_m=vectors_m,
-            correction_sd_m=self.deviation_m[self.passage.ping],
-            sharpness_before=self.before,
-            sharpness_after=self.sharpness if focused else self.before,
-            sharpness=tuple(self.steps),
-            focused=focused,
-        )
-
-    def _stages(self) -> Iterator[tuple[str, Callable[[], NDArray[np.float64] | None]]]:
-        """Yield the names of the steps and the functions that estimate displacements."""
-        for _ in range(_DRIFTS):
-            yield "drift between subapertures", self._drift
-        yield "phase gradients", self._gradients
-        for _ in range(_SWEEPS):
-            yield "sharpness of single pings", self._pings
+        return ""
 
     def _drift(self) -> NDArray[np.float64] | None:
         """Return displacements from the drift between subapertures, if there are enough of them."""
-        offsets_m = self.given.range_step_m * _OFFSETS
-        found = self._contributions(self.points_m[: self.for_drift], offsets_m)
+        offsets_m = self.readout.lines.range_step_m * _OFFSETS
+        found = self._contributions(self.points_m[: self.for_drift], self.moved_m, offsets_m)
         return drift_m(self.passage, found)
 
-    def _gradients(self) -> NDArray[np.float64]:
+    def _phase_gradients(self) -> NDArray[np.float64]:
         """Return displacements from the phase steps between pings."""
-        found, total_m = self._responses, np.zeros_like(self.moved_m)
+        found, total_m = self.responses, np.zeros_like(self.moved_m)
         for neighbourhood in _NEIGHBOURHOODS:
             if total_m.any():
-                found = self._contributions(self.points_m, moved_m=self.moved_m + total_m)
+                found = self._contributions(self.points_m, self.moved_m + total_m)
             length_m = neighbourhood * self.passage.fresnel_length_m(found)
             total_m = total_m + phase_gradient_m(self.passage, found, length_m)
         return total_m
 
-    def _pings(self) -> NDArray[np.float64]:
+    def _single_pings(self) -> NDArray[np.float64]:
         """Return displacements that maximise the sharpness ping by ping."""
-        found_m, self.deviation_m = sharpest_m(self.passage, self._responses)
+        found_m, self.deviation_m = sharpest_m(self.passage, self.responses)
         return found_m
 
-    @property
-    def _responses(self) -> Contributions:
-        """Contributions to the brightest responses of the current image."""
-        if self.found is None:
-            self.found = self._contributions(self.points_m)
-        return self.found
-
-    def _contributions(
-        self,
-        points_m: NDArray[np.float64],
-        offsets_m: NDArray[np.float64] | None = None,
-        moved_m: NDArray[np.float64] | None = None,
-    ) -> Contributions:
-        """Return contributions to points for the current track, or for displacements `moved_m`."""
-        lines = self._lines(self.moved_m if moved_m is None else moved_m)
-        return contributions(self.passage, self.readout, lines, points_m, self.beam, offsets_m)
-
-    def _try(self, name: str, find: Callable[[], NDArray[np.float64] | None]) -> bool:
+    def _try(self, name: str, found_m: NDArray[np.float64] | None) -> bool:
         """Keep a correction if it makes the image sharper; return whether to repeat the step."""
-        found_m = find()
         if found_m is None:
             return False
-        moved_m = _detrended(self.moved_m + found_m, self.passage.along_m)
+        # The mean and the linear trend of a track cannot be observed.
+        moved_m, along_m = self.moved_m + found_m, self.passage.along_m
+        design = np.stack([np.ones_like(along_m), along_m - along_m.mean()], axis=1)
+        moved_m = moved_m - (design @ np.linalg.lstsq(design, moved_m.T, rcond=None)[0]).T
         change_m = math.sqrt(float(np.mean(np.sum((moved_m - self.moved_m) ** 2, axis=0))))
         change = change_m / self.passage.wavelength_m
         if change <= _LEAST_CHANGE:
             return False
         image = self._form(moved_m)
-        reached = sharpness(image)
+        reached, before = _sharpness(image), self.sharpness
         self.steps.append((name, reached))
-        before = self.sharpness
         if reached > before:
             self._keep(moved_m, image, reached)
         return reached > _GAIN * before and change > _LARGE_CHANGE
 
     def _keep(self, moved_m: NDArray[np.float64], image: Image, reached: float) -> None:
         """Set the current track, and find the brightest responses of its image."""
-        self.moved_m, self.sharpness, self.found = moved_m, reached, None
-        self.points_m = brightest(image, _RESPONSES, _APART * self.cell_m)
+        self.moved_m, self.sharpness = moved_m, reached
+        self.points_m = brightest(image, _RESPONSES, _APART * range_cell_m(self.readout))
         if not len(self.points_m):
             self.points_m = self.grid.positions_m().reshape(-1, 3)[:1]
+        self.found: Contributions | None = None
+
+    @property
+    def responses(self) -> Contributions:
+        """Contributions to the brightest responses of the current image."""
+        if self.found is None:
+            self.found = self._contributions(self.points_m, self.moved_m)
+        return self.found
+
+    def _contributions(
+        self,
+        points_m: NDArray[np.float64],
+        moved_m: NDArray[np.float64],
+        offsets_m: NDArray[np.float64] | None = None,
+    ) -> Contributions:
+        """Return the contributions of displaced pings to points."""
+        lines = self._lines(moved_m)
+        return contributions(self.passage, self.readout, lines, points_m, self.beam, offsets_m)
 
     def _form(self, moved_m: NDArray[np.float64]) -> Image:
-        lines = self._lines(moved_m)
-        return form(scene_of_plan(lines, self.grid, self.plan), self.plan, self.device)
+        """Return the image of displaced pings."""
+        scene = scene_of_plan(self._lines(moved_m), self.grid, self.plan)
+        return form(scene, self.plan, self.device)
 
     def _lines(self, moved_m: NDArray[np.float64]) -> RangeLines:
-        vectors_m = self.passage.vectors_m(moved_m)
-        given = self.given
-        return replace(given, tx_m=given.tx_m + vectors_m, rx_m=given.rx_m + vectors_m)
+        """Return the lines of displaced pings."""
+        vectors_m, lines = self.passage.vectors_m(moved_m), self.readout.lines
+        return replace(lines, tx_m=lines.tx_m + vectors_m, rx_m=lines.rx_m + vectors_m)
 
 
-def sharpness(image: Image) -> float:
+def _sharpness(image: Image) -> float:
     """Return the mean squared intensity of an image over its squared mean intensity."""
     return 1 + contrast(image) ** 2 if image.pixels.any() else 0.0
 
 
-def _detrended(moved_m: NDArray[np.float64], along_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return displacements without their mean and linear trend along the track."""
-    design = np.stack([np.ones_like(along_m), along_m - along_m.mean()], axis=1)
-    fitted = np.linalg.lstsq(design, moved_m.T, rcond=None)[0]
-    return moved_m - (design @ fitted).T
+def halt(passage: Passage, readout: Readout, found: Contributions) -> tuple[int, int] | None:
+    """Return the first and last ping of the longest halt that the navigation does not contain.
+
+    All pings of a halt receive the same echoes. If a platform moves, pings of a stretch of several
+    Fresnel lengths have little in common, because the phase of every echo turns by cycles. The
+    navigation predicts how much they should have in common. A wall or a pipe along the track also
+    gives the same echoes everywhere, and a halt cannot then be distinguished from a passage.
+
+    Parameters
+    ----------
+    passage : Passage
+        Passage according to the navigation.
+    readout : Readout
+        The lines.
+    found : Contributions
+        Contributions to the brightest responses along the navigated track. Pings are compared at
+        the ranges of these responses.
+
+    Returns
+    -------
+    (first, last) or None
+        None if pings have little in common, or as much as the navigation predicts.
+    """
+    # The track is divided into stretches of about the same length, each with enough pings.
+    along_m = passage.along_m
+    length_m = _STRETCH * passage.fresnel_length_m(found)
+    count = max(int((along_m[-1] - along_m[0]) / length_m), 1)
+    starts_m = along_m[0] + (along_m[-1] - along_m[0]) * np.arange(1, count) / count
+    edges = [0]
+    for edge in [*np.searchsorted(along_m, starts_m).tolist(), passage.pings]:
+        if edge - edges[-1] >= _LEAST_PINGS:
+            edges.append(edge)
+    if len(edges) > 1:
+        edges[-1] = passage.pings
+
+    halts: list[tuple[int, int]] = []
+    for first, stop in pairwise(edges):
+        if _expected_share(passage, found, first, stop) > _MOST_EXPECTED:
+            continue
+        if _common_share(passage, readout, found, first, stop) <= _MOST_COMMON:
+            continue
+        if halts and halts[-1][1] >= first - 1:
+            halts[-1] = halts[-1][0], stop - 1
+        else:
+            halts.append((first, stop - 1))
+    return max(halts, key=lambda each: each[1] - each[0], default=None)
+
+
+def _expected_share(passage: Passage, found: Contributions, first: int, stop: int) -> float:
+    """Return the share of the power that pings have in common if the navigation is correct."""
+    some = np.flatnonzero((passage.ping >= first) & (passage.ping < stop))
+    if not len(some):
+        return 1.0
+    turns = 2 * found.range_m[some] / passage.wavelength_m
+    common = np.abs(np.mean(np.exp(2j * np.pi * turns), axis=0)) ** 2
+    brightness = np.abs(np.sum(found.values[some, :, 0], axis=0, dtype=np.complex128)) ** 2
+    total = float(brightness.sum())
+    return float(brightness @ common) / total if total else 1.0
+
+
+def _common_share(
+    passage: Passage, readout: Readout, found: Contributions, first: int, stop: int
+) -> float:
+    """Return the share of the power that all pings of a stretch have in common.
+
+    Its expectation is 0 for independent pings. All pings count equally, whatever their level.
+    """
+    lines = passage.lines
+    starts = lines.ping_starts
+    counts = np.diff(np.append(starts, lines.channels))[first:stop]
+    pings = first + _evenly_spaced(stop - first, _READ_PINGS)
+    shares = []
+    for receiver in _evenly_spaced(int(counts.min()), _READ_RECEIVERS).tolist():
+        # All pings are read at the ranges of the responses that they share.
+        channels = starts[pings] + receiver
+        range_m, nearest_m = found.range_m[channels], lines.first_range_m[channels]
+        least_m = max(float(range_m.min()), float(nearest_m.max()))
+        most_m = min(float(range_m.max()), float(lines.last_range_m[channels].min()))
+        at_m = np.arange(least_m, most_m + lines.range_step_m, lines.range_step_m)
+        at_m = np.broadcast_to(at_m, (len(channels), len(at_m)))
+        values = readout.read(channels, at_m).astype(np.complex128)
+
+        power = np.sum(np.abs(values) ** 2, axis=1)
+        received = power > 0
+        number = int(received.sum())
+        if number < _LEAST_PINGS:
+            continue
+        unit = values[received] / np.sqrt(power[received])[:, None]
+        mean = float(np.sum(np.abs(unit.mean(axis=0)) ** 2))
+        shares.append((number * mean - 1) / (number - 1))
+    return sum(shares) / len(shares) if shares else 0.0
+
+
+def _evenly_spaced(count: int, most: int) -> NDArray[np.int64]:
+    """Return up to `most` of `count` numbers."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
+
+
+def _check_speed(passage: Passage, found: Contributions, moved_m: NDArray[np.float64]) -> None:
+    """Warn if a wrong sound speed explains a correction, [unknowns, pings].
+
+    The range to a response, as a function of the position along a straight track, has the curvature
+    1/R. Suppose that ranges are too large by a share e, so that a response appears at (1 + e) R.
+    Its ranges are then curved too strongly, by 2 e/R. A track that bends away from the scene by e
+    x^2/R compensates this for every response along the track. Only responses at very different
+    ranges would reveal the difference.
+    """
+    power = passage.by_ping(np.abs(found.values[..., 0]).astype(np.float64) ** 2)
+    total = power.sum(axis=1)
+    received = np.flatnonzero(total > 0)
+    if len(received) < _LEAST_FITTED:
+        return
+
+    # Is the correction a parabola that is large enough to matter?
+    gradient = np.stack([passage.mean_by_ping(each) for each in found.gradient])
+    each_m = np.einsum("upk,up->pk", gradient, moved_m)
+    longer_m = np.sum(power * each_m, axis=1)[received] / total[received]
+    at_m = passage.along_m[received] - passage.along_m[received].mean()
+    longer_m = longer_m - np.polyval(np.polyfit(at_m, longer_m, 1), at_m)
+    parabola = np.polyfit(at_m, longer_m, 2)
+    bend_m = np.polyval(parabola, at_m)
+    if bend_m.std() < _LEAST_BEND * passage.wavelength_m:
+        return
+    if bend_m.var() < _LEAST_PARABOLA * longer_m.var():
+        return
+
+    # A curved track changes the curvature of ranges, so that it is measured, response by response.
+    range_m = passage.mean_by_ping(found.range_m)
+    bends = []
+    for response in np.flatnonzero(power.any(axis=0)).tolist():
+        some = power[:, response] > 0
+        if some.sum() < _LEAST_FITTED:
+            continue
+        weights = np.sqrt(power[some, response])
+        at_m = passage.along_m[some] - passage.along_m[some].mean()
+        bends.append(np.polyfit(at_m, range_m[some, response], 2, w=weights)[0])
+    mean_m = float(np.sum(power * range_m) / np.sum(power))
+    error = float(parabola[0] / (float(np.median(bends)) + 1 / (2 * mean_m)))
+    if abs(error) > _MOST_SPEED_ERROR:
+        return
+    given_m_s = passage.lines.sound_speed_m_s
+    side = "lower" if error > 0 else "higher"
+    validate.warn(
+        "the correction found is a parabola along the track, and a wrong sound speed may be the "
+        f"cause: {given_m_s / (1 + error):.5g} m/s, {100 * abs(error):.2g} % {side} than the "
+        f"{given_m_s:.5g} m/s of the lines, explains it without any bend of the track. Check the "
+        "sound speed, for instance with `clsas.calibrate_track`"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Autofocus:
+    """Result of autofocus.
+
+    Attributes
+    ----------
+    lines : RangeLines
+        The given lines with corrected positions.
+    correction_m : float64 [channels, 3]
+        Displacement that was added to transmitters and receivers.
+    correction_sd_m : float64 [channels]
+        Standard deviation of the change of the correction from ping to ping. A shift and a linear
+        trend of the track cannot be observed, and remain as they were.
+    sharpness_before, sharpness_after : float
+        Mean squared intensity of the image over its squared mean intensity. It is 2 for speckle,
+        and larger for sharper images.
+    sharpness : tuple of (step, float)
+        Sharpness after each step that was tried.
+    focused : bool
+        False if the scene has no responses to focus on, or if the platform stood still. The lines
+        are then unchanged.
+
+    See Also
+    --------
+    autofocus : Function that returns this result.
+    """
+
+    lines: RangeLines
+    correction_m: NDArray[np.float64]
+    correction_sd_m: NDArray[np.float64]
+    sharpness_before: float
+    sharpness_after: float
+    sharpness: tuple[tuple[str, float], ...]
+    focused: bool
+
+    def __repr__(self) -> str:
+        """Return the rms correction and the sharpness before and after."""
+        rms_m = float(np.sqrt(np.mean(np.sum(self.correction_m**2, axis=1))))
+        return reprs.summary(
+            self,
+            f"correction {reprs.quantity(rms_m, 'm')} rms",
+            f"sharpness {self.sharpness_before:.3g} to {self.sharpness_after:.3g}",
+            None if self.focused else "not focused",
+        )

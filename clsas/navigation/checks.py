@@ -1,10 +1,12 @@
-"""Checks of lines and arguments before a track is corrected, and figures of the lines' band."""
+"""Checks of lines and arguments before a track is corrected; band and axes of the lines."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsas.engine.data import validate
+from clsas.engine.data.beam import track_directions
 from clsas.engine.data.lines import RangeLines, band_wavelength_m, banks_of, is_about_zero
 from clsas.engine.data.pings import Transmissions
 from clsas.engine.data.validate import ArgumentError
@@ -36,6 +38,18 @@ def range_cell_m(readout: Readout) -> float:
     """Return the range resolution of the lines."""
     oversampling = min(max(readout.spectrum.oversampling, 1.0), _MOST_OVERSAMPLING)
     return readout.lines.range_step_m * oversampling
+
+
+def displacement_axes(lines: RangeLines, unknowns: tuple[str, ...]) -> NDArray[np.float64]:
+    """Return the unit vectors of "sway", "heave" and "surge" at every ping, [unknowns, pings, 3].
+
+    They point to port, up, and along the track.
+    """
+    along = track_directions(lines)[lines.ping_starts]
+    sway = np.cross(np.array([0.0, 0.0, 1.0]), along)
+    sway /= np.maximum(np.linalg.norm(sway, axis=1, keepdims=True), 1e-9)
+    vectors = {"sway": sway, "heave": np.cross(along, sway), "surge": along}
+    return np.stack([vectors[name] for name in unknowns])
 
 
 def first_bank(lines: RangeLines) -> RangeLines:
@@ -113,3 +127,12 @@ def check_navigation(lines: RangeLines, least_pings: int, purpose: str, *, may_s
             f"{turns[0]}): pings may be out of order. They are used in the order of the lines; "
             "`lines.select(order)` sorts them"
         )
+
+
+def parabola_peak(before: NDArray, at: NDArray, after: NDArray) -> NDArray:
+    """Return where parabolas through three samples peak, in steps from the middle sample.
+
+    It is 0 where the samples have no maximum.
+    """
+    bend = before - 2 * at + after
+    return np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, 1.0), 0.0)

@@ -1,4 +1,8 @@
-"""Pairs of channels in consecutive pings that share a phase centre."""
+"""Geometry of overlapping pings: the array, its displacements, and pairs of channels.
+
+Channels of consecutive pings that share a phase centre see the same part of the seabed along the
+same rays.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError
 
 _MOST_APART = 0.5
 """Largest distance along the array, in spacings of the array, at which two phase centres are
 paired. No channel within an overlap is farther than this from the nearest one of the other ping."""
+_CANCELLED = 1e-6  # length of the sum of two unit vectors below which they count as opposite
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +101,33 @@ class Array:
         return np.arange(self.starts[ping], self.starts[ping + 1])
 
 
+def moved(
+    lines: RangeLines,
+    array: Array,
+    sway_m: NDArray[np.float64],
+    yaw_rad: NDArray[np.float64],
+    surge_m: NDArray[np.float64],
+) -> RangeLines:
+    """Return lines whose array is displaced to port and forward, and turned, ping by ping.
+
+    The lines may have more channels than the array in each ping, such as those of other banks. All
+    turn about a vertical axis through the array's mean phase centre. Positive yaw turns them from
+    forward to port.
+    """
+    ping = lines.ping_numbers
+    turn = Rotation.from_rotvec(np.outer(yaw_rad, [0.0, 0.0, 1.0]))
+    shift_m = (sway_m[:, None] * array.port + surge_m[:, None] * array.forward)[ping]
+    reference_m = array.reference_m[ping]
+    tx_m, rx_m = (
+        turn[ping].apply(each - reference_m) + reference_m + shift_m
+        for each in (lines.tx_m, lines.rx_m)
+    )
+    look = lines.look_direction
+    if look is not None:
+        look = turn[ping].apply(look.copy())  # SciPy takes no read-only arrays
+    return replace(lines, tx_m=tx_m, rx_m=rx_m, look_direction=look)
+
+
 @dataclass(frozen=True, eq=False)
 class Overlap:
     """Pairs of channels of a ping and of the next one that nearly share a phase centre.
@@ -151,28 +184,103 @@ def overlap(lines: RangeLines, array: Array, ping: int, usable: NDArray[np.bool_
     return Overlap(first, second, (middle_m - pivot_m) @ forward, pivot_m)
 
 
-def moved(
-    lines: RangeLines,
-    array: Array,
-    sway_m: NDArray[np.float64],
-    yaw_rad: NDArray[np.float64],
-    surge_m: NDArray[np.float64],
-) -> RangeLines:
-    """Return lines whose array is displaced to port and forward, and turned, ping by ping.
+@dataclass(frozen=True, eq=False)
+class Swath:
+    """Part of the seabed that is measured, divided into windows of range.
 
-    The lines may have more channels than the array in each ping, such as those of other banks. All
-    turn about a vertical axis through the array's mean phase centre. Positive yaw turns them from
-    forward to port.
+    Attributes
+    ----------
+    edges_m : float64 [windows + 1]
+        Ranges between windows, and at both ends.
+    side : int
+        1 if the seabed lies to port, -1 if it lies to starboard.
+    seabed_z_m : float or None
+        Height of the seabed. With None, all rays are horizontal.
+    element_length_m : (transmitter, receiver) or None
+        Lengths of the elements, whose beam weighs the directions. With None, the beam counts as
+        narrow.
     """
-    ping = lines.ping_numbers
-    turn = Rotation.from_rotvec(np.outer(yaw_rad, [0.0, 0.0, 1.0]))
-    shift_m = (sway_m[:, None] * array.port + surge_m[:, None] * array.forward)[ping]
-    reference_m = array.reference_m[ping]
-    tx_m, rx_m = (
-        turn[ping].apply(each - reference_m) + reference_m + shift_m
-        for each in (lines.tx_m, lines.rx_m)
-    )
-    look = lines.look_direction
-    if look is not None:
-        look = turn[ping].apply(look.copy())  # SciPy takes no read-only arrays
-    return replace(lines, tx_m=tx_m, rx_m=rx_m, look_direction=look)
+
+    edges_m: NDArray[np.float64]
+    side: int = 1
+    seabed_z_m: float | None = None
+    element_length_m: tuple[float, float] | None = None
+
+    @property
+    def middles_m(self) -> NDArray[np.float64]:
+        """Ranges in the middle of the windows, [windows]."""
+        return (self.edges_m[1:] + self.edges_m[:-1]) / 2
+
+    def slopes(
+        self, height_m: NDArray[np.float64], range_m: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the horizontal and vertical parts of unit rays that end on the seabed.
+
+        `height_m` is the height of their origins. A ray that is too short to reach the seabed
+        points straight down.
+        """
+        if self.seabed_z_m is None:
+            return np.ones_like(range_m), np.zeros_like(range_m)
+        down = np.clip((height_m - self.seabed_z_m) / range_m, -1.0, 1.0)
+        return np.sqrt(1 - down**2), -down
+
+
+@dataclass(frozen=True, eq=False)
+class PairGeometry:
+    """Geometry of the channel pairs of an overlap, and of the rays from them to the seabed.
+
+    Attributes
+    ----------
+    lines : RangeLines
+        Lines with the positions to test.
+    pairs : Overlap
+    swath : Swath
+    headings : float64 [2, 3]
+        Forward unit vectors of the array at both pings.
+    centre_m : float64 [pairs, 3]
+        Mean phase centres of both channels of every pair.
+    forward, outward : float64 [3]
+        Horizontal unit vectors along the array, the mean of both pings, and to the seabed.
+    """
+
+    lines: RangeLines
+    pairs: Overlap
+    swath: Swath
+    headings: NDArray[np.float64]
+    centre_m: NDArray[np.float64]
+    forward: NDArray[np.float64]
+    outward: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, lines: RangeLines, array: Array, pairs: Overlap, swath: Swath) -> PairGeometry:
+        """Return the geometry of pairs at the positions of `lines`, whose array is `array`."""
+        centre_m = (lines.phase_centres_m[pairs.first] + lines.phase_centres_m[pairs.second]) / 2
+        ping = int(np.searchsorted(array.starts, pairs.first[0], "right")) - 1
+        headings = array.forward[ping : ping + 2]
+        forward = headings[0] + headings[1]
+        length = float(np.linalg.norm(forward))
+        # The headings cancel where the track turns back from one ping to the next.
+        forward = forward / length if length > _CANCELLED else headings[0]
+        outward = swath.side * np.array([-forward[1], forward[0], 0.0])
+        return cls(lines, pairs, swath, headings, centre_m, forward, outward)
+
+    def rays(self, range_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return unit vectors from the phase centres to the seabed, [pairs, ranges, 3]."""
+        across, up = self.swath.slopes(self.centre_m[:, 2:], range_m)
+        shape = len(self.centre_m), len(range_m)
+        rays = np.broadcast_to(across, shape)[..., None] * self.outward
+        rays[..., 2] += up
+        return rays
+
+    def ranges_m(
+        self, channels: NDArray[np.int64], points_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the ranges of points, [channels or 1, n, 3], in channels, [channels, n]."""
+        lines, velocity = self.lines, self.lines.rx_velocity_m_s
+        return bistatic_range_m(
+            points_m,
+            lines.tx_m[channels, None],
+            lines.rx_m[channels, None],
+            None if velocity is None else velocity[channels, None],
+            lines.sound_speed_m_s,
+        )

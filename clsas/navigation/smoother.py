@@ -116,52 +116,31 @@ def smooth(
     covariances[0] = np.diag(deviations[0] ** 2)
     both: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []  # a ping and the next one
     for ping, step in enumerate(steps):
+        # The navigation predicts the next state: part of its error persists, and the rest is fresh.
         change = np.diag(keep * deviations[ping + 1] / deviations[ping])
         fresh = (1 - keep**2) * deviations[ping + 1] ** 2
-        mean, covariance = _extended(states[ping], covariances[ping], change, np.diag(fresh))
+        across = change @ covariances[ping]
+        mean = np.concatenate([states[ping], change @ states[ping]])
+        covariance = np.block(
+            [[covariances[ping], across.T], [across, across @ change.T + np.diag(fresh)]]
+        )
         if step is not None:
-            mean, covariance = _updated(mean, covariance, step)
+            observed = np.hstack([-step.transition, np.eye(size)])
+            spread = observed @ covariance @ observed.T + step.spread
+            gain = np.linalg.solve(spread, observed @ covariance).T
+            mean = mean + gain @ (step.drift - observed @ mean)
+            covariance = covariance - gain @ observed @ covariance
+            covariance = (covariance + covariance.T) / 2
         both.append((mean, covariance))
         states[ping + 1], covariances[ping + 1] = mean[size:], covariance[size:, size:]
     for ping in range(pings - 2, -1, -1):
         mean, covariance = both[ping]
-        here, ahead, across = (
-            covariance[:size, :size],
-            covariance[size:, size:],
-            covariance[size:, :size],
-        )
+        ahead, across = covariance[size:, size:], covariance[size:, :size]
         gain = np.linalg.solve(ahead, across).T
         states[ping] = mean[:size] + gain @ (states[ping + 1] - mean[size:])
-        covariances[ping] = here + gain @ (covariances[ping + 1] - ahead) @ gain.T
+        change = gain @ (covariances[ping + 1] - ahead) @ gain.T
+        covariances[ping] = covariance[:size, :size] + change
     return states, covariances
-
-
-def _extended(
-    state: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    change: NDArray[np.float64],
-    fresh: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the joint mean and covariance of a state and the next one.
-
-    The next state is `change` times the state, plus noise of the covariance `fresh`.
-    """
-    across = change @ covariance
-    return (
-        np.concatenate([state, change @ state]),
-        np.block([[covariance, across.T], [across, across @ change.T + fresh]]),
-    )
-
-
-def _updated(
-    mean: NDArray[np.float64], covariance: NDArray[np.float64], step: Step
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the joint mean and covariance of a state and the next one, given their step."""
-    observed = np.hstack([-step.transition, np.eye(len(step.drift))])
-    spread = observed @ covariance @ observed.T + step.spread
-    gain = np.linalg.solve(spread, observed @ covariance).T
-    covariance = covariance - gain @ observed @ covariance
-    return mean + gain @ (step.drift - observed @ mean), (covariance + covariance.T) / 2
 
 
 def shape_deviation_m(

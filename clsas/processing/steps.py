@@ -34,7 +34,7 @@ from clsas.mosaics.mosaic import Mosaic, mosaic
 from clsas.mosaics.provenance import OtherInputsError, stored_digest
 from clsas.mosaics.store import Store
 from clsas.navigation.autofocus import autofocus
-from clsas.navigation.known_points import calibrate_track
+from clsas.navigation.calibration import calibrate_track
 from clsas.navigation.micronavigation import micronavigate
 from clsas.processing import numbers
 from clsas.processing.record import StepRecord

@@ -11,12 +11,9 @@ from studies.navigating import (
 )
 
 import clsas
-from clsas.navigation.advance import surge
-from clsas.navigation.correlation import Correlator
-from clsas.navigation.directions import ALL, MIDDLE
-from clsas.navigation.overlap import Array, overlap
-from clsas.navigation.pair_geometry import PairGeometry
-from clsas.navigation.swath import Swath
+from clsas.navigation.correlation import ALL, MIDDLE, Correlator
+from clsas.navigation.displacement import surge
+from clsas.navigation.overlap import Array, PairGeometry, Swath, overlap
 
 NEAR_M, FAR_M = 12.0, 16.0
 
@@ -41,7 +38,7 @@ def two_pings(excess_m=0.0):
 def responses(sine, half_width):
     """Return the responses of the channels of both pings to an echo, as received and filtered."""
     correlator, geometry, _ = two_pings()
-    _, filters = correlator.windows(geometry, half_width)
+    *_, filters = correlator.windows(geometry, half_width)
     range_m = filters.range_m[:1]
     own = geometry.rays(range_m)
     rays = np.sqrt(1 - sine**2)[:, None] * own.mean(axis=0) + sine[:, None] * geometry.forward

@@ -15,12 +15,8 @@ from studies.navigating import (
 from tiers import few
 
 import clsas
-from clsas.navigation.echoes import (
-    block_products,
-    independent_echoes,
-    strongest,
-    without_highlights,
-)
+from clsas.navigation.correlation import independent_echoes, strongest, without_highlights
+from clsas.navigation.displacement import block_products
 from clsas.navigation.micronavigation import micronavigate
 
 NEAR_M, FAR_M = 12.0, 16.0

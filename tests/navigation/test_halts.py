@@ -11,9 +11,8 @@ from tiers import also, few
 import clsas
 from clsas.engine.data.validate import ClsasWarning
 from clsas.engine.signal.interpolation import Readout
-from clsas.navigation.autofocus import autofocus
+from clsas.navigation.autofocus import autofocus, halt
 from clsas.navigation.checks import mean_wavelength_m
-from clsas.navigation.halts import halt
 from clsas.navigation.responses import READ_DB, Passage, brightest, contributions
 
 

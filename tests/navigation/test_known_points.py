@@ -12,7 +12,7 @@ from scipy.stats import chi2
 import clsas
 from clsas.cli import main
 from clsas.engine.data.validate import ClsasWarning
-from clsas.navigation.known_points import UNKNOWNS, calibrate_track
+from clsas.navigation.calibration import UNKNOWNS, calibrate_track
 
 SONAR = clsas.Sonar(
     clsas.Pulse(100e3, 30e3, 1e-3),

@@ -356,10 +356,7 @@ def test_implausible_corrections_are_reported():
     [
         ({"element_length_m": 30.0}, "element_length_m must be from .* got 30 m"),
         ({"element_length_m": 1e-9}, "element_length_m must be from .* twentieth"),
-        (
-            {"yaw_sd_deg": 200.0},
-            "yaw_sd_deg must be .* <= 180 degrees",
-        ),
+        ({"yaw_sd_deg": 200.0}, "yaw_sd_deg must be .* <= 180 degrees"),
         ({"sway_sd_m": 1e4}, "sway_sd_m must be finite and >= 1e-09 and <= 1000 m, got 10000"),
         ({"range_m": (12.0, 12.05)}, "range_m must be at least 16 samples long"),
         ({"range_m": (15.0, 12.0)}, "the nearest first"),

@@ -5,7 +5,7 @@ import pytest
 from cases import along_x
 
 from clsas.engine.data.lines import RangeLines
-from clsas.navigation.swath import checked_swath
+from clsas.navigation.micronavigation import checked_swath
 
 FIRST_M = np.array([10.0, 11.5, 12.0, 10.0])
 TRACK = along_x(4, 0.1)

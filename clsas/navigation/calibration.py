@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,13 +21,20 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.track import Track
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.interpolation import Readout
-from clsas.navigation.calibration_result import UNITS, Calibration
-from clsas.navigation.range_fit import MOST_CONDITION, Ambiguity, Fit, fitted
-from clsas.navigation.range_model import UNKNOWNS, Model
-from clsas.navigation.reflectors import LEAST_SNR, Reader
-from clsas.navigation.responses import displacement_axes
+from clsas.navigation.checks import displacement_axes
+from clsas.navigation.range_fit import (
+    LEAST_SNR,
+    MOST_CONDITION,
+    UNKNOWNS,
+    Ambiguity,
+    Reflectors,
+    fitted,
+)
 
 DEFAULT_UNKNOWNS = UNKNOWNS[:2]
+
+UNITS = {"time_offset": "s", "sound_speed": "m/s", "forward": "m", "port": "m", "up": "m"}
+"""Units of the unknowns."""
 
 _STEPS = 4  # steps of the progress
 _SEARCHED_CELLS = 50.0  # default half width of the search, range resolution cells
@@ -150,10 +158,8 @@ def calibrate_track(
     given = {"points_m": points_m, "unknowns": unknowns}
     points, names = check_declared(calibrate_track, given).values()
     validate.progress(progress)
-    reader = Reader.of(Readout.of(lines))
-    model = Model(lines, points, _axes(lines, names, track))
-    search_m = _checked_search(model, reader, search_m)
-    _check_within(model, search_m)
+    reflectors = Reflectors(Readout.of(lines), points, _axes(lines, names, track))
+    search_m = _checked_search(reflectors, search_m)
     steps = iter(range(1, _STEPS + 1))
 
     def step() -> None:
@@ -161,12 +167,21 @@ def calibrate_track(
             progress(next(steps), _STEPS)
 
     free = tuple(UNKNOWNS.index(name) for name in names)
-    fit, ambiguities, responses = fitted(model, reader, free, search_m, step)
-    result = _result(model, fit, tuple(UNKNOWNS[each.held] for each in ambiguities))
-    _check_seen(result, responses.snr, search_m)
+    fit, ambiguities, largest_snr = fitted(reflectors, free, search_m, step)
+    result = Calibration(
+        lines=reflectors.corrected(fit.state),
+        unknowns=tuple(UNKNOWNS[n] for n in fit.free),
+        values=fit.state[list(fit.free)],
+        covariance=fit.covariance * _dependence(lines, fit.residual_m),
+        held=tuple(UNKNOWNS[each.held] for each in ambiguities),
+        residual_m=fit.residual_m,
+        misfit_m=fit.misfit_m,
+        phases=fit.phases,
+    )
+    _check_seen(result, largest_snr, search_m)
     for each in ambiguities:
         _warn_of(each, lines)
-    if result.misfit_m > _MOST_MISFIT * reader.cell_m:
+    if result.misfit_m > _MOST_MISFIT * reflectors.cell_m:
         validate.warn(
             "the measured ranges of the points differ from those of the corrected lines by "
             f"{reprs.quantity(result.misfit_m, 'm')} rms in addition to the noise, which is more "
@@ -176,22 +191,6 @@ def calibrate_track(
         )
     step()
     return result
-
-
-def _checked_search(model: Model, reader: Reader, search_m: float | None) -> float:
-    """Return the half width of the search, which by default separates the reflectors."""
-    lines = reader.readout.lines
-    longest_m = (lines.length - 1) * lines.range_step_m
-    if search_m is not None:
-        return validate.number("search_m", search_m, "m", least=reader.cell_m, most=longest_m)
-    range_m = model.range_m(np.zeros(5))
-    apart_m = [
-        float(np.median(np.abs(range_m[:, one] - range_m[:, other])))
-        for one in range(range_m.shape[1])
-        for other in range(one)
-    ]
-    search_m = min([_SEARCHED_CELLS * reader.cell_m, *(_OF_DISTANCE * each for each in apart_m)])
-    return min(max(search_m, _LEAST_CELLS * reader.cell_m), longest_m)
 
 
 def _axes(lines: RangeLines, names: tuple[str, ...], track: Track | None) -> NDArray[np.float64]:
@@ -217,10 +216,22 @@ def _axes(lines: RangeLines, names: tuple[str, ...], track: Track | None) -> NDA
         ) from error
 
 
-def _check_within(model: Model, search_m: float) -> None:
-    """Refuse points at ranges where hardly any channel has samples."""
-    lines = model.lines
-    expected_m = model.range_m(np.zeros(5))
+def _checked_search(reflectors: Reflectors, search_m: float | None) -> float:
+    """Return the half width of the search; refuse points where hardly any channel has samples."""
+    lines, cell_m = reflectors.lines, reflectors.cell_m
+    expected_m = reflectors.range_m(np.zeros(5))
+    longest_m = (lines.length - 1) * lines.range_step_m
+    if search_m is None:
+        # By default, no reflector is searched where another one is expected.
+        apart_m = [
+            float(np.median(np.abs(expected_m[:, one] - expected_m[:, other])))
+            for one in range(len(reflectors.points_m))
+            for other in range(one)
+        ]
+        search_m = min([_SEARCHED_CELLS * cell_m, *(_OF_DISTANCE * each for each in apart_m)])
+        search_m = min(max(search_m, _LEAST_CELLS * cell_m), longest_m)
+    else:
+        search_m = validate.number("search_m", search_m, "m", least=cell_m, most=longest_m)
     inside = expected_m > lines.first_range_m[:, None] - search_m
     inside &= expected_m < lines.last_range_m[:, None] + search_m
     counts = inside.sum(axis=0)
@@ -233,20 +244,7 @@ def _check_within(model: Model, search_m: float) -> None:
             f"point {worst} at ranges from {expected_m[:, worst].min():.6g} to "
             f"{expected_m[:, worst].max():.6g} m",
         )
-
-
-def _result(model: Model, fit: Fit, held: tuple[str, ...]) -> Calibration:
-    """Return the calibration of a fit."""
-    return Calibration(
-        lines=model.corrected(fit.state),
-        unknowns=tuple(UNKNOWNS[n] for n in fit.free),
-        values=fit.state[list(fit.free)],
-        covariance=fit.covariance * _dependence(model.lines, fit.residual_m),
-        held=held,
-        residual_m=fit.residual_m,
-        misfit_m=fit.misfit_m,
-        phases=fit.phases,
-    )
+    return search_m
 
 
 def _dependence(lines: RangeLines, residual_m: NDArray[np.float64]) -> float:
@@ -274,9 +272,13 @@ def _dependence(lines: RangeLines, residual_m: NDArray[np.float64]) -> float:
     return max(of_ping, 1.0) * float(1 + 2 * np.sum(correlation[1:last]))
 
 
-def _check_seen(result: Calibration, snr: NDArray[np.float64], search_m: float) -> None:
+def _check_seen(result: Calibration, largest_snr: float, search_m: float) -> None:
     """Refuse if no point is seen; warn of points that are not."""
-    between = np.array([_between(np.isfinite(each)) for each in result.residual_m.T])
+    count = len(result.seen)
+    between = np.zeros(count, np.int64)
+    for number, seen in enumerate(np.isfinite(result.residual_m).T):
+        if seen.any():
+            between[number] = np.ptp(np.flatnonzero(seen)) + 1
     missing = np.flatnonzero((result.seen < _LEAST_SEEN) | (result.seen < _LEAST_SHARE * between))
     criterion = (
         f"echoes must exceed the noise by {10 * math.log10(LEAST_SNR):g} dB in at least "
@@ -289,25 +291,19 @@ def _check_seen(result: Calibration, snr: NDArray[np.float64], search_m: float) 
             missing, result.seen[missing], between[missing], strict=True
         )
     )
-    if len(missing) == snr.shape[1]:
+    if len(missing) == count:
         raise ArgumentError(
             "points_m",
             "be seen",
             "none that is",
             f"{criterion}; those of point {counts} do, which noise alone may reach. The largest is "
-            f"{snr.max():.3g} times the noise. Check positions, sound speed and `search_m`",
+            f"{largest_snr:.3g} times the noise. Check positions, sound speed and `search_m`",
         )
     if len(missing):
         validate.warn(
-            f"{len(missing)} of {snr.shape[1]} points are not seen, and only the others are used: "
+            f"{len(missing)} of {count} points are not seen, and only the others are used: "
             f"{criterion}; those of point {counts} do"
         )
-
-
-def _between(seen: NDArray[np.bool_]) -> int:
-    """Return the number of channels from the first to the last that sees a point."""
-    channels = np.flatnonzero(seen)
-    return int(np.ptp(channels)) + 1 if channels.size else 0
 
 
 def _warn_of(ambiguity: Ambiguity, lines: RangeLines) -> None:
@@ -324,3 +320,128 @@ def _warn_of(ambiguity: Ambiguity, lines: RangeLines) -> None:
         f"{MOST_CONDITION:g}): {held} is held at {kept}{others}. Use reflectors at more ranges and "
         "in more directions"
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Result of a calibration with known points. Its values are the corrections that were added.
+
+    Attributes
+    ----------
+    lines : RangeLines
+        The given lines with corrected first ranges, sound speed and positions.
+    unknowns : tuple of str
+        Names of the unknowns that were solved for.
+    values : float64 [unknowns]
+        Corrections in s, m/s and m: time added to that of every sample, speed added to the lines'
+        sound speed, and displacement added to all positions.
+    covariance : float64 [unknowns, unknowns]
+        Covariance matrix of the values, in the products of their units.
+    held : tuple of str
+        Unknowns that the points cannot distinguish from others. They were not changed.
+    residual_m : float64 [channels, points]
+        Measured ranges minus those of the corrected lines; NaN where a point was not seen.
+    misfit_m : float
+        Rms error of ranges in addition to the noise, due to the track, the points or the model.
+    phases : bool [points]
+        True where the phases of a point's response were used. Elsewhere, the ranges are those of
+        the peak of the envelope.
+
+    See Also
+    --------
+    calibrate_track : Function that returns this result.
+    """
+
+    lines: RangeLines
+    unknowns: tuple[str, ...]
+    values: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    held: tuple[str, ...]
+    residual_m: NDArray[np.float64]
+    misfit_m: float
+    phases: NDArray[np.bool_]
+
+    def __repr__(self) -> str:
+        """Return the corrections with their standard deviations, and the residual."""
+        return reprs.summary(self, self.describe())
+
+    def describe(self) -> str:
+        """Return the corrections with their standard deviations, on one line."""
+        found = []
+        for name, value, deviation in zip(self.unknowns, self.values, self.sd, strict=True):
+            whole = self.sound_speed_m_s if name == "sound_speed" else float(value)
+            found.append(in_words(name, whole, float(deviation)))
+        found += [f"{name.replace('_', ' ')} held" for name in self.held]
+        residual_m = float(np.sqrt(np.nanmean(self.residual_m**2)))
+        found.append(f"residual {reprs.quantity(residual_m, 'm')} rms")
+        return ", ".join(found) + f" at {self.residual_m.shape[1]} points"
+
+    @property
+    def sd(self) -> NDArray[np.float64]:
+        """Standard deviations of the values, [unknowns]."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlation(self) -> NDArray[np.float64]:
+        """Correlation of the errors of the values, [unknowns, unknowns]."""
+        sd = np.maximum(self.sd, 1e-300)
+        return self.covariance / np.outer(sd, sd)
+
+    @property
+    def time_offset_s(self) -> float:
+        """Time that was added to that of every sample, s; 0 if it was not solved for."""
+        return self._value("time_offset")
+
+    @property
+    def range_offset_m(self) -> float:
+        """Time offset as a range at the corrected sound speed, m."""
+        return self.time_offset_s * self.sound_speed_m_s / 2
+
+    @property
+    def sound_speed_m_s(self) -> float:
+        """Corrected sound speed, m/s."""
+        return self.lines.sound_speed_m_s
+
+    @property
+    def lever_arm_m(self) -> NDArray[np.float64]:
+        """Displacement forward, to port and up that was added to all positions, m, [3]."""
+        return np.array([self._value(name) for name in UNKNOWNS[2:]])
+
+    @property
+    def seen(self) -> NDArray[np.int64]:
+        """Number of channels in which each point was measured, [points]."""
+        return np.isfinite(self.residual_m).sum(axis=0)
+
+    @property
+    def residual_rms_m(self) -> NDArray[np.float64]:
+        """Rms residual of each point, m, [points]; NaN for a point that was not seen."""
+        count = np.maximum(self.seen, 1)
+        square = np.nansum(self.residual_m**2, axis=0) / count
+        return np.where(self.seen > 0, np.sqrt(square), np.nan)
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """All numbers, in types that JSON can represent."""
+        return {
+            "unknowns": list(self.unknowns),
+            "values": self.values.tolist(),
+            "sd": self.sd.tolist(),
+            "correlation": self.correlation.tolist(),
+            "held": list(self.held),
+            "time_offset_s": self.time_offset_s,
+            "sound_speed_m_s": self.sound_speed_m_s,
+            "lever_arm_m": self.lever_arm_m.tolist(),
+            "seen": self.seen.tolist(),
+            "residual_rms_m": [n if math.isfinite(n) else None for n in self.residual_rms_m],
+            "misfit_m": self.misfit_m,
+            "phases": self.phases.tolist(),
+        }
+
+    def _value(self, name: str) -> float:
+        """Return the correction of an unknown, 0 if it was not solved for."""
+        return float(self.values[self.unknowns.index(name)]) if name in self.unknowns else 0.0
+
+
+def in_words(name: str, value: float, sd: float) -> str:
+    """Return a value and its standard deviation, such as "time offset 10.0 ± 1.5 µs"."""
+    return f"{name.replace('_', ' ')} {reprs.with_deviation(value, sd, UNITS[name])}"
