@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import re
 import warnings
 from collections.abc import Callable
 from functools import partial
@@ -123,8 +124,10 @@ def option_of(argument: str) -> str:
 def _help(what: Declared, default: str, beside: str) -> str:
     """Return the help of an option: what is declared, its unit, and its default."""
     text = f"With {beside}, {what.help[0].lower()}{what.help[1:]}" if beside else what.help
-    if unit := getattr(what, "unit", ""):
-        text = f"{text.removesuffix('.')} ({unit})."
+    unit = getattr(what, "unit", "")
+    if unit and unit not in re.findall(r"\w+", text):
+        first, stop, others = text.partition(".")
+        text = f"{first} ({unit}){stop}{others}"
     if isinstance(what, Positions):
         text += " X,Y is at z = 0."
     if isinstance(what, Names | Positions | Several):

@@ -94,7 +94,7 @@ ORIGIN = Parsed(
     "60.39,5.32",
 )
 RATIO = Parsed("NUMBER", _ratio, "a number or a fraction such as 1/30")
-STAGES = Parsed("stages", _stages, "QRxQI for every stage, such as 2x2,2x2")
+STAGES = Parsed("QRxQI,...", _stages, "QRxQI for every stage, such as 2x2,2x2")
 SPAN = Parsed("LOW:HIGH", _span, "LOW:HIGH, two numbers, such as 30:60")
 COUNTS = Parsed("ROWSxCOLUMNS", _counts, "ROWSxCOLUMNS, at least 1x1, such as 8x8")
 
