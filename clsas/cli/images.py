@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +23,9 @@ from clsas.cli.inputs import (
 from clsas.cli.outputs import printable, progress_bar, report, say, warn
 from clsas.cli.parameters import HDF5
 from clsas.cli.wording import command
-from clsas.engine.data.image import Formed
-from clsas.engine.device.device import Device, KernelTimes, open_device
-from clsas.engine.exact.decide import ACCURACY_DB
-from clsas.engine.factorized.plan import ExactImage
+from clsas.engine.device.device import KernelTimes, open_device
 from clsas.engine.factorized.planner import WORST_TOLERANCE_DB
-from clsas.engine.forming import SceneImager, scene_of_plan
-from clsas.engine.scene import Scene
 from clsas.files.scene_tables import PLAN_KEYS
-from clsas.measures.tradeoff import summary
 
 _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is reported
 
@@ -100,118 +92,57 @@ def image(
         profiling = opened.profile()
     with progress_bar("imaging") as progress, profiling as kernels:
         built_before_s, start = opened.build_seconds, time.perf_counter()
-        if chosen is None or chosen.is_exact:
-            formed = _exactly(lines, grid, window, opened, request, chosen, progress)
+        if chosen is not None:
+            formed = clsas.factorize(lines, grid, chosen, device=opened, progress=progress)
         else:
-            formed = _factorized(lines, grid, opened, chosen, progress)
+            formed = clsas.backproject(
+                lines, grid, **request, beam=window, device=opened, progress=progress
+            )
         seconds = time.perf_counter() - start
         built_s = opened.build_seconds - built_before_s
-    clsas.save(output, formed.image)
+    clsas.save(output, formed)
     if picture is not None:
         from clsas import plot
 
-        plot.save(plot.image_db(formed.image, **levels), picture)
+        plot.save(plot.image_db(formed, **levels), picture)
+    words, figures = _results(formed, chosen)
+    if planned_s is not None:
+        figures["plan_seconds"] = planned_s
     duration = _duration(seconds, built_s, planned_s)
     report(
         as_json,
         f"{printable(output)}: {' x '.join(map(str, grid.shape))} pixels from "
-        f"{lines.channels} lines in {duration} on {opened.info.label} "
-        f"({formed.summary})" + _table(kernels),
+        f"{lines.channels} lines in {duration} on {opened.info.label} ({words})" + _table(kernels),
         file=output, picture=picture, shape=grid.shape, channels=lines.channels,
-        device=opened.info.label, driver=opened.info.driver,
-        **({} if planned_s is None else {"plan_seconds": planned_s}), **formed.results,
-        seconds=seconds, build_seconds=built_s, kernels=kernels,
+        device=opened.info.label, driver=opened.info.driver, **figures, seconds=seconds,
+        build_seconds=built_s, kernels=kernels,
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class _Formed:
-    """An image, and the method in words and as results in types of JSON."""
-
-    image: clsas.Image
-    how: str
-    figures: dict[str, Any]
-
-    @property
-    def formed(self) -> Formed:
-        """How the image says that it was formed. A zero image has no predicted error."""
-        assert self.image.formed is not None
-        return self.image.formed
-
-    @property
-    def summary(self) -> str:
-        """The method, the predicted error and what was left out, in a line."""
-        error_db, left_out = self.formed.predicted_error_db, self.formed.left_out
-        error = "all pixels are zero" if error_db is None else f"predicted error {error_db:.0f} dB"
-        parts = [self.how, error]
-        if left_out:
-            parts.append(f"without {', '.join(left_out)}, far below the error allowed")
-        return "; ".join(parts)
-
-    @property
-    def results(self) -> dict[str, Any]:
-        """The same in types of JSON."""
-        return {
-            **self.figures,
-            "predicted_error_db": self.formed.predicted_error_db,
-            "is_zero": self.formed.predicted_error_db is None,
-            "left_out": self.formed.left_out,
-        }
-
-
-def _factorized(
-    lines: clsas.RangeLines,
-    grid: clsas.Grid,
-    device: Device,
-    chosen: clsas.Plan,
-    progress: Callable[[int, int], None] | None,
-) -> _Formed:
-    """Form a factorized image."""
-    return _Formed(
-        clsas.factorize(lines, grid, chosen, device=device, progress=progress),
-        summary(chosen),
-        {
-            "method": "stages" if chosen.tolerance_db is None else "factorized",
-            "predicted_seconds": chosen.predicted_seconds,
-        },
-    )
-
-
-def _exactly(
-    lines: clsas.RangeLines,
-    grid: clsas.Grid,
-    beam: clsas.BeamWindow | None,
-    device: Device,
-    request: dict[str, Any],
-    chosen: clsas.Plan | None,
-    progress: Callable[[int, int], None] | None,
-) -> _Formed:
-    """Form an exact image, because it was requested or because a plan chose it."""
-    why = ""
-    how: clsas.Plan | ExactImage
-    if chosen is not None:  # the plan has warned
-        scene, how = scene_of_plan(lines, grid, chosen), chosen
-        if chosen.tolerance_db is not None:
-            why = f"exact: nothing faster within {chosen.tolerance_db:.4g} dB; "
-    else:
-        method = ExactImage(**{"accuracy_db": ACCURACY_DB, **request})
-        is_fixed = None not in (method.taps, method.upsampling)
-        scene, how = Scene.of(lines, grid, beam, None if is_fixed else method.accuracy_db), method
-        scene.warn("accuracy_db", 0.0 if is_fixed else method.accuracy_db)
-    imager = SceneImager(
-        scene, how, device, warned=chosen is not None and not scene.is_reached, keep=False
-    )
-    assert imager.decision is not None
-    return _Formed(
-        imager.form(lines, progress),
-        why + imager.decision.describe(),
-        {
-            "method": "exact",
-            "taps": imager.decision.interpolator.taps,
-            "upsampling": imager.decision.resampling.ratio,
-            "interpolation_error_db": imager.decision.interpolator.error_db,
-        },
-    )
+def _results(image: clsas.Image, chosen: clsas.Plan | None) -> tuple[str, dict[str, Any]]:
+    """Return how an image was formed and its predicted error, in words and in types of JSON."""
+    formed = image.formed
+    assert formed is not None
+    error_db = formed.predicted_error_db
+    parts = [formed.plan, "all pixels are zero"]
+    if error_db is not None:
+        parts[-1] = f"predicted error {error_db:.0f} dB"
+    if formed.left_out:
+        parts.append(f"without {', '.join(formed.left_out)}, far below the error allowed")
+    figures = {
+        "method": formed.method,
+        "how": formed.plan,
+        "predicted_error_db": error_db,
+        "is_zero": error_db is None,
+        "left_out": formed.left_out,
+    }
+    if chosen is not None:
+        figures["predicted_seconds"] = chosen.predicted_seconds
+        if chosen.tolerance_db is None:
+            figures["method"] = "stages"
+        elif chosen.is_exact:
+            parts.insert(0, f"exact: nothing faster within {chosen.tolerance_db:.4g} dB")
+    return "; ".join(parts), figures
 
 
 def _duration(seconds: float, built_s: float, planned_s: float | None) -> str:

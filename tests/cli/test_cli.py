@@ -93,7 +93,7 @@ def test_results_in_json(made):
     assert simulated["channels"] == compressed["channels"] == imaged["channels"] == 320
     assert compressed["range_step_m"] == pytest.approx(1500 / (4 * 60e3))
     assert imaged["shape"] == [201, 201]
-    assert imaged["interpolation_error_db"] < -60
+    assert imaged["predicted_error_db"] < -60
     assert all(result["seconds"] > 0 for result in (simulated, compressed, imaged))
     point = measured["point"]
     # The documented scene has noise, sway and yaw, and sound that takes its time.
@@ -147,8 +147,8 @@ def test_options_go_before_the_scene_file(made, tmp_path):
     grid = ("--x", "-1:1:5", "--y", "20:21:6", "--z", "0.5")
     image = tmp_path / "image.h5"
     result = run_json("image", lines, *scene, *grid, "--taps", 8, "--upsampling", 2, "-o", image)
-    assert (result["shape"], result["taps"]) == ([6, 5], 8)
-    assert result["upsampling"] == pytest.approx(2, rel=0.02)
+    assert result["shape"] == [6, 5]
+    assert "8 taps" in result["how"]
     positions = clsas.load(image).grid.positions_m()
     np.testing.assert_allclose(positions[[0, -1], [0, -1]], [[-1, 20, 0.5], [1, 21, 0.5]])
 
@@ -241,7 +241,7 @@ def test_a_plan_that_is_exact_is_as_accurate_as_asked_for(made, tmp_path):
     output = tmp_path / "image.h5"
     result = run_json("image", made[0] / "lines.h5", *few, "-o", output)
     assert result["method"] == "exact"
-    assert result["interpolation_error_db"] < -70
+    assert result["predicted_error_db"] < -70
     assert 0 <= result["build_seconds"] < result["seconds"]
     text, _ = run("image", made[0] / "lines.h5", *few, "-o", output)
     assert "planned in " in text
