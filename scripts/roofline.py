@@ -22,7 +22,7 @@ from studies import tables
 
 import clsas
 from clsas.engine.device.device import open_device
-from clsas.trials import cases
+from clsas.selftest import cases
 
 PROCESSORS = ("haswell", "znver3", "icelake-server")
 ITERATIONS = 200

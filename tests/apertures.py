@@ -9,7 +9,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from clsas.trials.extremes import along_x
+from clsas.selftest.extremes import along_x
 
 Floats = NDArray[np.float64]
 

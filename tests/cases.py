@@ -10,7 +10,7 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.image_error import relative_error_db
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.signal.spectrum import Spectrum
-from clsas.trials.reference import ideal
+from clsas.selftest.reference import ideal
 
 SPARE = 160  # samples of a line beyond what a grid needs, at each end
 TAPER = 100  # of them, over how many a line fades

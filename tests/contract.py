@@ -16,8 +16,8 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
-from clsas.trials import extremes
-from clsas.trials.extremes import Known
+from clsas.selftest import extremes
+from clsas.selftest.extremes import Known
 
 FINE = {"taps": 8, "upsampling": 4}  # an interpolator whose own error is below -100 dB
 

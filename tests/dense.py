@@ -6,7 +6,7 @@ import numpy as np
 from factorizing import around, over
 
 from clsas.engine.data.grid import Grid
-from clsas.trials.dense_cases import helix as positions_on_helix
+from clsas.selftest.cases import helix as positions_on_helix
 
 CARRIER = 30e3
 WAVELENGTH = 1500.0 / CARRIER

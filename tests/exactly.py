@@ -10,7 +10,7 @@ from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.sampled import SampledRoots, SampledScene
 from clsas.engine.forming import SceneImager
 from clsas.engine.scene import Scene
-from clsas.trials import reference
+from clsas.selftest import reference
 
 
 @dataclass(frozen=True, eq=False)

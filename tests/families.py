@@ -24,7 +24,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.sound_speed import STEEPEST_PER_S, SoundSpeed
-from clsas.trials import oracle
+from clsas.selftest import oracle
 
 SAMPLED = 70  # random pixels at which the ideal image is known, besides those around the points
 AROUND = 6  # pixels around every point, besides the one where it is

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rays import rays
 
 from clsas.engine.data.beam import BeamWindow
-from clsas.trials import oracle
+from clsas.selftest import oracle
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -9,7 +9,7 @@ one here; the whole suite would take four times as long if all of them ran on al
 from functools import cache
 
 from clsas.engine.device.device import DeviceError, choose, list_devices, open_device
-from clsas.trials.selftest import driven, other_builds
+from clsas.selftest.accuracy import driven, other_builds
 
 
 def _named(ways, infos):

@@ -20,7 +20,7 @@ from clsas.engine.factorized.planner import TOLERANCE_DB
 from clsas.files import scene_files as config
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS
-from clsas.plot.colours import colour_map as check_colour_map
+from clsas.plot.canvas import colour_map as check_colour_map
 
 DEFAULT_REQUEST = {"tolerance_db": TOLERANCE_DB}
 

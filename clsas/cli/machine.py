@@ -14,7 +14,7 @@ from clsas.cli.outputs import print_json, printable, progress_bar, say
 from clsas.cli.parameters import File, need_matplotlib
 from clsas.cli.wording import command
 from clsas.engine.device.device import choose, open_device
-from clsas.trials import demo as demonstration
+from clsas.selftest import demo as demonstration
 
 if TYPE_CHECKING:
     from clsas.engine.factorized.costs import KnownCosts

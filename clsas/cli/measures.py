@@ -184,8 +184,8 @@ def bench(
     \b
     Example:  clsas bench ffbp-2k --tolerance-db -40 --json
     """
-    from clsas.trials import bench as benchmark
-    from clsas.trials import cases
+    from clsas.selftest import bench as benchmark
+    from clsas.selftest import cases
 
     measures: dict[str, Callable[..., dict[str, Any]]]
     measures = dict.fromkeys(cases.EXACT_CASES, benchmark.run)
@@ -210,7 +210,7 @@ def bench(
 
 
 def _case(name: str) -> Any:
-    from clsas.trials import cases
+    from clsas.selftest import cases
 
     known = cases.EXACT_CASES | cases.FACTORIZED_CASES
     _one_of(name, known)

@@ -39,7 +39,7 @@ from clsas.files.hdf5 import SUFFIXES
 from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS
 from clsas.maps.export_options import ExportOptions
 from clsas.plot.canvas import SUFFIXES as PICTURES
-from clsas.plot.levels import Scale
+from clsas.plot.canvas import Scale
 
 _TYPES = {Number: float, Count: int, Span: SPAN, Positions: POSITION, Other: str}
 """Type of an option, by the kind of its declaration."""

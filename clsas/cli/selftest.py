@@ -13,7 +13,7 @@ from clsas.cli.wording import command
 from clsas.engine.device.device import open_device
 
 if TYPE_CHECKING:
-    from clsas.trials.selftest import Result
+    from clsas.selftest.accuracy import Result
 
 
 @command()
@@ -29,11 +29,11 @@ def selftest(ctx: click.Context, device: str | None, as_json: bool) -> None:
     \b
     Example:  clsas selftest --device 0
     """
-    from clsas.trials import selftest as test
+    from clsas.selftest import accuracy
 
     opened, begun = open_device(device), time.perf_counter()
     with progress_bar("testing") as progress:
-        results = test.run(opened, progress=progress)
+        results = accuracy.run(opened, progress=progress)
     seconds = time.perf_counter() - begun
     missed = sum(not result.passed for result in results)
     if as_json:

@@ -17,8 +17,7 @@ from clsas.cli.parameters import POSITION, File, Output, keep_out, need_matplotl
 from clsas.cli.wording import command
 from clsas.files.formats import SUFFIXES
 from clsas.plot.canvas import SUFFIXES as PICTURES
-from clsas.plot.levels import amplitude_at
-from clsas.plot.windows import window_around
+from clsas.plot.images import amplitude_at, window_around
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

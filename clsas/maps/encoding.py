@@ -85,7 +85,7 @@ def colour_table(name: str) -> dict[int, tuple[int, int, int, int]]:
     ImportError
         If matplotlib is not installed.
     """
-    from clsas.plot.colours import colour_map
+    from clsas.plot.canvas import colour_map
 
     levels = np.arange(1, _LEVELS + 2)
     colours = colour_map(name)((levels - 1) / _LEVELS, bytes=True)

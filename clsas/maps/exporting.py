@@ -25,10 +25,9 @@ from clsas.maps.orientation import Orientation
 from clsas.maps.sources import Source
 from clsas.mosaics.store import Store
 from clsas.plot import heights as heights_picture
+from clsas.plot.canvas import COLOUR_MAP, DYNAMIC_RANGE_DB
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.plot.canvas import save as save_picture
-from clsas.plot.colours import COLOUR_MAP
-from clsas.plot.levels import DYNAMIC_RANGE_DB
 
 
 def export(

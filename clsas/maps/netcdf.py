@@ -20,7 +20,7 @@ from clsas.files.xarrays import GRID_MAPPING, grid_dims, to_xarray
 from clsas.maps.bands import bands_of
 from clsas.maps.encoding import Encoding
 from clsas.maps.sources import Source
-from clsas.plot.levels import DYNAMIC_RANGE_DB
+from clsas.plot.canvas import DYNAMIC_RANGE_DB
 
 if TYPE_CHECKING:
     import xarray

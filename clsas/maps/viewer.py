@@ -26,9 +26,8 @@ from clsas.maps.frames import Frame, fitted_degrees, geographic_of, steps_of
 from clsas.maps.sources import Source
 from clsas.maps.tiles import BRIGHTEST, SIDE, STEP_DB, Pyramid, Quantization, factors_of
 from clsas.mosaics.store import Store
-from clsas.plot.colours import COLOUR_MAP
-from clsas.plot.colours import colour_map as colours_of
-from clsas.plot.levels import DYNAMIC_RANGE_DB
+from clsas.plot.canvas import COLOUR_MAP, DYNAMIC_RANGE_DB
+from clsas.plot.canvas import colour_map as colours_of
 
 PAGE = "index.html"
 """File in the folder of a viewer that a browser opens."""

@@ -14,14 +14,20 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.interferogram import Interferogram
 from clsas.interferometry.result import Heights
-from clsas.plot import colours
-from clsas.plot.canvas import axis_label, drawable, length_unit, new_figure, plain_ticks
-from clsas.plot.levels import edges
+from clsas.plot.canvas import colour_map as checked_colour_map
+from clsas.plot.canvas import (
+    drawable,
+    grid_extent,
+    label_grid,
+    new_figure,
+    plain_ticks,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 _MOST_PIXELS = 1500  # pixels drawn along an axis; pictures have fewer dots
 _PANEL_IN = 5.0  # longer side of a panel
@@ -56,10 +62,12 @@ def interferogram(interferogram: Interferogram, *, title: str = "") -> Figure:
     grid = interferogram.grid
     title = drawable("title", title)
     figure, (left, right) = _panels(grid, title)
-    phase = _drawn(left, grid, interferogram.phase_rad, "twilight_shifted", np.pi)
+    phase = _draw(
+        left, grid, _thinned(interferogram.phase_rad), "twilight_shifted", (-np.pi, np.pi)
+    )
     bar = figure.colorbar(phase, ax=left, label="Phase (rad)")
     bar.set_ticks([-np.pi, -np.pi / 2, 0, np.pi / 2, np.pi], labels=["-π", "-π/2", "0", "π/2", "π"])
-    shown = _drawn(right, grid, interferogram.coherence, "gray", 1.0, least=0.0)
+    shown = _draw(right, grid, _thinned(interferogram.coherence), "gray", (0.0, 1.0))
     figure.colorbar(shown, ax=right, label="Coherence")
     left.set_title("Phase")
     right.set_title("Coherence")
@@ -95,21 +103,23 @@ def heights(heights: Heights, *, colour_map: str | Colormap = "viridis", title: 
         raise ArgumentError("heights", "have at least one pixel that is not masked")
     height_m, sd_m = (np.where(known, each, 0.0) for each in (heights.height_m, heights.sd_m))
     title = drawable("title", title)
-    chosen = colours.colour_map(colour_map)
+    chosen = checked_colour_map(colour_map)
     figure, (left, right) = _panels(grid, title)
-    low_m, high_m = float(height_m[known].min()), float(height_m[known].max())
-    # Drawn for the colour bar only: the relief covers it.
-    scale = _drawn(left, grid, np.where(known, height_m, low_m), chosen, high_m, least=low_m)
-    factor, _ = _unit(grid)
-    left.imshow(
-        _relief(_thinned(height_m), _thinned(known), _steps_m(grid), scale.cmap, scale.norm),
-        origin="lower", extent=_extent(grid, factor), interpolation="nearest",
-    )  # fmt: skip
-    figure.colorbar(scale, ax=left, label="Height (m)")
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    colours = ScalarMappable(Normalize(height_m[known].min(), height_m[known].max()), chosen)
+    across, upward = grid.sides
+    every = [_every(count) for count in grid.shape]
+    steps_m = every[0] * upward.step_m, every[1] * across.step_m
+    relief = _relief(_thinned(height_m), _thinned(known), steps_m, chosen, colours.norm)
+    _draw(left, grid, relief)
+    figure.colorbar(colours, ax=left, label="Height (m)")
     share = 1 - float(known.mean())
     left.set_title(f"Height; {100 * share:.0f} % masked (grey)" if share else "Height")
     most_m = float(np.quantile(sd_m[known], _HIGHEST)) or 1.0
-    shown = _drawn(right, grid, np.ma.masked_array(1e3 * sd_m, ~known), "magma", 1e3 * most_m, 0.0)
+    deviation_mm = _thinned(np.ma.masked_array(1e3 * sd_m, ~known))
+    shown = _draw(right, grid, deviation_mm, "magma", (0.0, 1e3 * most_m))
     right.set_facecolor(_MASKED)
     extend = "max" if sd_m[known].max() > most_m else "neither"
     figure.colorbar(shown, ax=right, label="Deviation (mm)", extend=extend)
@@ -117,13 +127,58 @@ def heights(heights: Heights, *, colour_map: str | Colormap = "viridis", title: 
     return figure
 
 
+def _panels(grid: Grid, title: str) -> tuple[Figure, NDArray]:
+    """Return a figure and its two axes: beside each other, or above each other if they are wide."""
+    across, upward = grid.sides
+    high = abs(upward.step_m) * len(upward.places_m)
+    wide = abs(across.step_m) * len(across.places_m)
+    longest = max(high, wide)
+    width_in = max(_PANEL_IN * wide / longest, _LEAST_IN) + _LABELS_IN[0]
+    height_in = max(_PANEL_IN * high / longest, _LEAST_IN) + _LABELS_IN[1]
+    stacked = width_in > 1.5 * height_in
+    columns, rows = (1, 2) if stacked else (2, 1)
+    figure = new_figure(columns * width_in, rows * height_in, layout="compressed")
+    if title:
+        figure.suptitle(title)
+    return figure, figure.subplots(rows, columns)
+
+
+def _draw(
+    axes: Axes,
+    grid: Grid,
+    values: NDArray,
+    chosen: str | None = None,
+    limits: tuple[float, float] = (0.0, 1.0),
+) -> AxesImage:
+    """Draw thinned values or colours over metres or millimetres."""
+    extent = grid_extent(grid)
+    drawn = axes.imshow(
+        values, cmap=chosen, vmin=limits[0], vmax=limits[1],
+        origin="lower", extent=extent, interpolation="nearest",
+    )  # fmt: skip
+    axes.set(xlim=sorted(extent[:2]), ylim=sorted(extent[2:]))
+    plain_ticks(axes)
+    label_grid(axes, grid)
+    return drawn
+
+
+def _every(count: int) -> int:
+    """Return how many pixels share a dot."""
+    return max(-(-count // _MOST_PIXELS), 1)
+
+
+def _thinned(values: NDArray) -> NDArray:
+    """Return some of the pixels of a large array: means would mix phases, and cross steps."""
+    return values[:: _every(values.shape[0]), :: _every(values.shape[1])]
+
+
 def _relief(
     height_m: NDArray, known: NDArray, steps_m: tuple[float, float], chosen: Any, norm: Any
 ) -> NDArray[np.float64]:
     """Return colours [rows, columns, 3] of heights with hillshade; grey where none is known.
 
-    Slopes are those of the nearest known heights. `steps_m` are distances between rows and columns
-    upward and to the right of the picture, metres.
+    Slopes are those of the nearest known heights. `steps_m` are the distances between rows, upward
+    on the picture, and between columns, to the right; they may be negative.
     """
     if not known.all():
         nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
@@ -149,70 +204,3 @@ def _relief(
     shaded += (1 - shaded) * white[..., None]
     shaded[~known] = _MASKED
     return shaded
-
-
-def _panels(grid: Grid, title: str) -> tuple[Figure, NDArray]:
-    """Return a figure and its two axes: beside each other, or above each other if they are wide."""
-    across, upward = grid.sides
-    high = abs(upward.step_m) * len(upward.places_m)
-    wide = abs(across.step_m) * len(across.places_m)
-    longest = max(high, wide)
-    width_in = max(_PANEL_IN * wide / longest, _LEAST_IN) + _LABELS_IN[0]
-    height_in = max(_PANEL_IN * high / longest, _LEAST_IN) + _LABELS_IN[1]
-    stacked = width_in > 1.5 * height_in
-    columns, rows = (1, 2) if stacked else (2, 1)
-    figure = new_figure(columns * width_in, rows * height_in, layout="compressed")
-    if title:
-        figure.suptitle(title)
-    return figure, figure.subplots(rows, columns)
-
-
-def _unit(grid: Grid) -> tuple[float, str]:
-    """Return the factor and the unit of the axes."""
-    return length_unit(max(float(np.abs(side.places_m).max()) for side in grid.sides))
-
-
-def _extent(grid: Grid, factor: float) -> tuple[float, float, float, float]:
-    """Return the edges of a picture: left, right, bottom, top."""
-    places = tuple(factor * side.places_m for side in grid.sides)
-    return (*edges(*places), *edges(*reversed(places)))
-
-
-def _steps_m(grid: Grid) -> tuple[float, float]:
-    """Return the steps between rows and between columns that are drawn, with their signs, metres.
-
-    A negative step is drawn to the left or downward.
-    """
-    across, upward = grid.sides
-    every = [_every(count) for count in grid.shape]
-    return upward.step_m * every[0], across.step_m * every[1]
-
-
-def _every(count: int) -> int:
-    """Return how many pixels share a dot."""
-    return max(-(-count // _MOST_PIXELS), 1)
-
-
-def _thinned(values: NDArray) -> NDArray:
-    """Return some of the pixels of a large array: means would mix phases, and cross steps."""
-    return values[:: _every(values.shape[0]), :: _every(values.shape[1])]
-
-
-def _drawn(
-    axes: Axes, grid: Grid, values: NDArray, chosen: Any, most: float, least: float | None = None
-) -> Any:
-    """Draw values over metres or millimetres, in colours from `least` (or -most) to `most`."""
-    factor, unit = _unit(grid)
-    extent = _extent(grid, factor)
-    drawn = axes.imshow(
-        _thinned(values), cmap=chosen, vmin=-most if least is None else least, vmax=most,
-        origin="lower", extent=extent, interpolation="nearest",
-    )  # fmt: skip
-    axes.set(xlim=sorted(extent[:2]), ylim=sorted(extent[2:]))
-    plain_ticks(axes)
-    across, upward = grid.sides
-    place = grid.georeference
-    axes.set_xlabel(axis_label(across.name, unit, place=place))
-    axes.set_ylabel(axis_label(upward.name, unit, place=place))
-    axes.set_aspect("equal" if min(grid.shape) > 1 else "auto")
-    return drawn

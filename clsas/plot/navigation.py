@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import validate
-from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
 from clsas.navigation.autofocus import Autofocus
 from clsas.navigation.micronavigation import Micronavigation
 from clsas.plot.canvas import new_figure
-from clsas.plot.levels import FLAT, Scale, add_colour_bar, height_per_width
-from clsas.plot.levels import image as draw_image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _INTERVAL = 1.96  # standard deviations on each side that make 95 %
-_PANEL_IN, _LEAST_PANEL_IN = 4.3, 1.7  # largest and smallest width of each of two images
-_HIGHEST_IN = 8.0  # largest height of an image
 _LEAST_SHOWN = 1e-9  # corrections that never exceed this, in metres or radians, are not drawn
 
 
@@ -46,43 +40,59 @@ def corrections(found: Micronavigation | Autofocus) -> Figure:
         If `found` has another type.
     """
     validate.instance("found", found, Micronavigation, Autofocus)
-    curves = _curves(found)
+    # Name, unit, values, and their intervals: standard deviations, label and colour.
+    curves: list[tuple[str, str, NDArray, list[tuple[NDArray, str, str]]]]
+    if isinstance(found, Micronavigation):
+        curves = [
+            ("Sway", "mm", 1e3 * found.sway_m, [
+                (1e3 * found.sway_sd_m, "whole track", "tab:gray"),
+                (1e3 * found.shape_sd_m, "its shape", "tab:blue"),
+            ]),
+            ("Yaw", "mrad", 1e3 * found.yaw_rad, [(1e3 * found.yaw_sd_rad, "", "tab:gray")]),
+            ("Surge", "mm", 1e3 * found.surge_m, [(1e3 * found.surge_sd_m, "", "tab:gray")]),
+        ]  # fmt: skip
+    else:
+        starts = found.lines.ping_starts
+        correction = 1e3 * found.correction_m[starts]
+        interval = (1e3 * found.correction_sd_m[starts], "", "tab:blue")
+        curves = [
+            (f"Along {name}", "mm", correction[:, axis], [interval])
+            for axis, name in enumerate("xyz")
+        ]
+    moved = [each for each in curves if np.abs(each[2]).max() > 1e3 * _LEAST_SHOWN]
+    curves = moved or curves[:1]
+
     figure = new_figure(9.0, 1.2 + 1.8 * len(curves))
     panels: NDArray[Any] = figure.subplots(
         len(curves), 2, sharex=True, squeeze=False, width_ratios=(2, 1)
     )
-    for (values, widths), curve in zip(panels, curves, strict=True):
-        _draw_curve(values, widths, curve)
+    for (values, widths), (name, unit, value, intervals) in zip(panels, curves, strict=True):
+        ping = np.arange(len(value))
+        values.plot(ping, value, linewidth=1.0)
+        reach = max(float(np.ptp(value)), 1e-6)
+        for deviation, label, colour in intervals:
+            width = _INTERVAL * deviation
+            if not (np.isfinite(width) & (width > 0)).any():
+                continue
+            if width[np.isfinite(width)].max() < reach:  # wider intervals would fill the panel
+                values.fill_between(
+                    ping, value - width, value + width, alpha=0.4, linewidth=0, color=colour
+                )
+            widths.semilogy(ping, width, color=colour, linewidth=1.0, label=label)
+        values.set(
+            ylabel=f"{name} ({unit})", xlim=(0, max(len(value) - 1, 1)),
+            ylim=(float(value.min()) - 0.3 * reach, float(value.max()) + 0.3 * reach),
+        )  # fmt: skip
+        widths.set_ylabel(f"± ({unit})")
+        _show_decades(widths)
+        for axes in (values, widths):
+            axes.grid(alpha=0.3)
+        if len(intervals) > 1 and widths.get_legend_handles_labels()[0]:
+            widths.legend(fontsize="small")
     for axes in panels[-1]:
         axes.set_xlabel("Ping")
     panels[0, 1].set_title("95 % interval", fontsize="medium")
     return figure
-
-
-def _draw_curve(values: Axes, widths: Axes, curve: _Curve) -> None:
-    """Draw values over pings, and half the widths of their intervals beside them."""
-    ping, value = np.arange(len(curve.value)), curve.value
-    values.plot(ping, value, linewidth=1.0)
-    reach = max(float(np.ptp(value)), 1e-6)
-    for deviation, label, colour in curve.intervals:
-        width = _INTERVAL * deviation
-        if not (np.isfinite(width) & (width > 0)).any():
-            continue
-        if width[np.isfinite(width)].max() < reach:  # wider intervals would fill the panel
-            values.fill_between(
-                ping, value - width, value + width, alpha=0.4, linewidth=0, color=colour
-            )
-        widths.semilogy(ping, width, color=colour, linewidth=1.0, label=label)
-    values.set(
-        ylabel=f"{curve.name} ({curve.unit})", xlim=(0, max(len(value) - 1, 1)),
-        ylim=(float(value.min()) - 0.3 * reach, float(value.max()) + 0.3 * reach),
-    )  # fmt: skip
-    widths.set_ylabel(f"± ({curve.unit})")
-    _show_decades(widths)
-    for axes in (values, widths):
-        axes.grid(alpha=0.3)
-    if len(curve.intervals) > 1 and widths.get_legend_handles_labels()[0]:
-        widths.legend(fontsize="small")
 
 
 def _show_decades(axes: Axes) -> None:
@@ -118,7 +128,22 @@ def coherence(found: Micronavigation, *, range_m: tuple[float, float] | None = N
         If `found` has another type, or `range_m` is not in ascending order.
     """
     validate.instance("found", found, Micronavigation)
-    values, edges_m = found.coherence, _edges_m(found, range_m)
+    # Windows are equally wide.
+    middles_m, windows = found.range_m, len(found.range_m)
+    if range_m is not None:
+        near_m, far_m = validate.array("range_m", range_m, np.float64, (2,))
+        if not near_m < far_m:
+            raise ArgumentError("range_m", "be near < far in m", (float(near_m), float(far_m)))
+    elif windows > 1:
+        half_m = float(middles_m[1] - middles_m[0]) / 2
+        near_m, far_m = middles_m[0] - half_m, middles_m[-1] + half_m
+    else:
+        first_m, last_m = found.lines.first_range_m.max(), found.lines.last_range_m.min()
+        half_m = float(min(middles_m[0] - first_m, last_m - middles_m[0]))
+        near_m, far_m = middles_m[0] - half_m, middles_m[0] + half_m
+    edges_m = np.linspace(near_m, far_m, windows + 1)
+
+    values = found.coherence
     figure = new_figure(7.0, 4.0)
     beside, axes = figure.subplots(1, 2, sharey=True, width_ratios=(1, 3))
     drawn = axes.imshow(
@@ -138,23 +163,6 @@ def coherence(found: Micronavigation, *, range_m: tuple[float, float] | None = N
     beside.legend(loc="lower left", fontsize="small")
     figure.colorbar(drawn, label="Coherence")
     return figure
-
-
-def _edges_m(found: Micronavigation, range_m: tuple[float, float] | None) -> NDArray[np.float64]:
-    """Return the ranges at which windows begin and end; they are equally wide."""
-    middles_m, windows = found.range_m, len(found.range_m)
-    if range_m is not None:
-        near_m, far_m = validate.array("range_m", range_m, np.float64, (2,))
-        if not near_m < far_m:
-            raise ArgumentError("range_m", "be near < far in m", (float(near_m), float(far_m)))
-    elif windows > 1:
-        half_m = float(middles_m[1] - middles_m[0]) / 2
-        near_m, far_m = middles_m[0] - half_m, middles_m[-1] + half_m
-    else:
-        first_m, last_m = found.lines.first_range_m.max(), found.lines.last_range_m.min()
-        half_m = float(min(middles_m[0] - first_m, last_m - middles_m[0]))
-        near_m, far_m = middles_m[0] - half_m, middles_m[0] + half_m
-    return np.linspace(near_m, far_m, windows + 1)
 
 
 def sharpness(found: Autofocus) -> Figure:
@@ -187,88 +195,3 @@ def sharpness(found: Autofocus) -> Figure:
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right", fontsize="small")
     return figure
-
-
-def before_and_after(before: Image, after: Image, **options: Any) -> Figure:
-    """Draw an image before and after the correction of its track, with a common scale of levels.
-
-    Parameters
-    ----------
-    before, after : Image
-        Images on the same grid.
-    **options
-        Further arguments of `image`: `dynamic_range_db`, `percentiles` and `colour_map`.
-
-    Raises
-    ------
-    ImportError
-        If matplotlib is not installed.
-    TypeError, ValueError
-        If an argument has the wrong type, or the images differ in shape.
-    """
-    validate.instance("before", before, Image)
-    validate.instance("after", after, Image)
-    if before.shape != after.shape:
-        raise ArgumentError(
-            "after", f"have the pixels of `before`, {before.shape}", str(after.shape)
-        )
-    largest = max(float(np.abs(each.pixels).max()) for each in (before, after)) or 1.0
-    scale = Scale(reference=largest, **options)
-    high = height_per_width(before)
-    # Narrow images leave room for titles and labels beside each other.
-    axes_in = min(_PANEL_IN, _HIGHEST_IN / high)
-    narrow = axes_in < _LEAST_PANEL_IN
-    between = "\n" if narrow else " "
-    labels_in = 2.2 if high < FLAT else 1.5
-    size_in = 2 * max(axes_in, _LEAST_PANEL_IN) + 2.0, max(axes_in * high, 0.5) + labels_in
-    figure = new_figure(*size_in, layout="constrained" if narrow else "compressed")
-    panels: NDArray[Any] = figure.subplots(1, 2, sharex=True, sharey=True)
-    for axes, image, title in zip(panels, (before, after), ("Before", "After"), strict=True):
-        peak = float(np.abs(image.pixels).max()) / largest
-        shown = f"peak {20 * np.log10(peak):.1f} dB".replace("-", "−") if peak else "image is zero"
-        draw_image(
-            image, axes, reference=largest, colour_bar=False,
-            title=f"{title}:{between}{shown}", **options,
-        )  # fmt: skip
-    panels[-1].set_ylabel("")
-    levels = np.stack([each.db(reference=largest) for each in (before, after)])
-    add_colour_bar(
-        panels[-1].images[0], scale, levels, label="Amplitude (dB re larger peak)",
-        ax=panels, location="bottom" if high < FLAT else "right", aspect=30,
-    )  # fmt: skip
-    return figure
-
-
-@dataclass(frozen=True, eq=False)
-class _Curve:
-    """Corrections ping by ping; intervals are (standard deviations, label, colour)."""
-
-    name: str
-    unit: str
-    value: NDArray[np.float64]
-    intervals: list[tuple[NDArray[np.float64], str, str]]
-
-
-def _curves(found: Micronavigation | Autofocus) -> list[_Curve]:
-    """Return the corrections that differ from zero, or else the first."""
-    if isinstance(found, Micronavigation):
-        every = [
-            _Curve("Sway", "mm", 1e3 * found.sway_m, [
-                (1e3 * found.sway_sd_m, "whole track", "tab:gray"),
-                (1e3 * found.shape_sd_m, "its shape", "tab:blue"),
-            ]),
-            _Curve("Yaw", "mrad", 1e3 * found.yaw_rad, [(1e3 * found.yaw_sd_rad, "", "tab:gray")]),
-            _Curve("Surge", "mm", 1e3 * found.surge_m, [(1e3 * found.surge_sd_m, "", "tab:gray")]),
-        ]  # fmt: skip
-    else:
-        starts = found.lines.ping_starts
-        deviation = 1e3 * found.correction_sd_m[starts]
-        every = [
-            _Curve(
-                f"Along {name}", "mm", 1e3 * found.correction_m[starts, axis],
-                [(deviation, "", "tab:blue")],
-            )
-            for axis, name in enumerate("xyz")
-        ]  # fmt: skip
-    moved = [each for each in every if np.abs(each.value).max() > 1e3 * _LEAST_SHOWN]
-    return moved or every[:1]

@@ -1,4 +1,4 @@
-"""Pictures of recordings: levels of the lines, their spectrum, and the track."""
+"""Pictures of recordings: range lines, echoes, the geometry of a survey, and inspections."""
 
 from __future__ import annotations
 
@@ -12,20 +12,196 @@ from clsas.engine.data.decibels import level_db
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.pings import Transmissions
+from clsas.engine.signal.echoes import Echoes
 from clsas.engine.signal.spectrum import power_spectrum
 from clsas.inspection.inspection import Inspection
-from clsas.plot.canvas import axis_label, length_unit, new_figure, plain_ticks
-from clsas.plot.levels import Scale, draw_levels
-from clsas.plot.survey import outline as outline_of
+from clsas.plot.canvas import (
+    COLOUR_MAP,
+    Scale,
+    axis_label,
+    draw_levels,
+    drawable,
+    length_unit,
+    new_figure,
+    plain_ticks,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
 _MOST_CHANNELS, _MOST_ROWS = 1500, 800  # columns and rows drawn; pictures have fewer dots
-_LEVELS_DB = 30.0, 80.0  # least and largest dynamic range of the levels
+_LEVELS_DB = 30.0, 80.0  # least and largest dynamic range of the levels of inspected lines
 _SPECTRUM_DB = 80.0  # level below the strongest frequency at which the axis ends
 _PREFIXES = ((1e9, "GHz"), (1e6, "MHz"), (1e3, "kHz"))
+
+
+def range_lines(
+    lines: RangeLines,
+    *,
+    dynamic_range_db: float | None = None,
+    percentiles: tuple[float, float] | None = None,
+    reference: float | None = None,
+    colour_map: str | Colormap = COLOUR_MAP,
+    title: str = "",
+) -> Figure:
+    """Draw the amplitude of range lines in dB over channel and range.
+
+    Parameters
+    ----------
+    lines : RangeLines
+        Lines to draw; each is drawn at its own ranges.
+    dynamic_range_db, percentiles, reference, colour_map, title
+        As for `image`. By default, levels are relative to the largest sample.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError, ValueError
+        If an argument has the wrong type or is out of bounds.
+    """
+    validate.instance("lines", lines, RangeLines)
+    scale = Scale(dynamic_range_db, percentiles, reference, colour_map)
+    title = drawable("title", title)
+    amplitude, first_m, last_m = _aligned(lines.samples, lines.first_range_m, lines.range_step_m)
+    extent = (-0.5, lines.channels - 0.5, first_m, last_m)
+    figure = new_figure(7.0, 6.0)
+    axes = figure.subplots()
+    draw_levels(axes, level_db(amplitude, reference), extent, scale)
+    axes.set(xlabel="Channel", ylabel="Range (m)", title=title, aspect="auto")
+    return figure
+
+
+def echoes(
+    echoes: Echoes,
+    *,
+    dynamic_range_db: float | None = None,
+    percentiles: tuple[float, float] | None = None,
+    reference: float | None = None,
+    colour_map: str | Colormap = COLOUR_MAP,
+    title: str = "",
+) -> Figure:
+    """Draw the amplitude of echoes in dB: channels across, time after transmission upward.
+
+    Parameters
+    ----------
+    echoes : Echoes
+        Echoes before compression. Of real samples, the magnitude is drawn.
+    dynamic_range_db, percentiles, reference, colour_map, title
+        As for `image`.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError, ValueError
+        If an argument is of a wrong kind or outside its limits.
+    """
+    validate.instance("echoes", echoes, Echoes)
+    scale = Scale(dynamic_range_db, percentiles, reference, colour_map)
+    title = drawable("title", title)
+    amplitude, first_s, last_s = _aligned(
+        echoes.samples, echoes.start_time_s, 1 / echoes.sample_rate_hz
+    )
+    factor, unit = (1e3, "ms") if last_s < 1 else (1.0, "s")
+    extent = (-0.5, echoes.channels - 0.5, factor * first_s, factor * last_s)
+    figure = new_figure(7.0, 6.0)
+    axes = figure.subplots()
+    draw_levels(axes, level_db(amplitude, reference), extent, scale)
+    axes.set(
+        xlabel="Channel", ylabel=f"Time after transmission ({unit})", title=title, aspect="auto"
+    )
+    return figure
+
+
+def _aligned(
+    samples: NDArray, first: NDArray[np.float64], step: float
+) -> tuple[NDArray[np.float32], float, float]:
+    """Return amplitudes [range or time, channel] on one axis, and that axis's outer edges."""
+    channels, length = samples.shape
+    start = np.rint((first - first.min()) / step).astype(int)
+    rows = int(start.max()) + length
+    validate.memory("the picture", 12 * rows * channels)  # amplitudes, and levels with a copy
+    amplitude = np.zeros((rows, channels), np.float32)
+    for channel, (at, each) in enumerate(zip(start, samples, strict=True)):
+        amplitude[at : at + length, channel] = np.abs(each)
+    return amplitude, first.min() - step / 2, first.min() + (rows - 0.5) * step
+
+
+def geometry(lines: RangeLines | Echoes, grid: Grid | None = None) -> Figure:
+    """Draw the positions of transmitters and receivers, and the outline of a grid.
+
+    The view is from above, over x and y. For a vertical grid along x or y it is from the side.
+
+    Parameters
+    ----------
+    lines : RangeLines or Echoes
+        Data with the positions `tx_m` and `rx_m`.
+    grid : Grid, optional
+        Grid of an image. If it has arbitrary points, all of them are drawn.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    TypeError
+        If `lines` or `grid` has another type.
+
+    Examples
+    --------
+    >>> import clsas
+    >>> import numpy as np
+    >>> tx_m = np.outer(np.arange(8), [0.02, 0, 0])
+    >>> point = clsas.PointTargets([[0.1, 20.0, 0.0]], [1.0])
+    >>> lines = clsas.simulate_lines(tx_m, tx_m, point, carrier_hz=100e3, bandwidth_hz=20e3)
+    >>> figure = clsas.plot.geometry(lines, clsas.Grid.plane((0.0, 0.2, 21), (19.0, 21.0, 21)))
+    >>> [line.get_label() for line in figure.axes[0].get_lines()]
+    ['Receiver (8 positions)', 'Transmitter (8 positions)', 'Grid 21 × 21']
+    """
+    validate.instance("lines", lines, RangeLines, Echoes)
+    if grid is not None:
+        validate.instance("grid", grid, Grid)
+    shown = [0, 1]  # the coordinates across and upward
+    if grid is not None and grid.points_m is None and min(grid.shape) > 1:
+        names = "".join(sorted(side.name for side in grid.sides))
+        if names in ("xz", "yz"):
+            shown = ["xyz".index(name) for name in names]
+    # Units are metres unless the whole geometry is small.
+    ends_m = [lines.rx_m, lines.tx_m] + ([] if grid is None else [_outline(grid)[0]])
+    scale, unit = length_unit(max(float(np.abs(each[:, shown]).max()) for each in ends_m))
+    figure = new_figure(7.0, 6.0)
+    axes = figure.subplots()
+    for name, antenna_m, marker in (
+        ("Receiver", lines.rx_m, "."),
+        ("Transmitter", lines.tx_m, "x"),
+    ):
+        places = scale * np.unique(antenna_m[:, shown].round(6), axis=0)  # micrometres
+        label = f"{name} ({len(places)} positions)"
+        axes.plot(*places.T, marker, markersize=5, label=label)
+    if grid is not None:
+        outline_m, style = _outline(grid)
+        label = "Grid " + " × ".join(map(str, grid.shape))
+        places = scale * outline_m[:, shown]
+        axes.plot(*places.T, style, linewidth=1.5, markersize=2, label=label)
+    place = lines.georeference or (None if grid is None else grid.georeference)
+    xlabel, ylabel = (axis_label("xyz"[index], unit, place=place) for index in shown)
+    axes.set(xlabel=xlabel, ylabel=ylabel, aspect="equal")
+    axes.set_adjustable("datalim")
+    axes.grid(alpha=0.3)
+    figure.legend(loc="outside lower center", ncols=3, fontsize="small")
+    plain_ticks(axes)
+    return figure
+
+
+def _outline(grid: Grid) -> tuple[NDArray, str]:
+    """Return the corners of a grid, or all its points, [n, 3], and the style to draw them."""
+    if grid.points_m is not None:
+        return grid.points_m.reshape(-1, 3), "."
+    down, right = (count - 1 for count in grid.shape)
+    corners = np.array([[0, 0], [0, right], [down, right], [down, 0], [0, 0]])
+    return grid.origin_m + corners @ [grid.row_step_m, grid.column_step_m], "-"
 
 
 def inspection(found: Inspection, grid: Grid | None = None) -> Figure:
@@ -53,16 +229,17 @@ def inspection(found: Inspection, grid: Grid | None = None) -> Figure:
         validate.instance("grid", grid, Grid)
     figure = new_figure(13.0, 9.0)
     places = figure.add_gridspec(2, 3, height_ratios=(3, 2))
-    _draw_lines(figure.add_subplot(places[0, :]), found)
+    pings = Transmissions.of(found.lines.tx_m, found.lines.rx_m)
+    _draw_lines(figure.add_subplot(places[0, :]), found, pings)
     _draw_spectrum(figure.add_subplot(places[1, 0]), found)
-    _draw_steps(figure.add_subplot(places[1, 1]), found)
-    _draw_track(figure.add_subplot(places[1, 2]), found, grid)
+    _draw_steps(figure.add_subplot(places[1, 1]), found, pings)
+    _draw_track(figure.add_subplot(places[1, 2]), found, pings, grid)
     names = ", ".join(each.name.replace("_", " ") for each in found.findings)
     figure.suptitle(f"Found: {names}" if names else "No defects found", fontsize=11)
     return figure
 
 
-def _draw_lines(axes: Axes, found: Inspection) -> None:
+def _draw_lines(axes: Axes, found: Inspection, pings: Transmissions) -> None:
     lines = found.lines
     amplitude, first_m, last_m = _pooled(lines)
     scale, unit = length_unit(max(abs(first_m), abs(last_m)))
@@ -74,7 +251,6 @@ def _draw_lines(axes: Axes, found: Inspection) -> None:
         xlabel=f"Channel (of {found.pings} pings)", ylabel=f"Range ({unit})", aspect="auto",
         title="Levels of the lines",
     )  # fmt: skip
-    pings = Transmissions.of(lines.tx_m, lines.rx_m)
     marks = (
         ("still_pings", "tab:red", "taken standing still"),
         ("dead_channels", "tab:cyan", "dead"),
@@ -150,8 +326,8 @@ def _draw_spectrum(axes: Axes, found: Inspection) -> None:
     plain_ticks(axes)
 
 
-def _draw_steps(axes: Axes, found: Inspection) -> None:
-    steps_m = Transmissions.of(found.lines.tx_m, found.lines.rx_m).steps_m
+def _draw_steps(axes: Axes, found: Inspection, pings: Transmissions) -> None:
+    steps_m = pings.steps_m
     largest_m = float(steps_m.max(initial=0.0))
     scale, unit = length_unit(largest_m)
     number = np.arange(1, len(steps_m) + 1)
@@ -176,10 +352,9 @@ def _draw_steps(axes: Axes, found: Inspection) -> None:
     plain_ticks(axes)
 
 
-def _draw_track(axes: Axes, found: Inspection, grid: Grid | None) -> None:
-    pings = Transmissions.of(found.lines.tx_m, found.lines.rx_m)
+def _draw_track(axes: Axes, found: Inspection, pings: Transmissions, grid: Grid | None) -> None:
     shown = pings.centres_m[:, :2]
-    outline = None if grid is None else outline_of(grid)
+    outline = None if grid is None else _outline(grid)
     ends_m = [shown] if outline is None else [shown, outline[0][:, :2]]
     scale, unit = length_unit(max(float(np.abs(each).max()) for each in ends_m))
     axes.plot(*(scale * shown.T), ".-", markersize=3, linewidth=0.5, color="0.3", label="Pings")

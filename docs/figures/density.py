@@ -6,8 +6,8 @@ import numpy as np
 from drawing import plt, save
 
 import clsas
+from clsas.selftest import wreck
 from clsas.simulation import seabeds
-from clsas.trials import wreck
 
 scene = wreck.scene("wreck_two_banks")
 sonar, track = scene.need("sonar", "track")

@@ -36,7 +36,7 @@ FLOORS = (
     (
         (
             ("processing", "from a recording to an image\nsteps, records"),
-            ("trials", "is it right, is it fast?\noracle, selftest, benchmarks"),
+            ("selftest", "is it right, is it fast?\noracle, benchmarks, demo"),
             ("cli", "the command line\none file per group of commands"),
         ),
         ORANGE,

@@ -21,7 +21,7 @@ from exactly import prepare
 
 import clsas
 from clsas.engine.factorized.costs import Costs
-from clsas.trials.extremes import raw
+from clsas.selftest.extremes import raw
 
 POINTS = [(0.0, 42.5, 0), (0.08, 42.505, 0), (-0.07, 42.49, 0), (0.03, 42.512, 0)]
 SLOW_EXACT = Costs(pixel_ns=1e6, point_ns=1e6)  # so that small images are factorized

@@ -21,7 +21,7 @@ from peers.codes import Code, Method, installed, methods
 from peers.workers import worker
 from studies import tables
 
-from clsas.trials import reference
+from clsas.selftest import reference
 
 ERROR_PIXELS = 1000
 _LONG_S = 60.0  # an image that takes longer is formed only once

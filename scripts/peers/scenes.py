@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 import clsas
 from clsas.engine.signal.spectrum import measure_spectrum
-from clsas.trials import cases
-from clsas.trials.cases import Case
-from clsas.trials.dense_cases import DenseCase, helix
+from clsas.selftest import cases
+from clsas.selftest.cases import Case, DenseCase, helix
 
 Scene = Case | DenseCase
 PADDING = 64  # zeros at both ends of a line, which keep its echoes from wrapping around

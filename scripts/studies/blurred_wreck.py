@@ -1,8 +1,8 @@
 """The wreck, recorded from an unknown track, and its image after micronavigation.
 
-The scene is a part of that of `clsas.trials.wreck`: 18 m of the wreck's 25 m along the track, with
-its shadow, from 120 of 200 pings. The pings are half as far apart, so that four of the six phase
-centres overlap. According to the navigation the track is straight.
+The scene is a part of that of `clsas.selftest.wreck`: 18 m of the wreck's 25 m along the track,
+with its shadow, from 120 of 200 pings. The pings are half as far apart, so that four of the six
+phase centres overlap. According to the navigation the track is straight.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from clsas.files.formats import load
 from clsas.files.scene_files import parse_scene
 from clsas.measures.quality import measure_point
 from clsas.processing.chain import process
+from clsas.selftest import wreck
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.seabeds import wreck as seabed
 from clsas.simulation.simulator import simulate
-from clsas.trials import wreck
 
 POINT_M = (-6.0, 54.0, 0.0)
 """Position of a reflector on the sand in front of the wreck."""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import clsas
 from clsas.files.scene_files import built_in_scene
-from clsas.trials import wreck
+from clsas.selftest import wreck
 
 SIDE, PATCHES = 20_000, "5x5"
 PLACE = "[georeference]\nlatitude_deg = 59.4245\nlongitude_deg = 10.4912\nheading_deg = 214.0\n"

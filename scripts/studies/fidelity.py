@@ -11,7 +11,7 @@ from scipy.ndimage import uniform_filter
 
 import clsas
 from clsas.measures.limits_heights import phase_per_height
-from clsas.trials import wreck
+from clsas.selftest import wreck
 
 COLUMNS = (
     "scene",

@@ -16,7 +16,7 @@ from clsas.engine.factorized.sampled import SampledRoots, SampledScene
 from clsas.engine.forming import form_exactly
 from clsas.engine.imaging import factorize, plan
 from clsas.engine.scene import Scene
-from clsas.trials import cases
+from clsas.selftest import cases
 from studies.tables import TOLERANCES_DB
 
 COLUMNS = ("case", "dB", "subimages", "predicted s", "measured s: median (min to max)", "ratio")

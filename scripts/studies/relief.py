@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from clsas.trials import bench, cases
+from clsas.selftest import bench, cases
 
 COLUMNS = [
     "pixels", "image s", "sweep s", "refinement s", "heights over image", "valid %",
@@ -12,7 +12,7 @@ Row = list[object]
 
 
 def rows(device: str) -> list[Row]:
-    """Return times and errors of all cases of heights; see `clsas.trials.bench.run_heights`."""
+    """Return times and errors of all cases of heights; see `clsas.selftest.bench.run_heights`."""
     return [_row(bench.run_heights(case, device=device)) for case in cases.HEIGHTS_CASES]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from clsas.trials.cases import FFBP_2K, Case
+from clsas.selftest.cases import FFBP_2K, Case
 
 
 def scaled(size: int) -> Case:

@@ -27,7 +27,7 @@ from clsas.engine.data.validate import ClsasWarning
 from clsas.engine.device.device import Device
 from clsas.engine.factorized.costs import Costs
 from clsas.engine.imaging import backproject, factorize, plan
-from clsas.trials import cases
+from clsas.selftest import cases
 from studies.scaling import scaled
 
 ROOMS = ("engine.factorized", "engine.exact")

@@ -24,8 +24,8 @@ from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.forming import form
 from clsas.engine.scene import Scene
 from clsas.measures.shadows import dark_level_db
+from clsas.selftest import bench, cases, wreck
 from clsas.simulation import seabeds
-from clsas.trials import bench, cases, wreck
 from studies.scaling import scaled
 
 TOLERANCES_DB = {

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from clsas.engine.data.image import Image
 from clsas.engine.device.device import Device
 from clsas.engine.imaging import backproject, factorize, plan
-from clsas.trials.cases import FFBP_2K, Case
+from clsas.selftest.cases import FFBP_2K, Case
 from studies.sensitivity import Constant
 
 COLUMNS = ("constant", "set to", "exact, s", "over usual", "factorized, s", "over usual")

@@ -1,6 +1,6 @@
 """Scene of THESIS chapter 6 (Odegaard 2004), and functions that its figures share.
 
-A wreck beside a track of 80 m, simulated in place of the thesis's recording (clsas.trials.wreck).
+A wreck beside a track of 80 m, simulated in place of the thesis's recording (clsas.selftest.wreck).
 Images show the whole scene or, with pixels of the same size, the part around the wreck.
 """
 
@@ -23,8 +23,8 @@ import clsas
 from clsas.engine.data.visibility import BeamTrack, Boxes, sines
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.factorized.virtual_channels import stage_errors_m
+from clsas.selftest import wreck
 from clsas.simulation import seabeds
-from clsas.trials import wreck
 
 PIXELS = 1024
 NEAR_M = 53.0  # near edge, across the track, of the part around the wreck

@@ -14,7 +14,7 @@ import chapter6
 import numpy as np
 
 import clsas
-from clsas.trials import wreck
+from clsas.selftest import wreck
 
 THESIS = {
     "42": (8, "λ/13"),

@@ -28,7 +28,7 @@ from clsas.engine.factorized import measured_costs as costs
 from clsas.engine.factorized.measured_costs import Scale
 from clsas.files.scene_files import built_in_scene, read_scene
 from clsas.measures.resolution import expected_resolution_m
-from clsas.trials import cases, demo
+from clsas.selftest import cases, demo
 
 pytest.importorskip("matplotlib")
 

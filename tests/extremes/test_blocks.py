@@ -10,7 +10,7 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.image_error import relative_error_db
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.imaging import backproject
-from clsas.trials.reference import ideal
+from clsas.selftest.reference import ideal
 
 
 @pytest.fixture

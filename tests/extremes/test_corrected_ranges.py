@@ -13,7 +13,7 @@ from clsas import Grid, SoundSpeed
 from clsas.engine.signal.interpolation import Readout
 from clsas.engine.water.ray_delays import delays_s
 from clsas.engine.water.refraction import homogeneous
-from clsas.trials import oracle
+from clsas.selftest import oracle
 
 THERMOCLINE = SoundSpeed([0, 14, 17, 60], [1505, 1505, 1495, 1495.5])
 

@@ -17,7 +17,7 @@ from clsas import Grid, RangeLines, SoundSpeed
 from clsas.engine.data.decibels import in_db
 from clsas.engine.data.simplify import REFRACTION
 from clsas.engine.water.refraction import homogeneous
-from clsas.trials import oracle
+from clsas.selftest import oracle
 
 NOMINAL = 1500.0  # m/s, by which times become ranges
 CHANNELS, POINTS, PIXELS = 120, 150, (24, 24)

@@ -29,8 +29,8 @@ from clsas.engine.data.image_error import relative_error_db
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ClsasWarning
 from clsas.engine.imaging import backproject
-from clsas.trials import oracle
-from clsas.trials.reference import sampled_error_db
+from clsas.selftest import oracle
+from clsas.selftest.reference import sampled_error_db
 
 FAR = np.array([1e7, -1e7, 1e7])
 

@@ -10,8 +10,8 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.factorized.costs import Costs
 from clsas.engine.imaging import factorize, plan
 from clsas.mosaics.mosaic import mosaic
-from clsas.trials import extremes
-from clsas.trials.extremes import (
+from clsas.selftest import extremes
+from clsas.selftest.extremes import (
     along_x,
     apart,
     array,
@@ -28,7 +28,7 @@ from clsas.trials.extremes import (
     uneven,
     widest,
 )
-from clsas.trials.oracle import Band
+from clsas.selftest.oracle import Band
 
 
 def line_in_the_spectrum(centre, width):

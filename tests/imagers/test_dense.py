@@ -21,8 +21,8 @@ from clsas.engine.factorized.plan import Plan
 from clsas.engine.factorized.tree import geometry_of, sector_of
 from clsas.engine.forming import scene_of_plan
 from clsas.engine.imaging import backproject, factorize, plan
-from clsas.trials import reference
-from clsas.trials.selftest import driven
+from clsas.selftest import reference
+from clsas.selftest.accuracy import driven
 
 SHAPES = {"passes": "strips"}  # sheets otherwise
 KINDS = ("hills", "volume", "bistatic", "moving")

@@ -10,8 +10,8 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 import clsas
 from clsas.interferometry.coherence import Window
+from clsas.selftest import wreck
 from clsas.simulation import seabeds
-from clsas.trials import wreck
 
 PINGS = slice(14, 56)  # those that see the grid through the beam
 GRID = clsas.Grid.plane((-9.0, 3.0, 241), (52.0, 66.0, 701))

@@ -20,7 +20,7 @@ from clsas.engine.water.refraction import homogeneous
 from clsas.files import scene_files as config
 from clsas.measures.assessment import assess, survey_lines
 from clsas.measures.effects import BEAM, ENDS, KEYS, PATTERN, SINGLE, SWAY, track_errors_m
-from clsas.trials.reference import ideal
+from clsas.selftest.reference import ideal
 
 CHANNELS, CARRIER, STEP = 96, 300e3, 0.012
 APERTURE = along_x(CHANNELS, 0.02)

@@ -8,7 +8,7 @@ from families import draw
 from judging import SLOW
 
 import clsas
-from clsas.trials import extremes
+from clsas.selftest import extremes
 
 ALL = 10**6  # more pixels than any image here has
 

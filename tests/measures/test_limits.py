@@ -13,7 +13,7 @@ from clsas.engine.data.system import Pulse, Sonar, line_array
 from clsas.engine.data.track import Pointing, Track
 from clsas.files.scene_files import built_in_scene, parse_scene
 from clsas.measures.limits_result import LABELS, Limit
-from clsas.trials.reference import ideal
+from clsas.selftest.reference import ideal
 
 WIDE = Sonar.thesis_wide_beam()
 TRACK = Track.straight([-2.376, 0, 0], [2, 0, 0], 10, 0.264)

@@ -8,7 +8,7 @@ from cases import along_x, lines_over
 
 import clsas
 from clsas import Grid, SoundSpeed
-from clsas.trials.reference import ideal
+from clsas.selftest.reference import ideal
 
 PROFILE = SoundSpeed([0, 12, 15, 60], [1505, 1504, 1494, 1490])
 

@@ -9,7 +9,7 @@ from matplotlib.colors import Normalize
 import clsas
 from clsas import plot
 from clsas.plot import interferometry
-from clsas.plot.colours import colour_map
+from clsas.plot.canvas import colour_map
 
 GRID = clsas.Grid.plane((-1, 1, 81), (40, 42, 101))
 

@@ -112,9 +112,14 @@ def test_images_before_and_after_have_one_scale():
     titles = [axes.get_title() for axes in figure.axes[:2]]
     assert titles == ["Before: peak −20.0 dB", "After: peak 0.0 dB"]
     assert {axes.images[0].get_clim() for axes in figure.axes[:2]} == {(-30.0, 0.0)}
+    figure = clsas.plot.before_and_after(before, after, percentiles=(0, 100))
+    assert {axes.images[0].get_clim() for axes in figure.axes[:2]} == {(-20.0, 0.0)}
     with pytest.raises(ValueError, match="after must have the pixels of `before`"):
         clsas.plot.before_and_after(before, Image(np.ones((2, 2), complex), grid.window(
             slice(2), slice(2))))  # fmt: skip
+    points = Image(np.ones(4, complex), clsas.Grid.points(np.ones((4, 3))))
+    with pytest.raises(ValueError, match="after must be on a plane or height map to be drawn"):
+        clsas.plot.before_and_after(before, points)
 
 
 @pytest.mark.parametrize("y", [(10, 50, 200), (10, 210, 200), (10, 14, 20), (10, 10.4, 2)])

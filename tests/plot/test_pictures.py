@@ -17,7 +17,7 @@ from clsas import plot
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.measures.tradeoff_result import Row, Tradeoff
-from clsas.plot.colours import colour_map
+from clsas.plot.canvas import colour_map
 
 matplotlib = pytest.importorskip("matplotlib")
 
@@ -380,6 +380,15 @@ def test_views_of_a_volume_have_one_scale_and_are_aligned():
     above, beside, front = (axes.get_window_extent() for axes in figure.axes[:3])
     np.testing.assert_allclose([above.x0, above.x1], [front.x0, front.x1], atol=0.5)
     np.testing.assert_allclose([above.y0, above.y1], [beside.y0, beside.y1], atol=0.5)
+
+
+@pytest.mark.parametrize("options", [{"dynamic_range_db": 90}, {"percentiles": (0, 100)}])
+def test_views_of_a_volume_show_levels_below_60_db(options):
+    volume = Image(np.where(VOLUME.pixels == 0.01, 1e-4, VOLUME.pixels), VOLUME.grid)
+    for axes in plot.volume(volume, **options).axes[:3]:
+        (drawn,) = axes.get_images()
+        assert drawn.get_array().min() == pytest.approx(-80, abs=1e-3)
+        assert drawn.get_clim()[0] <= -80
 
 
 def test_slices_of_a_volume_go_through_a_point():

@@ -8,8 +8,7 @@ import clsas
 from clsas import plot
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
-from clsas.plot.levels import amplitude_at
-from clsas.plot.windows import window_around
+from clsas.plot.images import amplitude_at, window_around
 
 pytest.importorskip("matplotlib")
 
@@ -77,7 +76,7 @@ def test_strong_points_lie_over_weak_ones():
 
 
 def test_of_very_many_points_the_strongest_are_drawn(monkeypatch):
-    monkeypatch.setattr("clsas.plot.scattered_points._MOST_POINTS", 3)
+    monkeypatch.setattr("clsas.plot.volumes._MOST_POINTS", 3)
     grid = Grid.points(np.arange(30.0).reshape(10, 3))
     image = Image(np.arange(1, 11).astype(np.complex64), grid)
     (drawn,) = plot.points(image).axes[0].collections

@@ -4,7 +4,7 @@ import pytest
 from studies import blurred_wreck
 
 from clsas.engine.data.validate import ClsasWarning
-from clsas.trials import wreck
+from clsas.selftest import wreck
 
 pytest.importorskip("matplotlib")
 

@@ -3,13 +3,12 @@
 import pytest
 from studies import relief
 
-from clsas.trials import cases, dunes
+from clsas.selftest import cases
 
 
 @pytest.mark.watches("scripts/studies", "scripts/bench")
 def test_heights_err_as_much_as_they_say(monkeypatch):
-    monkeypatch.setattr(cases, "HEIGHTS_CASES", {"small": 128})
-    monkeypatch.setattr(dunes, "SEARCH_M", (-1.0, 1.0))
+    monkeypatch.setattr(cases, "HEIGHTS_CASES", {"small": cases.Dunes(128, (-1.0, 1.0))})
     (row,) = relief.rows("pocl")
     found = dict(zip(relief.COLUMNS, row, strict=True))
     assert found["pixels"] == "128 x 128"

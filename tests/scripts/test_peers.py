@@ -10,7 +10,7 @@ from peers import codes, compare, focus, scenes, workers
 from studies import focusing
 
 import clsas
-from clsas.trials import cases, reference
+from clsas.selftest import cases, reference
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 

@@ -7,8 +7,8 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.device.device import open_device
 from clsas.engine.factorized import measured_costs as costs
 from clsas.engine.imaging import plan
-from clsas.trials import cases
-from clsas.trials.cases import Case
+from clsas.selftest import cases
+from clsas.selftest.cases import Case
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ from cases import along_x
 import clsas
 from clsas import PointTargets, Pulse, Sonar, SoundSpeed, Track, simulate, simulate_lines
 from clsas.engine.data.track import Channels
+from clsas.selftest import oracle
 from clsas.simulation.refraction import BlockRays
-from clsas.trials import oracle
 
 PROFILE = SoundSpeed([0, 12, 15, 60], [1505, 1504, 1494, 1490])
 TRACK = along_x(9, 1.0, z=-6.0)

@@ -31,10 +31,10 @@ from clsas.engine.data.visibility import BeamTrack, sines
 from clsas.engine.exact.layout import Groups, Tiles
 from clsas.engine.forming import form_exactly
 from clsas.engine.imaging import backproject
+from clsas.selftest import reference
+from clsas.selftest.reference import ideal
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
-from clsas.trials import reference
-from clsas.trials.reference import ideal
 
 FINE = {"taps": 8, "upsampling": 4}
 X = (1.0, 0, 0)

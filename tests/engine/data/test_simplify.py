@@ -19,7 +19,7 @@ from clsas.engine.data.simplify import APART, MOTION, RELIEF, SHARE, leave_out, 
 from clsas.engine.data.visibility import sines
 from clsas.engine.factorized.plan import Plan
 from clsas.engine.imaging import backproject
-from clsas.trials.reference import ideal
+from clsas.selftest.reference import ideal
 
 LEAST_PIXELS = 1 << 15
 CHANNELS, CARRIER, STEP = 96, 300e3, 0.012

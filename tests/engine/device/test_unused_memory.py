@@ -12,8 +12,8 @@ from tiers import thinned
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.device.device import Device
 from clsas.engine.imaging import factorize, plan
-from clsas.trials import extremes, selftest
-from clsas.trials.extremes import along_x
+from clsas.selftest import accuracy, extremes
+from clsas.selftest.extremes import along_x
 
 BEAM = BeamWindow(12, "hann", along=[1, 0, 0], normalise=True)
 SCENES = {
@@ -54,9 +54,9 @@ def poison(monkeypatch):
 def test_what_unused_memory_holds_does_not_matter(name, request_, device, poison):
     imager, asked_db = request_
     known = made(name)
-    wanted = selftest.form(imager, known, asked_db, device).pixels
+    wanted = accuracy.form(imager, known, asked_db, device).pixels
     filled = poison()
-    found = selftest.form(imager, known, asked_db, device).pixels
+    found = accuracy.form(imager, known, asked_db, device).pixels
     assert filled
     assert known.error_db(found) <= asked_db
     assert found.tobytes() == wanted.tobytes()

@@ -7,7 +7,7 @@ from cases import noise
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, band_wavelength_m
 from clsas.engine.signal.spectrum import measure_spectrum
-from clsas.trials.reference import ideal
+from clsas.selftest.reference import ideal
 
 GRID = Grid.plane((-0.1, 0.1, 3), (15, 15.2, 3))
 

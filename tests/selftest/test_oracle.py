@@ -8,8 +8,8 @@ import pytest
 from bent import travel_times
 from rays import rays
 
-from clsas.trials import oracle
-from clsas.trials.oracle import Band, Echo
+from clsas.selftest import oracle
+from clsas.selftest.oracle import Band, Echo
 
 
 def test_it_imports_nothing_but_numpy():

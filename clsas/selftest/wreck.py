@@ -99,10 +99,9 @@ class Shadow:
                 dark[:, column] &= ~lit
                 light[:, column] &= lit
         sand = height_m < _FLAT_M
-        near = np.zeros_like(sand)
         rows, columns = np.nonzero(dark & sand)
         along_m, across_m = _SURROUNDINGS_M
-        near[:] = np.abs(ground[..., 0] - x_m[columns].mean()) < along_m + np.ptp(x_m[columns]) / 2
+        near = np.abs(ground[..., 0] - x_m[columns].mean()) < along_m + np.ptp(x_m[columns]) / 2
         near &= np.abs(ground[..., 1] - y_m[rows].mean()) < across_m
         chosen = sand & near & (dark | light)
         return ground[chosen], dark[chosen], light[chosen]

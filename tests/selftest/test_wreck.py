@@ -7,7 +7,7 @@ import clsas
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
-from clsas.trials import bench, cases, wreck
+from clsas.selftest import bench, cases, wreck
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_lines_are_simulated_once(monkeypatch, tmp_path):
     assert asked == [1, 1]
 
 
-@pytest.mark.watches("clsas/trials")
+@pytest.mark.watches("clsas/selftest")
 def test_benchmark(monkeypatch):
     monkeypatch.setattr(wreck, "lines", lambda progress=None: few_lines())
     monkeypatch.setitem(cases.MOSAIC_CASES, "small", (128, BeamWindow(5.0, "hann")))

@@ -8,24 +8,24 @@ from click.testing import CliRunner
 
 from clsas.cli import main
 from clsas.engine.device.device import DeviceError
-from clsas.trials import selftest
+from clsas.selftest import accuracy
 
 
 @pytest.fixture
 def small(monkeypatch):
     """Run one exact and one factorized image, without variants of the device."""
-    monkeypatch.setattr(selftest, "other_builds", lambda info: [])
+    monkeypatch.setattr(accuracy, "other_builds", lambda info: [])
     monkeypatch.setattr(
-        selftest, "_CHECKS", (("flat", "exact", -60.0), ("flat", "factorized", -40.0))
+        accuracy, "_CHECKS", (("flat", "exact", -60.0), ("flat", "factorized", -40.0))
     )
 
 
 @pytest.mark.exhaustive
 def test_every_image_is_within_its_bound(platform, monkeypatch):
     """With the default vectors and with one lane; other tests cover the other builds."""
-    monkeypatch.setattr(selftest, "_BUILDS", ((1, False),))
+    monkeypatch.setattr(accuracy, "_BUILDS", ((1, False),))
     told = []
-    results = selftest.run(platform, progress=lambda *done: told.append(done))
+    results = accuracy.run(platform, progress=lambda *done: told.append(done))
     assert [result for result in results if not result.passed] == []
     assert told == [(done, len(results)) for done in range(len(results) + 1)]
     for imager in ("exact", "factorized", "half precision", "mosaic", "wavenumber"):
@@ -36,10 +36,10 @@ def test_every_image_is_within_its_bound(platform, monkeypatch):
 def test_other_builds_for_a_device_are_tested_too(platform, monkeypatch):
     """One lane forms every image whose imager runs kernels, other widths form two."""
     checks = (("bistatic", "exact", -60.0), ("flat", "wavenumber", None))
-    monkeypatch.setattr(selftest, "_CHECKS", checks)
-    monkeypatch.setattr(selftest, "other_builds", lambda info: [(1, False), (4, False)])
-    device = selftest.driven(platform, 8, False)
-    results = selftest.run(device)
+    monkeypatch.setattr(accuracy, "_CHECKS", checks)
+    monkeypatch.setattr(accuracy, "other_builds", lambda info: [(1, False), (4, False)])
+    device = accuracy.driven(platform, 8, False)
+    results = accuracy.run(device)
     assert [result.case for result in results] == [
         "bistatic, exact", "flat, wavenumber", "bistatic, exact, width 1", "flat, exact, width 4",
         "flat, factorized, width 4",
@@ -51,17 +51,17 @@ def test_other_builds_for_a_device_are_tested_too(platform, monkeypatch):
 @pytest.mark.filterwarnings("ignore:the band of the lines wraps")  # sampled far below its carrier
 def test_plans_of_the_scenes_are_factorized(platform):
     """Otherwise the factorized imager would not be tested."""
-    for scene, imager, asked_db in selftest._CHECKS:
+    for scene, imager, asked_db in accuracy._CHECKS:
         if imager == "factorized":
-            known = selftest._SCENES[scene]()
-            assert not selftest.divided_plan(known, asked_db, platform).is_exact, scene
+            known = accuracy._SCENES[scene]()
+            assert not accuracy.divided_plan(known, asked_db, platform).is_exact, scene
 
 
 def test_a_result_that_is_no_number_has_not_passed():
-    assert not selftest.Result("", -60, math.nan, -60).passed
-    assert not selftest.Result("", -60, -59.9, -60).passed
-    assert not selftest.Result("", -60, None, -60, "RuntimeError: no").passed
-    assert selftest.Result("", None, -60.0, -60).passed
+    assert not accuracy.Result("", -60, math.nan, -60).passed
+    assert not accuracy.Result("", -60, -59.9, -60).passed
+    assert not accuracy.Result("", -60, None, -60, "RuntimeError: no").passed
+    assert accuracy.Result("", None, -60.0, -60).passed
 
 
 def test_the_command_prints_a_table(small):
@@ -73,7 +73,7 @@ def test_the_command_prints_a_table(small):
 
 @pytest.mark.slow
 def test_a_miss_is_told_and_is_exit_code_1(small, monkeypatch):
-    monkeypatch.setattr(selftest, "IMAGERS", selftest.IMAGERS | {"exact": _doubled})
+    monkeypatch.setattr(accuracy, "form", _doubled)
     result = CliRunner().invoke(main, ["selftest", "--json"])
     assert result.exit_code == 1
     found = json.loads(result.stdout)
@@ -83,7 +83,7 @@ def test_a_miss_is_told_and_is_exit_code_1(small, monkeypatch):
 
 
 def test_an_image_that_cannot_be_formed_is_told_and_the_others_follow(small, monkeypatch):
-    monkeypatch.setattr(selftest, "IMAGERS", selftest.IMAGERS | {"exact": _broken})
+    monkeypatch.setattr(accuracy, "form", _broken)
     result = CliRunner().invoke(main, ["selftest"])
     assert result.exit_code == 1
     (line,) = (line for line in result.stdout.splitlines() if "flat, exact" in line)
@@ -97,10 +97,15 @@ def test_an_image_that_cannot_be_formed_is_told_and_the_others_follow(small, mon
     assert found["results"][0]["failure"] == "DeviceError: out of lanes"
 
 
-def _broken(known, asked_db, device):
-    raise DeviceError("out of lanes")
+FORM = accuracy.form
 
 
-def _doubled(known, asked_db, device):
-    image = selftest._exact(known, asked_db, device)
-    return type(image)(2 * image.pixels, image.grid)
+def _broken(imager, *given):
+    if imager == "exact":
+        raise DeviceError("out of lanes")
+    return FORM(imager, *given)
+
+
+def _doubled(imager, *given):
+    image = FORM(imager, *given)
+    return type(image)((2 if imager == "exact" else 1) * image.pixels, image.grid)

@@ -1,7 +1,7 @@
 """Scenes with a known ideal image, at the extremes of what clsas images.
 
-Lines and ideal images come from `clsas.trials.oracle`. The library contributes only the containers
-`RangeLines`, `Grid` and `BeamWindow`.
+Lines and ideal images come from `clsas.selftest.oracle`. The library contributes only the
+containers `RangeLines`, `Grid` and `BeamWindow`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError
-from clsas.trials import oracle
-from clsas.trials.oracle import Band, Echo
+from clsas.selftest import oracle
+from clsas.selftest.oracle import Band, Echo
 
 LIGHT_M_S = 299_792_458.0
 _FLAT = 0.94  # share of the bandwidth over which the spectrum of a pulse is flat
@@ -145,8 +145,16 @@ def scene(
     rng = np.random.default_rng(seed)
     tx, rx = (_quantised(tx_m if each is None else each) for each in (tx_m, rx_m))
     velocity = 0.0 if rx_velocity_m_s is None else rx_velocity_m_s
+
+    # The pixels. The corner is the first one without relief.
     height_m = relief_m * np.random.default_rng(seed).normal(size=shape)
-    corner, pixels = _pixels(centre_m, pixel_m, height_m)
+    rows, columns = shape
+    x_m = pixel_m[0] * (np.arange(columns) - (columns - 1) / 2)
+    y_m = pixel_m[1] * (np.arange(rows) - (rows - 1) / 2)
+    corner = _quantised(np.add(centre_m, [x_m[0], y_m[0], 0]))
+    plane = np.broadcast_arrays(x_m - x_m[0], (y_m - y_m[0])[:, None], height_m)
+    pixels = corner + np.stack(plane, axis=-1)
+
     extent_m = pixels[-1, -1, :2] - corner[:2]
     # No points near the border, so that their main lobes are in the image.
     low, high = np.array([within, (0.1, 0.9), (0.1, 0.9)]).T
@@ -164,11 +172,19 @@ def scene(
     levels = np.array([offset, tail, noise])
     if levels.any():  # disturbances extend over the whole line, and fade like a Gaussian
         fade_m = max(fade_m, np.ptp(of_pixels_m, axis=1).max())
-    first_m, length = _extent(np.hstack([at_m, of_pixels_m]), fade_m, step_m)
+
+    # Lines cover the ranges of points and pixels, and a margin. They have one first range, unless
+    # they would then be mostly zeros.
+    covered_m = np.hstack([at_m, of_pixels_m])
+    nearest_m, farthest_m = covered_m.min(axis=1), covered_m.max(axis=1)
+    first_m = nearest_m - fade_m
+    length = int(np.ceil(((farthest_m - nearest_m).max() + 2 * fade_m) / step_m)) + 1
     if own_starts:
         first_m = first_m - rng.uniform(0, step_m, len(tx))
-    else:
-        first_m, length = _from_one_start(first_m, length, step_m)
+    elif np.ptp(first_m) < length * step_m:
+        length += int(np.ceil(np.ptp(first_m) / step_m))
+        first_m = np.full(len(first_m), first_m.min())
+
     of_channels = np.broadcast_to(np.asarray(gains, np.float64), len(tx))
     echoes = [Echo(at_m, of_channels[:, None] * amplitude, bands)]
     mixed = partial(
@@ -190,37 +206,64 @@ def scene(
     return Known(lines, grid.with_height(height_m) if relief_m else grid, ideal, beam)
 
 
-def _pixels(
-    centre_m: Sequence[float], pixel_m: tuple[float, float], height_m: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the position of the first pixel without relief, and those of all pixels, [..., 3]."""
-    rows, columns = height_m.shape
-    x_m, y_m = (
-        step * (np.arange(count) - (count - 1) / 2)
-        for step, count in zip(pixel_m, (columns, rows), strict=True)
-    )
-    corner = _quantised(np.add(centre_m, [x_m[0], y_m[0], 0]))
-    plane = np.broadcast_arrays(x_m - x_m[0], (y_m - y_m[0])[:, None], height_m)
-    return corner, corner + np.stack(plane, axis=-1)
+def _quantised(positions_m: ArrayLike) -> NDArray[np.float64]:
+    """Return rounded positions, to which a distant origin can be added exactly."""
+    return np.round(np.asarray(positions_m, np.float64) / _QUANTUM_M) * _QUANTUM_M
 
 
-def _extent(
-    range_m: NDArray[np.float64], fade_m: float, step_m: float
-) -> tuple[NDArray[np.float64], int]:
-    """Return first ranges and the length of lines that cover ranges [channels, n] and a margin."""
-    nearest, farthest = range_m.min(axis=1), range_m.max(axis=1)
-    length = int(np.ceil(((farthest - nearest).max() + 2 * fade_m) / step_m)) + 1
-    return nearest - fade_m, length
+def _disturbances(
+    rng: np.random.Generator,
+    first_m: NDArray[np.float64],
+    step_m: float,
+    length: int,
+    levels: NDArray[np.float64],
+    centre: float,
+) -> list[Echo]:
+    """Return echoes that represent a constant, a tail below the band, and noise.
+
+    `levels` are the rms values of the three over a line.
+    """
+    offset, tail, noise = levels
+    channels = len(first_m)
+    middle_m = (first_m + (length - 1) / 2 * step_m)[:, None]
+    edge = _FADED / (np.pi * length * step_m)  # envelopes fade at both ends of the line
+    # Rms value of the envelope over the line.
+    fullness = np.sqrt(np.sqrt(np.pi) / (2 * _FADED))
+    found = []
+    if offset:
+        found.append(Echo(middle_m, offset / fullness, [Band(0.0, 0.0, edge)]))
+    floor = 0.45 / step_m
+    for level, low, high in (
+        (tail, 0.0, 0.8 * centre),
+        (noise, centre - floor, centre + floor),
+    ):
+        for tone in range(_TONES if level else 0):
+            position = (tone + rng.uniform(0, 1, (channels, 1))) / _TONES
+            value = rng.normal(size=(channels, 1, 2)) @ [1, 1j] / np.sqrt(2 * _TONES)
+            found.append(
+                Echo(
+                    middle_m,
+                    level / fullness * value,
+                    [Band(low + (high - low) * position, 0.0, edge)],
+                )
+            )
+    return found
 
 
-def _from_one_start(
-    first_m: NDArray[np.float64], length: int, step_m: float
-) -> tuple[NDArray[np.float64], int]:
-    """Return a common first range for all lines, unless they would then be mostly zeros."""
-    spread_m = np.ptp(first_m)
-    if spread_m >= length * step_m:
-        return first_m, length
-    return np.full(len(first_m), first_m.min()), length + int(np.ceil(spread_m / step_m))
+def _weights(
+    beam: BeamWindow, pixels_m: NDArray[np.float64], centres_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the weights of a beam from their definition, [channels, pixels]."""
+    if beam.along is None:
+        raise ArgumentError("beam", "have the direction `along`")
+    towards = pixels_m.reshape(1, -1, 3) - centres_m[:, None]
+    along = np.broadcast_to(beam.along, centres_m.shape)
+    sine = np.einsum("cpi,ci->cp", towards, along) / np.linalg.norm(towards, axis=-1)
+    u = (np.degrees(np.arcsin(sine)) - beam.squint_deg) / beam.width_deg
+    weights = np.where(np.abs(u) < 0.5, np.cos(np.pi * u) ** 2 if beam.shape == "hann" else 1.0, 0)
+    if beam.normalise:
+        weights = weights * len(centres_m) / np.maximum(weights.sum(axis=0), 0.01)
+    return weights
 
 
 def ultrasonic(channels: int = 160, track: NDArray | None = None, **options: Any) -> Known:
@@ -354,63 +397,3 @@ def steps(centre: float, width: float) -> list[Band]:
         Band(centre + shift * width, 0.28 * width, 0.01 * width, 10 ** (level_db / 20))
         for shift, level_db in ((-0.3, 0), (0, -15), (0.3, -30))
     ]
-
-
-def _quantised(positions_m: ArrayLike) -> NDArray[np.float64]:
-    """Return rounded positions, to which a distant origin can be added exactly."""
-    return np.round(np.asarray(positions_m, np.float64) / _QUANTUM_M) * _QUANTUM_M
-
-
-def _disturbances(
-    rng: np.random.Generator,
-    first_m: NDArray[np.float64],
-    step_m: float,
-    length: int,
-    levels: NDArray[np.float64],
-    centre: float,
-) -> list[Echo]:
-    """Return echoes that represent a constant, a tail below the band, and noise.
-
-    `levels` are the rms values of the three over a line.
-    """
-    offset, tail, noise = levels
-    channels = len(first_m)
-    middle_m = (first_m + (length - 1) / 2 * step_m)[:, None]
-    edge = _FADED / (np.pi * length * step_m)  # envelopes fade at both ends of the line
-    # Rms value of the envelope over the line.
-    fullness = np.sqrt(np.sqrt(np.pi) / (2 * _FADED))
-    found = []
-    if offset:
-        found.append(Echo(middle_m, offset / fullness, [Band(0.0, 0.0, edge)]))
-    floor = 0.45 / step_m
-    for level, low, high in (
-        (tail, 0.0, 0.8 * centre),
-        (noise, centre - floor, centre + floor),
-    ):
-        for tone in range(_TONES if level else 0):
-            position = (tone + rng.uniform(0, 1, (channels, 1))) / _TONES
-            value = rng.normal(size=(channels, 1, 2)) @ [1, 1j] / np.sqrt(2 * _TONES)
-            found.append(
-                Echo(
-                    middle_m,
-                    level / fullness * value,
-                    [Band(low + (high - low) * position, 0.0, edge)],
-                )
-            )
-    return found
-
-
-def _weights(
-    beam: BeamWindow, pixels_m: NDArray[np.float64], centres_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the weights of a beam from their definition, [channels, pixels]."""
-    if beam.along is None:
-        raise ArgumentError("beam", "have the direction `along`")
-    towards = pixels_m.reshape(1, -1, 3) - centres_m[:, None]
-    along = np.broadcast_to(beam.along, centres_m.shape)
-    sine = np.einsum("cpi,ci->cp", towards, along) / np.linalg.norm(towards, axis=-1)
-    u = (np.degrees(np.arcsin(sine)) - beam.squint_deg) / beam.width_deg
-    weights = np.where(np.abs(u) < 0.5, np.cos(np.pi * u) ** 2 if beam.shape == "hann" else 1.0, 0)
-    if beam.normalise:
-        weights = weights * len(centres_m) / np.maximum(weights.sum(axis=0), 0.01)
-    return weights

@@ -11,8 +11,8 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.image_error import relative_error_db
 from clsas.engine.data.lines import RangeLines
-from clsas.trials import reference
-from clsas.trials.reference import ideal, sampled_error_db
+from clsas.selftest import reference
+from clsas.selftest.reference import ideal, sampled_error_db
 
 TRACK = along_x(7, 0.3)
 RX = TRACK + np.array([0.1, -0.05, 0.2])

@@ -20,8 +20,8 @@ from clsas.engine.factorized.costs import Costs
 from clsas.engine.factorized.plan import Plan
 from clsas.engine.imaging import backproject, factorize, plan
 from clsas.mosaics.mosaic import mosaic
-from clsas.trials import extremes
-from clsas.trials.extremes import Known, along_x
+from clsas.selftest import extremes
+from clsas.selftest.extremes import Known, along_x
 
 _BUILDS = ((1, False), (4, False), (8, False), (8, True), (16, False))  # width, permuted lookup
 _WIDEST = 16
@@ -96,11 +96,11 @@ def run(
     own = open_device(device)
     checks = [(own, "", *check) for check in _CHECKS]
     of_kernels = [check for check in _CHECKS if check[1] != "wavenumber"]
-    checks += [
-        (other, f", {name}", *check)
-        for name, other in variants(own).items()
-        for check in (of_kernels if other.info.width == 1 else _OF_VARIANTS)
-    ]
+    for width, permute in other_builds(own.info):
+        other, name = driven(own, width, permute), f", width {width}"
+        if permute:
+            name += ", permuted"
+        checks += [(other, name, *check) for check in (of_kernels if width == 1 else _OF_VARIANTS)]
     made = functools.cache(lambda name: _SCENES[name]())
     results = []
     for done, (used, variant, scene, imager, asked_db) in enumerate(checks):
@@ -110,7 +110,10 @@ def run(
         measured_db, failure = None, ""
         try:
             known = made(scene)
-            measured_db = known.error_db(_quietly(imager, known, bound_db, used).pixels)
+            with warnings.catch_warnings():  # only the measured error matters
+                warnings.simplefilter("ignore", validate.ClsasWarning)
+                image = form(imager, known, bound_db, used)
+            measured_db = known.error_db(image.pixels)
         except Exception as error:  # a driver may raise anything; the other images still count
             failure = f"{type(error).__name__}: {error}"
         case = f"{scene}, {imager}{variant}"
@@ -120,16 +123,35 @@ def run(
     return tuple(results)
 
 
-def _quietly(imager: str, known: Known, asked_db: float, device: Device) -> Image:
-    """Return an image without warning, since only the measured error matters."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", validate.ClsasWarning)
-        return form(imager, known, asked_db, device)
-
-
 def form(imager: str, known: Known, asked_db: float, device: Device) -> Image:
-    """Return the image of a scene that one of `IMAGERS` forms."""
-    return IMAGERS[imager](known, asked_db, device)
+    """Return the image of a scene that an imager forms, one of those that `run` tests."""
+    lines, grid, beam = known.lines, known.grid, known.beam
+    if imager == "exact":
+        return backproject(lines, grid, device=device, accuracy_db=asked_db, beam=beam)
+    if imager == "mosaic":
+        return mosaic(
+            lines, grid, tolerance_db=asked_db, beam=beam, patches=(2, 2), device=device
+        ).image()
+    if imager == "wavenumber":
+        return wavenumber(lines, grid, beam=beam)
+    if imager == "factorized":
+        chosen = divided_plan(known, asked_db, device)
+        return factorize(lines, grid, chosen, device=device)
+    assert imager == "half precision"
+    # Every device can compute in half precision, but plans use it only on those where it is fast.
+    able = driven(device, device.info.width, True)
+    chosen = divided_plan(known, asked_db, able)
+    if not chosen.half_precision:
+        raise RuntimeError(f"the plan for {asked_db:g} dB should use half precision, but does not")
+    return factorize(lines, grid, chosen, device=device)
+
+
+def divided_plan(known: Known, asked_db: float, device: Device) -> Plan:
+    """Return a plan that divides the image of a scene, however small."""
+    return plan(
+        known.lines, known.grid, tolerance_db=asked_db, beam=known.beam, device=device,
+        costs=_DIVIDED,
+    )  # fmt: skip
 
 
 def other_builds(info: DeviceInfo) -> list[tuple[int, bool]]:
@@ -144,14 +166,6 @@ def other_builds(info: DeviceInfo) -> list[tuple[int, bool]]:
     most = info.width if info.width > 1 else _WIDEST
     own = (info.width, info.permute)
     return [build for build in _BUILDS if build[0] <= most and build != own]
-
-
-def variants(device: Device) -> dict[str, Device]:
-    """Return variants of the device, one for each of `other_builds`, by name."""
-    return {
-        f"width {width}{', permuted' if permute else ''}": driven(device, width, permute)
-        for width, permute in other_builds(device.info)
-    }
 
 
 def driven(device: Device, width: int, permute: bool) -> Device:
@@ -169,51 +183,6 @@ def driven(device: Device, width: int, permute: bool) -> Device:
     return dataclasses.replace(device, info=info, _kernels={})
 
 
-def _exact(known: Known, asked_db: float, device: Device) -> Image:
-    return backproject(
-        known.lines, known.grid, device=device, accuracy_db=asked_db, beam=known.beam
-    )
-
-
-def _factorized(known: Known, asked_db: float, device: Device) -> Image:
-    return factorize(known.lines, known.grid, divided_plan(known, asked_db, device), device=device)
-
-
-def _in_half_precision(known: Known, asked_db: float, device: Device) -> Image:
-    # Every device can compute in half precision, but plans use it only on those where it is fast.
-    able = driven(device, device.info.width, True)
-    chosen = divided_plan(known, asked_db, able)
-    if not chosen.half_precision:
-        raise RuntimeError(f"the plan for {asked_db:g} dB should use half precision, but does not")
-    return factorize(known.lines, known.grid, chosen, device=device)
-
-
-def divided_plan(known: Known, asked_db: float, device: Device) -> Plan:
-    """Return a plan that divides the image of a scene, however small."""
-    return plan(
-        known.lines, known.grid, tolerance_db=asked_db, beam=known.beam, device=device,
-        costs=_DIVIDED,
-    )  # fmt: skip
-
-
-def _mosaic(known: Known, asked_db: float, device: Device) -> Image:
-    return mosaic(
-        known.lines, known.grid, tolerance_db=asked_db, beam=known.beam, patches=(2, 2),
-        device=device,
-    ).image()  # fmt: skip
-
-
-def _wavenumber(known: Known, asked_db: float, device: Device) -> Image:
-    return wavenumber(known.lines, known.grid, beam=known.beam)
-
-
-IMAGERS = {
-    "exact": _exact,
-    "factorized": _factorized,
-    "half precision": _in_half_precision,
-    "mosaic": _mosaic,
-    "wavenumber": _wavenumber,
-}
 _HANN = BeamWindow(12, "hann", along=np.array([1.0, 0, 0]))
 _SMALL: dict[str, Any] = {"shape": (32, 32)}
 _SCENES: dict[str, Callable[[], Known]] = {

@@ -11,11 +11,8 @@ from typing import Any
 import numpy as np
 
 from clsas.engine.data import validate
-from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.image_error import relative_error_db
-from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.visibility import sines
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.factorized.plan import ExactImage
@@ -28,9 +25,8 @@ from clsas.interferometry.result import Heights
 from clsas.measures.tradeoff import REFERENCE_DB
 from clsas.mosaics.mosaic import mosaic
 from clsas.mosaics.store import Record
-from clsas.trials import cases, dunes, reference, wreck
-from clsas.trials.cases import Case
-from clsas.trials.dense_cases import DenseCase
+from clsas.selftest import cases, reference, wreck
+from clsas.selftest.cases import Case, DenseCase
 
 _PIXELS = 300  # random pixels at which errors are measured
 _VISIBILITY_PIXELS = 64  # along either side, at which the share of visible channels is evaluated
@@ -50,7 +46,7 @@ def run(
     Parameters
     ----------
     case : str
-        One of `clsas.trials.cases.EXACT_CASES`.
+        One of `clsas.selftest.cases.EXACT_CASES`.
     device : Device, str or int, optional
         See `clsas.engine.device.device.choose`.
     accuracy_db : float
@@ -91,11 +87,8 @@ def run(
     del seconds[0], kernel_seconds[0]
     assert imager.decision is not None
     decision, pairs = imager.decision, lines.channels * grid.size
-    flops = (
-        flops_per_pair(decision.interpolator.taps, decision.phase_terms)
-        * pairs
-        / min(kernel_seconds)
-    )
+    operations = flops_per_pair(decision.interpolator.taps, decision.phase_terms) * pairs
+    flops = operations / min(kernel_seconds)
     return {
         "case": case,
         "device": device.info.label,
@@ -135,7 +128,7 @@ def run_factorized(
     Parameters
     ----------
     case : str, Case or DenseCase
-        One of `clsas.trials.cases.FACTORIZED_CASES`, or another case.
+        One of `clsas.selftest.cases.FACTORIZED_CASES`, or another case.
     device : Device, str or int, optional
         See `clsas.engine.device.device.choose`.
     tolerance_db : float
@@ -226,7 +219,7 @@ def run_mosaic(
     Parameters
     ----------
     case : str
-        One of `clsas.trials.cases.MOSAIC_CASES`.
+        One of `clsas.selftest.cases.MOSAIC_CASES`.
     device : Device, str or int, optional
         See `clsas.engine.device.device.choose`.
     tolerance_db : float
@@ -277,6 +270,10 @@ def run_mosaic(
         ("default_unlimited_seconds", exact),
     ]
     found = _in_turns(methods, repeats, progress)
+    points_m = wreck.grid(_VISIBILITY_PIXELS).positions_m().reshape(-1, 3)
+    sine = sines(points_m, lines.phase_centres_m, beam.directions(lines))
+    low, high = beam.limits
+    share_seen = float(((sine > low) & (sine < high)).mean())
     seconds = found["seconds"]["median"]
     predicted = [r.predicted_error_db for r in records if r.predicted_error_db is not None]
     return {
@@ -289,7 +286,7 @@ def run_mosaic(
         "patches": len(records),
         "tolerance_db": tolerance_db,
         **found,
-        "share_seen": _share_seen(lines, wreck.grid(_VISIBILITY_PIXELS), beam),
+        "share_seen": share_seen,
         "plan_seconds": sum(record.plan_seconds for record in records),
         "speedup": found["exact_seconds"]["median"] / seconds,
         "speedup_unlimited": found["unlimited_seconds"]["median"] / seconds,
@@ -314,7 +311,7 @@ def run_heights(
     Parameters
     ----------
     case : str
-        One of `clsas.trials.cases.HEIGHTS_CASES`.
+        One of `clsas.selftest.cases.HEIGHTS_CASES`.
     device : Device, str or int, optional
         See `clsas.engine.device.device.choose`.
     tolerance_db : float
@@ -338,16 +335,16 @@ def run_heights(
         - `valid_share`: share of the pixels with a valid height.
     """
     validate.one_of("case", case, tuple(cases.HEIGHTS_CASES))
-    pixels = cases.HEIGHTS_CASES[case]
+    dunes = cases.HEIGHTS_CASES[case]
     device = open_device(device)
-    grid, banks = dunes.grid(pixels), dunes.banks(pixels)
+    grid, banks = dunes.grid, dunes.banks()
     runs: list[tuple[Heights, float, float]] = []
 
     def measure() -> None:
         steps: list[tuple[int, float]] = []
         start = time.perf_counter()
         found = heights(
-            *banks, grid, search_m=dunes.SEARCH_M, tolerance_db=tolerance_db, device=device,
+            *banks, grid, search_m=dunes.search_m, tolerance_db=tolerance_db, device=device,
             progress=lambda done, total: steps.append((total - done, time.perf_counter())),
         )  # fmt: skip
         swept = next(at for left, at in steps if left <= PASSES)
@@ -360,9 +357,9 @@ def run_heights(
             *_FAST_RUNS * [("image_seconds", image)],
         ]
         taken = _in_turns(methods, repeats, progress)
-    found = runs[-1][0]
+    found, *_ = runs[-1]
     _, sweeps, refinements = zip(*runs[-repeats:], strict=True)
-    error_m = (found.height_m - dunes.relief_m(*np.meshgrid(*grid.axes_m)))[found.mask]
+    error_m = (found.height_m - dunes.height_m(*np.meshgrid(*grid.axes_m)))[found.mask]
     return {
         "case": case,
         "device": device.info.label,
@@ -378,14 +375,6 @@ def run_heights(
         "deviation_m": float(np.sqrt(np.mean(found.sd_m[found.mask] ** 2))),
         "valid_share": float(found.mask.mean()),
     }
-
-
-def _share_seen(lines: RangeLines, grid: Grid, beam: BeamWindow) -> float:
-    """Return the share of all pixel-channel pairs within the beam."""
-    points_m = grid.positions_m().reshape(-1, 3)
-    sine = sines(points_m, lines.phase_centres_m, beam.directions(lines))
-    low, high = beam.limits
-    return float(((sine > low) & (sine < high)).mean())
 
 
 def _in_turns(

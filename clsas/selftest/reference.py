@@ -120,9 +120,8 @@ def ideal(
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
     modes = scipy.fft.next_fast_len(lines.length + 2 * padding)
-    shift = round(measure_spectrum(lines).centre * modes)
-
-    lowest = shift - modes // 2  # frequency, cycles per `modes` samples
+    # The lowest frequency, cycles per `modes` samples.
+    lowest = round(measure_spectrum(lines).centre * modes) - modes // 2
 
     def evaluate(
         samples: NDArray[np.complex128], position: NDArray[np.float64]
@@ -173,16 +172,6 @@ def sampled_error_db(
     return relative_error_db(image.pixels.ravel()[chosen], correct)
 
 
-def _ranges_m(lines: RangeLines, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the ranges of points for every channel, along rays, [channels, points]."""
-    if lines.sound_speed is None:
-        motion = lines.rx_velocity_m_s, lines.sound_speed_m_s
-        return pairwise_range_m(points_m, lines.tx_m, lines.rx_m, *motion).T
-    channel, point = np.divmod(np.arange(lines.channels * len(points_m)), len(points_m))
-    delay_s = delays_s(lines, channel, points_m[point])
-    return lines.sound_speed_m_s / 2 * delay_s.reshape(lines.channels, len(points_m))
-
-
 def _sum_channels(
     lines: RangeLines,
     points_m: ArrayLike,
@@ -203,7 +192,13 @@ def _sum_channels(
     step = max(_PAIRS_AT_ONCE // len(points), 1)
     for first in range(0, lines.channels, step):
         block = lines.select(slice(first, first + step))
-        range_m = _ranges_m(block, points)
+        if block.sound_speed is None:
+            motion = block.rx_velocity_m_s, block.sound_speed_m_s
+            range_m = pairwise_range_m(points, block.tx_m, block.rx_m, *motion).T
+        else:  # along rays
+            channel, point = np.divmod(np.arange(block.channels * len(points)), len(points))
+            delay_s = delays_s(block, channel, points[point]).reshape(-1, len(points))
+            range_m = block.sound_speed_m_s / 2 * delay_s
         position = (range_m - block.first_range_m[:, None]) / block.range_step_m
         values = evaluate(block.samples.astype(np.complex128), position)
         if beam is not None and along is not None:

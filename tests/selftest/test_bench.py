@@ -11,7 +11,7 @@ from studies import tables
 from studies.scaling import scaled
 
 from clsas.engine.data.beam import BeamWindow
-from clsas.trials import bench, cases, dunes
+from clsas.selftest import bench, cases
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "bench"
 SMALL = cases.Case(200, 8.25e-3, 1e6, 100e3, (-0.3, 0.3), (40.0, 40.6), 128)
@@ -58,7 +58,7 @@ def test_scaled_cases_keep_what_they_look_like_in_wavelengths():
     assert (base.x_m, base.y_m, base.beam) == (small.x_m, small.y_m, small.beam)
 
 
-@pytest.mark.watches("clsas/trials", "scripts/bench", "scripts/studies")
+@pytest.mark.watches("clsas/selftest", "scripts/bench", "scripts/studies")
 @pytest.mark.parametrize("beam", [None, BeamWindow(1.5, "hann")])
 def test_factorized_against_exact(beam, monkeypatch):
     case = dataclasses.replace(SMALL, beam=beam)
@@ -87,10 +87,9 @@ def test_factorized_against_exact(beam, monkeypatch):
     assert json.loads(json.dumps(result)) == result
 
 
-@pytest.mark.watches("clsas/trials", "scripts/bench", "scripts/studies")
+@pytest.mark.watches("clsas/selftest", "scripts/bench", "scripts/studies")
 def test_heights_against_one_image(monkeypatch):
-    monkeypatch.setitem(cases.HEIGHTS_CASES, "small", 128)
-    monkeypatch.setattr(dunes, "SEARCH_M", (-1.0, 1.0))
+    monkeypatch.setitem(cases.HEIGHTS_CASES, "small", cases.Dunes(128, (-1.0, 1.0)))
     seen = []
     result = bench.run_heights("small", repeats=1, progress=lambda *done: seen.append(done))
     assert seen == [(1, 1)]
@@ -152,7 +151,7 @@ def test_intervals_of_exponents_contain_the_true_one_as_often_as_they_claim():
     assert tables.growth([256, 512], [1.0, 4.0]).cells == ["2.00", "", "2", "256 to 512"]
 
 
-@pytest.mark.watches("clsas/trials", "scripts/bench", "scripts/studies")
+@pytest.mark.watches("clsas/selftest", "scripts/bench", "scripts/studies")
 def test_the_table_of_factorized_cases(monkeypatch, capsys):
     monkeypatch.setattr(cases, "FACTORIZED_CASES", {"small": SMALL})
     tables.factorized([None])

@@ -1,0 +1,1 @@
+"""Self-test: is it right here, and fast? An oracle, extreme scenes, benchmarks and the demo."""

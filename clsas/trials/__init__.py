@@ -1,1 +1,0 @@
-"""Trials: an independent oracle, extreme cases, the self-test, benchmarks and built-in cases."""
