@@ -56,7 +56,7 @@ autosummary_filename_map |= {
         "engine.factorized.plan.Prediction",
         "measures.cuts.Cut",
         "measures.quality.PointResponse",
-        "mosaics.record.Record",
+        "mosaics.document.Record",
         "engine.device.device.DeviceInfo",
     )
 }

@@ -34,9 +34,8 @@ from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.engine.factorized.plan import ExactImage
 from clsas.files.scene_files import SceneFile, simulation_digest
 from clsas.files.scene_tables import PLAN_KEYS, MosaicTable
-from clsas.mosaics.document import check_place
+from clsas.mosaics.document import Record, check_place
 from clsas.mosaics.patches import patch_shape_of
-from clsas.mosaics.record import Record
 
 _SCHEDULER_S = 10  # how long a scheduler may take to answer; arbitrary
 _IDLE_S = 60.0  # default of --idle-s

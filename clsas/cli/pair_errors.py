@@ -15,7 +15,7 @@ from clsas.cli.parameters import HDF5_OR_STORE, INPUT, keep_out
 from clsas.cli.wording import command
 from clsas.files.scene_files import SceneFile
 from clsas.interferometry.pair_errors_result import with_bank
-from clsas.mosaics.stored_heights import check_heights
+from clsas.mosaics.store import check_heights
 
 
 @command("pair-errors")

@@ -15,7 +15,7 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.result import Heights
-from clsas.mosaics.record import PatchIndex, Record
+from clsas.mosaics.document import PatchIndex, Record
 from clsas.mosaics.store import Store
 
 _WINDOW = 2048  # rows and columns that are read at once: 32 MiB of pixels; a plain choice

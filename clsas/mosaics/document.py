@@ -1,22 +1,25 @@
-"""The document of a store: what a mosaic was made with, as JSON attributes of its Zarr group.
+"""The document of a store, which says what its mosaic was made with, and the records of patches.
 
-The records of patches and of levels are such groups, too. All of them have digests.
+The document is what a mosaic was made with, as JSON attributes of its Zarr group. The record of a
+patch, the attributes of an empty Zarr group, says how the patch was formed, with checksums of its
+pixels. Both have digests, so that a changed bit is detected. Nothing here needs Zarr.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from clsas.engine.data import validate
+from clsas.engine.data import reprs, validate
 from clsas.engine.data.atomic import make_folders, replacing
-from clsas.engine.data.digests import is_intact, with_digest
+from clsas.engine.data.digests import digest, is_intact, with_digest
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.reading import parse_json, read_bytes
@@ -46,21 +49,41 @@ GROUP = "patches"
 PARTS_OF_B = "parts_of_b"
 """Input with the digests of the second bank's files, if they are not those of the first one."""
 
+PIXELS_CHECKSUM = "pixels_crc32c"
+"""Attribute with the checksum of a patch's pixels, or the list of those of its chunks."""
+
+LEVELS_CHECKSUMS = "levels_crc32c"
+"""Attribute with the checksums of a patch's levels, by the name of the array."""
+
+Checksums = dict[str, str | list[str | None] | None]
+"""Checksums of a patch by the name of the array: of its chunk, or a list of those of its chunks.
+
+That of a chunk that does not exist, because it has only the fill value, is None.
+"""
+
+PatchIndex = tuple[int, int]
+"""Row and column of a patch."""
+
 _VECTORS = "origin_m", "row_step_m", "column_step_m"
+_LISTED = 3  # damaged patches that a message names; the others are only counted
 
 
 class DamageError(ValueError):
     """A patch or a document of a store differs from what was written."""
 
 
+class OtherInputsError(ValueError):
+    """A store was made with other inputs than those given."""
+
+
 @dataclass(frozen=True, eq=False)
 class Document:
-    """What a store was made with. All of its arrays follow from this.
+    """Inputs, grid and division of a mosaic, from which all arrays of its store follow.
 
     Attributes
     ----------
     inputs : dict
-        Inputs of the mosaic, as `clsas.mosaics.provenance.inputs_of` returns them.
+        Inputs of the mosaic, as `clsas.mosaics.mosaic.inputs_of` returns them.
     patch_shape : (rows, columns)
     plane : Grid or None
         Grid of the mosaic without heights, or None for arbitrary points.
@@ -102,34 +125,30 @@ class Document:
         if not is_intact(attributes):
             raise ValueError(f"{path} is damaged: its attributes do not match their digest")
         try:
-            return cls._of(attributes)
+            inputs, stored = attributes["inputs"], attributes["grid"]
+            metadata, window = attributes["metadata"], attributes.get("window")
+            check_inputs(inputs, None)
+            validate.instance("metadata", metadata, dict)
+            plane = None
+            if stored is not None:
+                place = inputs.get("georeference")
+                plane = Grid.oriented(
+                    **{name: stored[name] for name in _VECTORS},
+                    shape=tuple(inputs["pixels"]),
+                    georeference=None if place is None else Georeference(**place),
+                )
+            return cls(
+                inputs,
+                validate.sides("patch_shape", attributes["patch_shape"]),
+                plane,
+                validate.flag("has_height", attributes["has_height"]),
+                None if window is None else validate.sides("window", window),
+                {name: validate.text(name, each) for name, each in metadata.items()},
+            )
         except (LookupError, TypeError, ValueError) as error:
             raise ValueError(
                 f"{path} is damaged: its attributes are not those of a mosaic"
             ) from error
-
-    @classmethod
-    def _of(cls, attributes: Mapping[str, Any]) -> Document:
-        inputs, stored, window = attributes["inputs"], attributes["grid"], attributes.get("window")
-        metadata = attributes["metadata"]
-        check_inputs(inputs, None)
-        validate.instance("metadata", metadata, dict)
-        plane = None
-        if stored is not None:
-            place = inputs.get("georeference")
-            georeference = None if place is None else Georeference(**place)
-            vectors = {name: stored[name] for name in _VECTORS}
-            plane = Grid.oriented(
-                **vectors, shape=tuple(inputs["pixels"]), georeference=georeference
-            )
-        return cls(
-            inputs,
-            validate.sides("patch_shape", attributes["patch_shape"]),
-            plane,
-            validate.flag("has_height", attributes["has_height"]),
-            None if window is None else validate.sides("window", window),
-            {name: validate.text(name, each) for name, each in metadata.items()},
-        )
 
     def write(self, path: Path) -> None:
         """Write the document, and wait until it is on the disk."""
@@ -151,6 +170,13 @@ class Document:
     def shape(self) -> tuple[int, int]:
         """Number of pixels, (rows, columns)."""
         rows, columns = self.inputs["pixels"]
+        return rows, columns
+
+    @property
+    def patches(self) -> tuple[int, int]:
+        """Number of patches, (rows, columns)."""
+        sides = zip(self.shape, self.patch_shape, strict=True)
+        rows, columns = (math.ceil(count / side) for count, side in sides)
         return rows, columns
 
     @cached_property
@@ -201,18 +227,17 @@ class Document:
         found = []
         if self.plane is not None and self.plane.has_axes:
             factors = self.levels.factors
-            places = [("", 1), *((f"{n}x/", n) for n in factors)]
-            places += [("overview_", n) for n in factors[-1:]]
-            for (prefix, factor), (axis, name) in (
-                (place, axis) for place in places for axis in enumerate("xy")
-            ):
-                dimension = f"overview_{name}" if prefix == "overview_" else name
-                count = (level_shape(self.shape, factor)[1 - axis],)
-                found.append(
-                    StoredArray(
-                        prefix + name, "float64", count, count, (dimension,), {"units": "m"}, factor
-                    )
-                )
+            places = [("", "", 1), *((f"{n}x/", "", n) for n in factors)]
+            places += [("overview_", "overview_", n) for n in factors[-1:]]
+            for before, of_dimension, factor in places:
+                for axis, name in enumerate("xy"):
+                    count = (level_shape(self.shape, factor)[1 - axis],)
+                    found.append(
+                        StoredArray(
+                            before + name, "float64", count, count, (of_dimension + name,),
+                            {"units": "m"}, factor,
+                        )
+                    )  # fmt: skip
         if self.has_height:
             chunks = self._chunks(self.shape, self.shape)
             found.append(
@@ -280,6 +305,209 @@ def _meaning(kind: str) -> dict[str, Any]:
     return {name: each for name, each in (("units", units), ("long_name", meaning)) if each}
 
 
+def check_inputs(inputs: Any, shape: Sequence[int] | None) -> None:
+    """Check the inputs of a mosaic.
+
+    Parameters
+    ----------
+    inputs : dict
+        The inputs, as `clsas.mosaics.mosaic.inputs_of` returns them.
+    shape : (rows, columns) or None
+        Shape of the grid, which the number of pixels must equal; None for any shape.
+
+    Raises
+    ------
+    TypeError
+        If `inputs` are not a dict.
+    ValueError
+        If the list of parts or the number of pixels is missing or wrong.
+    """
+    validate.instance("inputs", inputs, dict)
+    parts, pixels = inputs.get("parts"), inputs.get("pixels")
+    for name, each in (("parts", parts), (PARTS_OF_B, inputs.get(PARTS_OF_B, []))):
+        if not isinstance(each, list):
+            raise ArgumentError("inputs", f"have a list {name!r}", validate.shown(each))
+    is_shape = (
+        isinstance(pixels, list)
+        and len(pixels) == 2
+        and all(type(side) is int and side > 0 for side in pixels)
+    )
+    if not is_shape or (shape is not None and pixels != list(shape)):
+        expected = "of two numbers" if shape is None else f"{list(shape)}, the shape of the grid"
+        raise ArgumentError("inputs", f"have 'pixels' {expected}", validate.shown(pixels))
+
+
+def differences(
+    document: Document, given: dict[str, Any], patch_shape: tuple[int, int]
+) -> list[str]:
+    """Return one message for every difference between the inputs of a store and the given ones.
+
+    Files may have been added to the survey, so the given parts need only begin with the stored
+    ones.
+    """
+    found, stored = [], document.inputs
+    if ("search_m" in stored) != ("search_m" in given):
+        kinds = ("heights", "images") if "search_m" in stored else ("images", "heights")
+        return ["it is a mosaic of {}, not of {}".format(*kinds)]
+    if document.patch_shape != patch_shape:
+        shapes = "{} x {} pixels in the store, {} x {} here"
+        found.append(f"patches have {shapes.format(*document.patch_shape, *patch_shape)}")
+    before, now = (
+        [each.get(name, []) for name in ("parts", PARTS_OF_B)] for each in (stored, given)
+    )
+    if any(new[: len(old)] != old for old, new in zip(before, now, strict=True)):
+        found.append("the range lines differ")
+    elif stored.keys() & {PARTS_OF_B} != given.keys() & {PARTS_OF_B}:
+        found.append("the range lines of both banks were in one source, or are now")
+    for name, theirs in given.items():
+        mine = stored.get(name)
+        if name in ("parts", PARTS_OF_B):
+            continue
+        if name == "grid" and mine != theirs:
+            if stored.get("pixels") == given["pixels"]:
+                found.append("the grid has another position or other heights")
+        elif isinstance(mine, dict) and isinstance(theirs, dict):
+            found += [
+                f"`{name}`'s {key} is {_word(mine.get(key))} in the store, {_word(each)} here"
+                for key, each in theirs.items()
+                if mine.get(key) != each
+            ]
+        elif name == "pixels" and mine != theirs:
+            shapes = "{} x {} pixels in the store, {} x {} here"
+            found.append(f"the grid has {shapes.format(*stored[name], *theirs)}")
+        elif mine != theirs:
+            found.append(f"`{name}` is {_word(mine)} in the store, {_word(theirs)} here")
+    return found
+
+
+def _word(value: Any) -> str:
+    """Return an input in words."""
+    if value is None:
+        return "not set"
+    return "set" if isinstance(value, dict) else str(value)
+
+
+def stored_digest(path: Path) -> str:
+    """Return a digest of the inputs that the store at a path was made with.
+
+    Raises
+    ------
+    ValueError
+        If there is no mosaic at the path, or its document is damaged.
+    """
+    return digest(Document.read(path).inputs)
+
+
+@dataclass(frozen=True)
+class Record:
+    """Record of how a finished patch was formed, and of defects of its data.
+
+    Attributes
+    ----------
+    channels : int
+        Number of channels whose beam and recorded ranges touch the patch. If 0, all pixels are
+        zero.
+    survey_channels : int
+        Number of channels in the survey when the patch was formed.
+    missing_channels : int
+        Number of `channels` without samples.
+    gap_m : float
+        Longest distance between consecutive pings that contribute to the patch, if it exceeds
+        three median steps; else 0.
+    predicted_error_db : float or None
+        Predicted relative rms error against the exact image, dB; None for an empty patch.
+    predicted_seconds, plan_seconds, read_seconds, seconds : float
+        Predicted time of imaging; measured times of planning, of reading lines, and in total, s.
+    memory_bytes : int
+        Predicted memory.
+    device, driver : str
+        Device that formed the patch, and its driver.
+    plan : dict or None
+        The plan as JSON, without the beam's directions; `clsas.Plan.from_json` reads it. None for
+        an exact image or an empty patch.
+    has_pixels : bool
+        True if any pixel is not 0.
+    heights : dict or None
+        How the heights were measured: the share of `valid` pixels, the median of `looks`, the
+        height of ambiguity `ambiguity_m`, and `converged`; or the `reason` why there are none.
+        None for images.
+    """
+
+    channels: int
+    survey_channels: int
+    missing_channels: int = 0
+    gap_m: float = 0.0
+    predicted_error_db: float | None = None
+    predicted_seconds: float = 0.0
+    plan_seconds: float = 0.0
+    read_seconds: float = 0.0
+    seconds: float = 0.0
+    memory_bytes: int = 0
+    device: str = ""
+    driver: str = ""
+    plan: dict[str, Any] | None = None
+    has_pixels: bool = False
+    heights: dict[str, Any] | None = None
+
+    __repr__ = reprs.of_fields
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """Descriptions of the defects of the data; empty if there are none."""
+        found = []
+        if not self.channels:
+            found.append("empty: outside the beam or recorded ranges of every channel")
+        elif self.missing_channels:
+            found.append(f"{self.missing_channels} of {self.channels} channels have no samples")
+        if self.gap_m:
+            found.append(f"a gap of {self.gap_m:.3g} m between pings")
+        if self.heights is not None and "reason" in self.heights:
+            found.append(f"no heights: {self.heights['reason']}")
+        elif self.heights is not None and not self.heights["converged"]:
+            found.append("heights still changed in the last pass")
+        return tuple(found)
+
+    def attributes(self, checksums: Checksums) -> dict[str, Any]:
+        """Return the attributes to store, with the checksums of pixels and levels."""
+        levels = {name: value for name, value in checksums.items() if name != "pixels"}
+        stored = {PIXELS_CHECKSUM: checksums["pixels"], LEVELS_CHECKSUMS: levels}
+        return with_digest(asdict(self) | stored)
+
+    @classmethod
+    def read(cls, folder: Path) -> tuple[Record, Checksums] | None:
+        """Return the record in a folder and its checksums, or None if there is none.
+
+        Raises
+        ------
+        DamageError
+            If the record is damaged.
+        """
+        if not (folder / "zarr.json").exists():
+            return None
+        stored = read_attributes(folder)
+        if not is_intact(stored):
+            raise DamageError("its record does not match its digest")
+        names = {field.name for field in fields(cls)}
+        try:
+            record = cls(**{name: value for name, value in stored.items() if name in names})
+            checksums = {"pixels": stored[PIXELS_CHECKSUM], **stored[LEVELS_CHECKSUMS]}
+        except (LookupError, TypeError) as error:
+            raise DamageError("its record is incomplete") from error
+        return record, checksums
+
+
+def describe_damage(found: dict[PatchIndex, str]) -> str:
+    """Return the first damaged patches with their reasons, and the number of others, in words."""
+    named = [f"patch {row},{column}: {reason}" for (row, column), reason in found.items()]
+    more = f" and {len(named) - _LISTED} more" if len(named) > _LISTED else ""
+    return "; ".join(named[:_LISTED]) + more
+
+
+def describe_arrays(found: dict[str, str]) -> str:
+    """Return the damaged arrays with their reasons, in words."""
+    return "; ".join(f"{name}: {reason}" for name, reason in found.items())
+
+
 def read_attributes(folder: Path) -> dict[str, Any]:
     """Return the attributes of a Zarr group.
 
@@ -307,6 +535,12 @@ def write_attributes(folder: Path, attributes: dict[str, Any]) -> None:
     document = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
     with replacing(folder / "zarr.json") as temporary:
         temporary.write_text(json.dumps(document, indent=1))
+
+
+def stamp_of(path: Path) -> tuple[int, int, int]:
+    """Return what tells a file from another that has replaced it."""
+    status = path.stat()
+    return status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def is_there(path: Path) -> bool:
@@ -346,35 +580,3 @@ def check_own(store: Path, folder: Path) -> None:
             f"{folder} must be a real folder of the store, but a symbolic link leads elsewhere: "
             "nothing is written through it"
         )
-
-
-def check_inputs(inputs: Any, shape: Sequence[int] | None) -> None:
-    """Check the inputs of a mosaic.
-
-    Parameters
-    ----------
-    inputs : dict
-        The inputs, as `clsas.mosaics.provenance.inputs_of` returns them.
-    shape : (rows, columns) or None
-        Shape of the grid, which the number of pixels must equal; None for any shape.
-
-    Raises
-    ------
-    TypeError
-        If `inputs` are not a dict.
-    ValueError
-        If the list of parts or the number of pixels is missing or wrong.
-    """
-    validate.instance("inputs", inputs, dict)
-    parts, pixels = inputs.get("parts"), inputs.get("pixels")
-    for name, each in (("parts", parts), (PARTS_OF_B, inputs.get(PARTS_OF_B, []))):
-        if not isinstance(each, list):
-            raise ArgumentError("inputs", f"have a list {name!r}", validate.shown(each))
-    is_shape = (
-        isinstance(pixels, list)
-        and len(pixels) == 2
-        and all(type(side) is int and side > 0 for side in pixels)
-    )
-    if not is_shape or (shape is not None and pixels != list(shape)):
-        expected = "of two numbers" if shape is None else f"{list(shape)}, the shape of the grid"
-        raise ArgumentError("inputs", f"have 'pixels' {expected}", validate.shown(pixels))

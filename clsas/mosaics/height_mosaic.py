@@ -1,8 +1,15 @@
 """Mosaics of heights: measured patch by patch in bounded memory, and kept in a store.
 
+A mosaic of heights is a `Mosaic` whose patches `measure_patch` measures instead of forming images.
 Everything that does not depend on a patch is decided once: the window, so that all heights have the
 same resolution, and the margin with which patches are measured. Both are kept with the inputs of
 the store, and a run that continues it takes them from there.
+
+A patch is measured together with a margin, so that the windows of its outermost pixels are complete
+and the cycles of the phase are decided as in a measurement of the whole grid. Lines are read for
+everything that the sweep images: the patch with its margin at all heights of the search, and what
+lies at the same ranges. Shadows are found once all patches are finished
+(`clsas.mosaics.relief_shadows`).
 """
 
 from __future__ import annotations
@@ -10,53 +17,55 @@ from __future__ import annotations
 import json
 import math
 import os
+import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines, first_two_banks
+from clsas.engine.data.image import holds_any
+from clsas.engine.data.lines import RangeLines, bank_members, first_two_banks
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device
 from clsas.engine.factorized.planner import TOLERANCE
 from clsas.interferometry import heights
+from clsas.interferometry.baseline import Baseline
 from clsas.interferometry.checks import COHERENCE, PATCH, SEARCH, WINDOW, check_grid, check_pair
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.doubts import BEYOND
+from clsas.interferometry.errors import UnmeasurableError
 from clsas.interferometry.heights import LEAST_COHERENCE
+from clsas.interferometry.pair import Pair
 from clsas.interferometry.request import Request
-from clsas.mosaics.arguments import beam_of_mosaic, warn_of_window
-from clsas.mosaics.banks import Bank
-from clsas.mosaics.devices import open_devices
-from clsas.mosaics.document import PARTS_OF_B
-from clsas.mosaics.height_patches import HeightsJob, seen
-from clsas.mosaics.levels import aligned_side, factors_of
-from clsas.mosaics.patches import Layout
-from clsas.mosaics.provenance import inputs_of
-from clsas.mosaics.record import PatchIndex, Record
-from clsas.mosaics.scheduling import Run, form_patches
+from clsas.interferometry.sweep import Curves
+from clsas.mosaics.devices import open_devices, thread_device
+from clsas.mosaics.document import PARTS_OF_B, PatchIndex, Record
+from clsas.mosaics.levels import LAYERS, SHADOWED
+from clsas.mosaics.mosaic import Mosaic, beam_of_mosaic, inputs_of, warn_of_window
+from clsas.mosaics.patches import Layout, PatchWindow, aligned_shape, with_margin
+from clsas.mosaics.relief_shadows import mask_shadows, of_shadows
 from clsas.mosaics.store import Store
-from clsas.mosaics.survey import open_survey
+from clsas.mosaics.survey import Source, Survey, SurveyVisibility, largest_gap_m, open_survey
 
 _SIDE = 1024  # pixels along a patch by default, which then takes about 0.6 GiB
 _TRIAL = 512  # largest side of the part of the grid that decides on the windows; arbitrary
 _NAMED = 4  # patches that a warning names; the others are only counted
 _MARGIN_WINDOWS = 2.0  # beside half a large one: for as many passes, of half a window each
-
-Lines = RangeLines | str | os.PathLike
+_PLACES = 5  # along either side of a patch, for which curves are found; arbitrary
 
 
 def mosaic_heights(
-    a: Lines,
-    b: Lines | None,
+    a: RangeLines | str | os.PathLike,
+    b: RangeLines | str | os.PathLike | None,
     grid: Grid,
     store: str | os.PathLike,
     *,
@@ -175,42 +184,320 @@ def mosaic_heights(
         patch_m = PATCH.check("patch_m", patch_m)
     validate.progress(progress)
     opened = Store.at(validate.path("store", store))
-    beam = request.beam
-    for name, source in (("a", a), *(() if b is None else [("b", b)])):
-        beam = beam_of_mosaic(beam, _source(name, source), opened.path, grows=False)
+    sources, beam = [], request.beam
+    for name, each in (("a", a), *(() if b is None else [("b", b)])):
+        source = each if isinstance(each, RangeLines) else validate.path(name, each)
+        beam = beam_of_mosaic(beam, source, opened.path, grows=False)
+        sources.append(source)
     given, request = request.beam, replace(request, beam=beam)
-    banks = _banks(a, b, request.beam)
+    banks = _banks(sources, beam)
     check_pair(*(bank.geometry for bank in banks))
     grid = placed(banks[1].geometry, placed(banks[0].geometry, grid))
     if given is not None and given is not beam:
         warn_of_window(given, banks[0].geometry, {"tolerance_db": request.tolerance_db})
     devices = open_devices(device)
-    patch_shape = _patch_shape(grid, patch_m)
-    decided = _decided(opened)
-    if decided is None or request.window_m not in (None, decided["window_m"]):
-        decided = _decide(banks, grid, request, devices[0])
-    window_m = decided["window_m"]
-    if patch_m is not None and patch_m < window_m:
-        allowed = f"be at least the side of a window, {window_m:.3g} m"
-        raise ArgumentError("patch_m", allowed, f"{patch_m:g} m")
-    inputs = _inputs(banks, grid, request) | decided
-    opened.begin(inputs, grid, patch_shape, Window.of(grid, window_m).sides)
-    request = replace(request, window_m=window_m)
-    job = HeightsJob(banks, grid, request, tuple(decided["margin"]), opened.path)
-    layout = Layout(grid, patch_shape)
-    run = Run(layout, job, inputs, banks[0].visibility, devices, None, None)
-    finished = {
-        index: record
-        for index, record in opened.undamaged_records().items()
-        if job.is_current(record, layout.window(index))
+    sides = [_SIDE, _SIDE]
+    if patch_m is not None:
+        sides = [round(patch_m / float(np.linalg.norm(step_m))) for step_m in grid.vectors_m[1:]]
+    counts = [math.ceil(n / max(side, 1)) for n, side in zip(grid.shape, sides, strict=True)]
+    patch_shape = aligned_shape(grid.shape, counts)
+
+    # A store that exists has decided on the window and the margin, unless it is one of images.
+    stored = {} if opened.patch_shape is None else opened.document.inputs
+    decided: dict[str, Any] = {
+        name: stored[name] for name in ("window_m", "margin") if name in stored
     }
+    if len(decided) < 2 or request.window_m not in (None, decided["window_m"]):
+        decided = _decide(banks, grid, request, devices[0])
+    request = replace(request, window_m=decided["window_m"])
+    assert request.window_m is not None
+    if patch_m is not None and patch_m < request.window_m:
+        allowed = f"be at least the side of a window, {request.window_m:.3g} m"
+        raise ArgumentError("patch_m", allowed, f"{patch_m:g} m")
+    inputs = inputs_of(banks[0].survey, grid, {"tolerance_db": request.tolerance_db}, beam)
+    if banks[1].survey is not banks[0].survey:
+        inputs[PARTS_OF_B] = banks[1].survey.digests()
+    inputs |= {"search_m": list(request.search_m), "least_coherence": request.least_coherence}
+    inputs = json.loads(json.dumps(inputs)) | decided
+    opened.begin(inputs, grid, patch_shape, Window.of(grid, request.window_m).sides)
+
+    margin, layout = tuple(decided["margin"]), Layout(grid, patch_shape)
+    finished = {}
+    for index, record in opened.undamaged_records().items():
+        # Patches to which channels contribute that were added since are measured again.
+        if record.survey_channels < len(banks[0].members):
+            rows, columns, _ = with_margin(layout.window(index), margin, grid.shape)
+            visible, _ = _swept(banks, grid.window(rows, columns), request)
+            if visible[record.survey_channels :].any():
+                continue
+        finished[index] = record
+    mosaic = Mosaic(
+        grid,
+        patch_shape,
+        finished,
+        _form=partial(measure_patch, banks, grid, request, margin, opened),
+        _complete=partial(_complete, opened),
+        _visibility=banks[0].visibility,
+        _store=opened,
+        _inputs=inputs,
+        _devices=devices,
+    )
     report = progress or (lambda done, total: None)
-    report(len(finished), len(layout))
-    with closing(form_patches(run, finished)) as forming:
-        for _ in forming:
-            report(len(finished), len(layout))
+    report(len(finished), len(mosaic))
+    with closing(iter(mosaic)) as measuring:
+        for _ in measuring:
+            report(len(finished), len(mosaic))
     _warn_of_doubts(finished)
     return opened
+
+
+def _complete(store: Store) -> None:
+    """Find the shadows of the whole relief, then compute the levels that mix patches."""
+    mask_shadows(store)
+    store.complete_levels()
+
+
+@dataclass(frozen=True, eq=False)
+class Bank:
+    """One receiver bank of a survey.
+
+    Attributes
+    ----------
+    survey : Survey
+        The survey, which may have other banks too.
+    members : int64 [channels]
+        Channels of the survey that belong to the bank.
+    visibility : SurveyVisibility
+        The channels of the bank alone, without their samples.
+    """
+
+    survey: Survey
+    members: NDArray[np.int64]
+    visibility: SurveyVisibility
+
+    @classmethod
+    def of(cls, survey: Survey, number: int | None, beam: BeamWindow | None) -> Self:
+        """Return a bank of a survey by its number; None stands for all channels."""
+        geometry = survey.geometry
+        chosen = np.arange(survey.channels)
+        if number is not None:
+            chosen = chosen[bank_members(geometry.bank_numbers, number)]
+            geometry = geometry.bank(number)
+        begins = np.searchsorted(chosen, survey.begins)
+        alone = replace(survey, geometry=geometry, begins=tuple(map(int, begins)))
+        return cls(survey, chosen, SurveyVisibility.of(alone, beam))
+
+    @property
+    def geometry(self) -> RangeLines:
+        """Geometry of the bank's channels."""
+        return self.visibility.survey.geometry
+
+    def read(
+        self, visible: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
+    ) -> tuple[RangeLines, NDArray[np.bool_]]:
+        """Return lines of the bank between two ranges; see `Survey.read`."""
+        chosen = np.zeros(self.survey.channels, bool)
+        chosen[self.members[visible]] = True
+        ends_m = np.zeros((2, self.survey.channels))
+        ends_m[:, self.members] = near_m, far_m
+        lines, missing = self.survey.read(chosen, *ends_m)
+        return replace(lines, bank_numbers=None), missing
+
+
+def _banks(sources: Sequence[RangeLines | Path], beam: BeamWindow | None) -> tuple[Bank, Bank]:
+    """Return the two banks of one source or of two."""
+    surveys = [
+        open_survey(each if isinstance(each, RangeLines) else each.resolve()) for each in sources
+    ]
+    first, second = surveys[0], surveys[-1]
+    if len(surveys) == 1:
+        if first.geometry.banks < 2:
+            raise ArgumentError("a", "have at least 2 banks", "1", "give the other one as `b`")
+        both = first_two_banks(first.geometry.bank_numbers)
+        return Bank.of(first, both[0], beam), Bank.of(first, both[1], beam)
+    for name, survey in (("a", first), ("b", second)):
+        if survey.geometry.banks > 1:
+            raise ArgumentError(
+                name,
+                "have the lines of one bank if `a` and `b` are given",
+                f"{survey.geometry.banks} banks",
+                "leave `b` out, or take one bank by `lines.bank(n)`",
+            )
+    return Bank.of(first, None, beam), Bank.of(second, None, beam)
+
+
+def _decide(
+    banks: tuple[Bank, Bank], grid: Grid, request: Request, device: Device
+) -> dict[str, Any]:
+    """Return the window and the margin of a new mosaic, from images of the middle of the grid."""
+    part = []
+    for count in grid.shape:
+        side = min(count, _TRIAL)
+        first = (count - side) // 2
+        part.append(slice(first, first + side))
+    middle = grid.window(*part)
+    pair, known, silent = _seen(banks, middle, request, device)
+    if silent:
+        raise ArgumentError(
+            silent[0],
+            "contain echoes",
+            "samples that are all zero or not finite in the "
+            f"{known['channels']} channels that receive from the middle of the grid",
+        )
+    if pair is None:
+        raise ArgumentError(
+            "grid", "lie where the lines reach it", hint="no channel receives from its middle"
+        )
+    window_m, window, large = heights.windows(pair, middle, request)
+    margin = [
+        math.ceil(wide / 2 + _MARGIN_WINDOWS * side)
+        for side, wide in zip(window.sides, large.sides, strict=True)
+    ]
+    return {"window_m": window_m, "margin": margin}
+
+
+def measure_patch(
+    banks: tuple[Bank, Bank],
+    grid: Grid,
+    request: Request,
+    margin: tuple[int, int],
+    store: Store,
+    window: PatchWindow,
+    _: Source,
+) -> tuple[Record, None]:
+    """Measure a patch of a grid with a margin, and write it to the store.
+
+    The banks do not grow. If the patch cannot be imaged, a note of the ValueError names it.
+    """
+    start = time.perf_counter()
+    rows, columns, inside = with_margin(window, margin, grid.shape)
+    wide = grid.window(rows, columns)
+    pixels: NDArray[np.complex64] = np.zeros(window.grid.shape, np.complex64)
+    names = (*LAYERS, *SHADOWED)
+    layers = {name: np.full(window.grid.shape, np.nan, np.float32) for name in names}
+    try:
+        pair, known, _silent = _seen(banks, wide, request, thread_device())
+        if pair is not None:
+            try:
+                measured = heights.measured(pair, wide, request, None)
+            except UnmeasurableError as error:
+                known["heights"] = {"reason": str(error)}
+            else:
+                scale = 1.0
+                if request.beam is not None and request.beam.normalise:
+                    # The beam was normalised by the channels of this patch.
+                    scale = len(banks[0].members) / pair.a.channels
+                pixels = np.complex64(scale) * measured.heights.image.pixels[inside]
+                layers, known["heights"] = _results(measured, window.grid, inside)
+            known["has_pixels"] = holds_any(pixels)
+        record = Record(**known, seconds=time.perf_counter() - start)
+    except ValueError as error:
+        error.add_note(f"patch {window.row},{window.column}")
+        raise
+    store.write(*window[1:], pixels, record, layers)
+    return record, None
+
+
+def _results(
+    measured: heights.Measured, grid: Grid, inside: tuple[slice, slice]
+) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
+    """Return the layers of a patch, and what its record says about heights, as types of JSON."""
+    found, refined, doubts = measured.heights, measured.refined, measured.doubts
+    values = {name: getattr(found, name) for name in LAYERS}
+    # Pixels that are hidden by the relief of the patch or of its margin.
+    shadowed = refined.valid & ~found.mask
+    for name, each in zip(SHADOWED, (refined.offset_m, refined.sd_m), strict=True):
+        values[name] = np.where(shadowed, each, np.nan)
+    layers = {name: each[inside].astype(np.float32) for name, each in values.items()}
+    summary = {
+        "valid": float(found.mask[inside].mean()),
+        "looks": float(np.median(found.looks[inside])),
+        "ambiguity_m": float(2 * np.pi * np.median(np.abs(found.m_per_rad[inside]))),
+        "converged": refined.converged,
+        "best_end": doubts.end,
+        "large_m": doubts.large_m,
+    }
+    return layers, summary | of_shadows(layers, grid, measured.sights)
+
+
+def _seen(
+    banks: tuple[Bank, Bank], grid: Grid, request: Request, device: Device
+) -> tuple[Pair | None, dict[str, Any], list[str]]:
+    """Return what two banks recorded of a grid and of the heights to search above it.
+
+    Returns
+    -------
+    pair : Pair or None
+        Lines of both banks, or None if no channel of both has samples.
+    known : dict
+        Fields of the record of the patch.
+    silent : list of {"a", "b"}
+        Banks of which no channel has samples, though some receive from that part.
+    """
+    start = time.perf_counter()
+    known: dict[str, Any] = {
+        "survey_channels": len(banks[0].members),
+        "device": device.info.label,
+        "driver": device.info.driver,
+    }
+    visible, volume = _swept(banks, grid, request)
+    known["channels"] = int(np.count_nonzero(visible))
+    if not visible.any():
+        return None, known, []
+    (first, lost), (second, lost_too) = (
+        bank.read(visible, *bank.visibility.ranges_m(volume)) for bank in banks
+    )
+    missing = lost | lost_too
+    known |= {
+        "missing_channels": int(np.count_nonzero(missing)),
+        "gap_m": largest_gap_m(first, missing),
+        "read_seconds": time.perf_counter() - start,
+    }
+    if missing.all():
+        return None, known, [n for n, each in (("a", lost), ("b", lost_too)) if each.all()]
+    chosen = visible.copy()
+    chosen[visible] = ~missing
+    if missing.any():
+        first, second = first.select(~missing), second.select(~missing)
+    beam = _beam_of(banks[0], request.beam, chosen)
+    return Pair(first, second, request.tolerance_db, None, beam, device), known, []
+
+
+def _swept(
+    banks: tuple[Bank, Bank], grid: Grid, request: Request
+) -> tuple[NDArray[np.bool_], Grid]:
+    """Return the channels from which heights of a grid follow, and the volume that they image."""
+    first, second = banks
+    volume = _box(grid, request.search_m)
+    visible = first.visibility.channels(volume) | second.visibility.channels(volume)
+    if visible.any():
+        some = [bank.geometry.select(visible) for bank in banks]
+        baseline = Baseline.of(some[0], some[1], _beam_of(first, request.beam, visible), 1.0)
+        every = [slice(None, None, max((n - 1) // _PLACES, 1)) for n in grid.shape]
+        reached = Curves.over(baseline, grid.window(*every), np.array(request.search_m)).grid
+        volume = _box(reached, request.search_m)
+        visible = first.visibility.channels(volume) | second.visibility.channels(volume)
+    return visible, volume
+
+
+def _beam_of(bank: Bank, beam: BeamWindow | None, channels: NDArray[np.bool_]) -> BeamWindow | None:
+    """Return the beam with the directions of the track at some channels."""
+    along = bank.visibility.along
+    return None if beam is None or along is None else replace(beam, along=along[channels])
+
+
+def _box(grid: Grid, search_m: tuple[float, float]) -> Grid:
+    """Return a grid of four pixels that span the volume of all heights to search above a grid."""
+    rows, columns = grid.shape
+    origin_m, row_step_m, column_step_m = grid.vectors_m
+    lowest_m, highest_m = 0.0, 0.0
+    if grid.height_m is not None:
+        lowest_m, highest_m = float(grid.height_m.min()), float(grid.height_m.max())
+    ends_m = lowest_m + search_m[0], highest_m + search_m[1]
+    corners = Grid.oriented(
+        origin_m, (rows - 1) * row_step_m, (columns - 1) * column_step_m, (2, 2)
+    )
+    return corners.with_height([ends_m, ends_m[::-1]])
 
 
 def _warn_of_doubts(records: dict[PatchIndex, Record]) -> None:
@@ -257,93 +544,3 @@ def _span(measured: dict[PatchIndex, dict[str, Any]]) -> str:
         f"{edge(each['ambiguity_m'] for each in measured.values()):.3g}" for edge in (min, max)
     )
     return f"{least} m" if least == most else f"{least} to {most} m"
-
-
-def _banks(a: Lines, b: Lines | None, beam: BeamWindow | None) -> tuple[Bank, Bank]:
-    """Return the two banks of one source or of two."""
-    if b is not None:
-        first, second = (
-            open_survey(each if isinstance(each, RangeLines) else Path(each).resolve())
-            for each in (_source("a", a), _source("b", b))
-        )
-        for name, survey in (("a", first), ("b", second)):
-            if survey.geometry.banks > 1:
-                raise ArgumentError(
-                    name,
-                    "have the lines of one bank if `a` and `b` are given",
-                    f"{survey.geometry.banks} banks",
-                    "leave `b` out, or take one bank by `lines.bank(n)`",
-                )
-        return Bank.of(first, None, beam), Bank.of(second, None, beam)
-    source = _source("a", a)
-    survey = open_survey(source if isinstance(source, RangeLines) else source.resolve())
-    if survey.geometry.banks < 2:
-        raise ArgumentError("a", "have at least 2 banks", "1", "give the other one as `b`")
-    both = first_two_banks(survey.geometry.bank_numbers)
-    return Bank.of(survey, both[0], beam), Bank.of(survey, both[1], beam)
-
-
-def _source(name: str, lines: Any) -> RangeLines | Path:
-    return lines if isinstance(lines, RangeLines) else validate.path(name, lines)
-
-
-def _patch_shape(grid: Grid, patch_m: float | None) -> tuple[int, int]:
-    """Return the number of pixels of a patch, rounded so that levels end at its borders."""
-    sides = []
-    coarsest = factors_of(grid.shape)[-1]
-    for step_m, count in zip(grid.vectors_m[1:], grid.shape, strict=True):
-        side = _SIDE if patch_m is None else round(patch_m / float(np.linalg.norm(step_m)))
-        patches = math.ceil(count / min(max(side, 1), count))
-        sides.append(aligned_side(math.ceil(count / patches), patches, count, coarsest))
-    return sides[0], sides[1]
-
-
-def _inputs(banks: tuple[Bank, Bank], grid: Grid, request: Request) -> dict[str, Any]:
-    """Return the inputs of a mosaic of heights as JSON types."""
-    first, second = (bank.survey for bank in banks)
-    inputs = inputs_of(first, grid, {"tolerance_db": request.tolerance_db}, request.beam)
-    if second is not first:
-        inputs[PARTS_OF_B] = second.digests()
-    inputs |= {"search_m": list(request.search_m), "least_coherence": request.least_coherence}
-    return json.loads(json.dumps(inputs))
-
-
-def _decided(store: Store) -> dict[str, Any] | None:
-    """Return the window and the margin of a store that exists."""
-    if store.patch_shape is None:
-        return None
-    inputs = store.document.inputs
-    if "window_m" not in inputs or "margin" not in inputs:  # a mosaic of images
-        return None
-    return {"window_m": inputs["window_m"], "margin": inputs["margin"]}
-
-
-def _decide(
-    banks: tuple[Bank, Bank], grid: Grid, request: Request, device: Device
-) -> dict[str, Any]:
-    """Return the window and the margin of a new mosaic, from images of the middle of the grid."""
-    middle = grid.window(*(_middle(count) for count in grid.shape))
-    pair, known, silent = seen(banks, middle, request, device)
-    if silent:
-        raise ArgumentError(
-            silent[0],
-            "contain echoes",
-            "samples that are all zero or not finite in the "
-            f"{known['channels']} channels that receive from the middle of the grid",
-        )
-    if pair is None:
-        raise ArgumentError(
-            "grid", "lie where the lines reach it", hint="no channel receives from its middle"
-        )
-    window_m, window, large = heights.windows(pair, middle, request)
-    margin = [
-        math.ceil(wide / 2 + _MARGIN_WINDOWS * side)
-        for side, wide in zip(window.sides, large.sides, strict=True)
-    ]
-    return {"window_m": window_m, "margin": margin}
-
-
-def _middle(count: int) -> slice:
-    side = min(count, _TRIAL)
-    first = (count - side) // 2
-    return slice(first, first + side)

@@ -10,7 +10,7 @@ xarray and Zarr the levels are ordinary groups.
 If the factor of a level divides the sides of a patch, every pixel of the level belongs to one
 patch. Such a level is *of patches*: it is written with each patch, and no two patches share a
 chunk, so that any number of processes can write at once. The other levels are *of the mosaic*: one
-process computes them when all patches are finished (`clsas.mosaics.completing`).
+process computes them when all patches are finished (`clsas.mosaics.store_files`).
 """
 
 from __future__ import annotations

@@ -1,264 +1,91 @@
 """Mosaics: images of any size, formed patch by patch on one or several devices or machines.
 
-Every patch is planned and imaged by itself, from the channels and samples that it needs. A patch in
-a store (`clsas.mosaics.store`) is finished once it has a record, which is written after its pixels.
-If a mosaic is interrupted, the next run forms only the patches that are not finished.
+`mosaic` checks its arguments and opens the survey and the store. Iterating over the `Mosaic` that
+it returns hands the patches to the devices of this process or to the workers of a cluster, also
+while files are added to the survey. `form_patch` forms one of them: every patch is planned and
+imaged by itself, from the channels and samples that it needs.
+
+A patch in a store (`clsas.mosaics.store`) is finished once it has a record, which is written after
+its pixels. If a mosaic is interrupted, the next run forms only the patches that are not finished.
 """
 
 from __future__ import annotations
 
+import json
+import math
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import reprs, validate
-from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.coverage import warn_unreached
-from clsas.engine.data.digests import digest
+from clsas.engine.data.beam import MOST_TRACK_PINGS, BeamWindow
+from clsas.engine.data.coverage import reaches, warn_unreached
+from clsas.engine.data.digests import digest, grid_digest
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.image import Formed, Image
+from clsas.engine.data.image import Formed, Image, holds_any
 from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.validate import ArgumentError
+from clsas.engine.data.simplify import shift_error
+from clsas.engine.data.threads import uninterrupted, wait
+from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.engine.data.version import __version__
 from clsas.engine.device.device import Device
-from clsas.engine.signal.doubts import warn_before_imaging
-from clsas.mosaics.arguments import (
-    FOLLOW,
-    beam_of_mosaic,
-    check_client,
-    checked_growth,
-    checked_request,
-    warn_of_window,
+from clsas.engine.exact.decide import BEST_ACCURACY_DB
+from clsas.engine.factorized.plan import ExactImage
+from clsas.engine.factorized.planner import (
+    TOLERANCE_DB,
+    Request,
+    checked_pairs,
+    planned,
+    tolerance_in_db,
 )
-from clsas.mosaics.devices import open_devices
-from clsas.mosaics.forming import Job
-from clsas.mosaics.patches import Layout, choose_patch_shape, patch_shape_of
-from clsas.mosaics.provenance import inputs_of
-from clsas.mosaics.record import PatchIndex, Record
-from clsas.mosaics.scheduling import Run, form_patches, wait_for_first_file
+from clsas.engine.forming import SceneImager, form
+from clsas.engine.scene import Scene
+from clsas.engine.signal.doubts import warn_before_imaging
+from clsas.mosaics.devices import device_threads, open_devices, process_device, thread_device
+from clsas.mosaics.document import Document, PatchIndex, Record, is_there
+from clsas.mosaics.patches import Layout, PatchWindow, aligned_shape, patch_shape_of
 from clsas.mosaics.store import Store
-from clsas.mosaics.survey import open_survey, warn_of_order
-from clsas.mosaics.visibility import SurveyVisibility
+from clsas.mosaics.survey import (
+    END,
+    FOLLOW,
+    POLL_S,
+    GrowingSurvey,
+    Growth,
+    Source,
+    Survey,
+    SurveyVisibility,
+    beam_json,
+    has_ended,
+    largest_gap_m,
+    open_survey,
+    opened_visibility,
+    warn_of_order,
+)
 
 if TYPE_CHECKING:
     from distributed import Client
 
+REQUESTS = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
+"""Requests for accuracy or a method, of which a mosaic takes at most one."""
+
 MEMORY_BYTES = 1 << 30
 """Default memory of one patch: a plain choice, which suits laptops and small GPUs."""
 
-
-@dataclass(frozen=True, eq=False)
-class Patch:
-    """A finished patch of a mosaic.
-
-    Attributes
-    ----------
-    row, column : int
-        Index of the patch.
-    rows, columns : slice
-        Pixels of the mosaic's grid that belong to the patch.
-    grid : Grid
-        Grid of these pixels.
-    record : Record
-        How the patch was formed: errors, seconds, plan, gaps.
-    """
-
-    row: int
-    column: int
-    rows: slice
-    columns: slice
-    grid: Grid
-    record: Record
-    _formed: Image | None
-    _store: Store | None
-
-    def __repr__(self) -> str:
-        """Return the patch's index, size and extents."""
-        return reprs.summary(
-            self,
-            f"row {self.row}",
-            f"column {self.column}",
-            f"{reprs.by(self.grid.shape)} pixels",
-            reprs.extents(*self.grid.bounds_m),
-        )
-
-    @property
-    def image(self) -> Image:
-        """Image of the patch. It is read from the store if another process formed it.
-
-        Raises
-        ------
-        ValueError
-            If the patch in the store is damaged.
-        OSError
-            If the store cannot be read.
-        """
-        if self._formed is not None:
-            return self._formed
-        if self._store is None:
-            raise RuntimeError("the patch has neither pixels nor a store to read them from")
-        return Image(self._store.read(self.rows, self.columns), self.grid)
-
-
-@dataclass(frozen=True, eq=False)
-class Mosaic:
-    """An image of any size, to be formed patch by patch or, with `image`, as a whole.
-
-    Iterating over the mosaic yields every `Patch` as soon as it is finished. A second iteration
-    forms only the patches that the store lacks.
-
-    A mosaic can be pickled, together with its lines unless they are in files. The process that
-    unpickles it opens devices of the same names. A mosaic with a client cannot be pickled, since
-    the connection belongs to this process.
-
-    Attributes
-    ----------
-    grid : Grid
-        Grid of the whole mosaic.
-    patch_shape : (rows, columns)
-        Number of pixels of a patch; the last patches along each axis may be smaller.
-    shape : (rows, columns)
-        Number of patches.
-    finished : dict of (row, column) to Record
-        Records of the finished patches in the store.
-
-    See Also
-    --------
-    mosaic : Prepare a mosaic.
-    Store : Read a mosaic from its store.
-    """
-
-    grid: Grid
-    patch_shape: tuple[int, int]
-    finished: dict[PatchIndex, Record]
-    _run: Run
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the fields to pickle; the process that unpickles them opens the devices again.
-
-        Raises
-        ------
-        TypeError
-            If the mosaic has a client, whose connection belongs to this process.
-        """
-        if self._run.client is not None:
-            raise TypeError(
-                "a mosaic with a client cannot be pickled, since the connection belongs to this "
-                "process: call `clsas.mosaic` where it is needed, with the same source and store"
-            )
-        return self.__dict__
-
-    def __repr__(self) -> str:
-        """Return the number of patches and of finished ones, the store and the extents."""
-        store = self._run.job.store
-        return reprs.summary(
-            self,
-            f"{reprs.by(self.shape)} patches of {reprs.by(self.patch_shape)} pixels",
-            f"{len(self.finished)} of {len(self)} finished",
-            None if store is None else f"store {str(store)!r}",
-            reprs.extents(*self.grid.bounds_m),
-        )
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Number of patches along rows and columns."""
-        return self._run.layout.shape
-
-    def __len__(self) -> int:
-        """Return the number of patches, finished or not."""
-        return len(self._run.layout)
-
-    def __iter__(self) -> Iterator[Patch]:
-        """Form the patches that are not finished, and yield each of them.
-
-        Raises
-        ------
-        OSError
-            If the store cannot be written, for example on a full disk. Finished patches remain.
-        ValueError
-            If a patch cannot be imaged; the message names the patch.
-        """
-        with closing(form_patches(self._run, self.finished)) as forming:
-            for index, record, image in forming:
-                yield self._patch(index, record, image)
-
-    def image(self, tell: Callable[[Patch], object] | None = None) -> Image:
-        """Form the patches that are not finished, and return the whole image.
-
-        Finished patches are read from the store. Patches from which no channel receives are zero.
-
-        Parameters
-        ----------
-        tell : callable, optional
-            Called with every patch once its pixels are in the image: first with those of the store,
-            then with the others as they are finished. If a patch is formed again, the function is
-            called with it again.
-
-        Returns
-        -------
-        Image
-            Image on all of `grid`. It takes 8 bytes of memory per pixel, in addition to the memory
-            of the patches that are being formed. `Image.formed` is None if patches were read from
-            the store, whose `Record` says how each was formed.
-
-        Raises
-        ------
-        OSError
-            If the store cannot be read or written. Finished patches remain.
-        ValueError
-            If the image does not fit into the memory of this machine, or a patch cannot be imaged;
-            the message names the patch.
-        """
-        validate.function("tell", tell)
-        validate.memory("the mosaic", 8 * self.grid.size)
-        stored = [self._patch(index, record, None) for index, record in self.finished.items()]
-        pixels: NDArray[np.complex64] | None = None
-        formed: dict[PatchIndex, Formed | None] = {}
-        for patch in chain(stored, self):
-            image = patch.image
-            if patch.record.has_pixels:
-                formed[patch.row, patch.column] = image.formed
-            if image.pixels.shape == self.grid.shape:
-                whole = image  # copying the pixels can take as long as forming the image
-            else:
-                if pixels is None:
-                    pixels = np.empty(self.grid.shape, np.complex64)
-                pixels[patch.rows, patch.columns] = image.pixels
-            if tell is not None:
-                tell(patch)
-        if pixels is None:
-            return whole
-        known = [each for each in formed.values() if each is not None]
-        if not known or len(known) < len(formed):
-            return Image(pixels, self.grid)
-        return Image(pixels, self.grid, self._formed(known))
-
-    def _formed(self, patches: Sequence[Formed]) -> Formed:
-        """Return how the whole image was formed, from patches with pixels."""
-        errors_db = [each.predicted_error_db for each in patches]
-        return Formed(
-            method="mosaic",
-            tolerance_db=patches[0].tolerance_db,
-            plan=f"{reprs.by(self.shape)} patches of {reprs.by(self.patch_shape)} pixels",
-            predicted_error_db=max((e for e in errors_db if e is not None), default=None),
-            beam=self._run.job.beam,
-            left_out=tuple(dict.fromkeys(e for each in patches for e in each.left_out)),
-            device=", ".join(dict.fromkeys(each.device for each in patches)),
-            version=__version__,
-            lines_digest=digest(sorted(each.lines_digest for each in patches)),
-        )
-
-    def _patch(self, index: PatchIndex, record: Record, formed: Image | None) -> Patch:
-        grid, row, column, rows, columns = self._run.layout.window(index)
-        return Patch(row, column, rows, columns, grid, record, formed, self._run.job.opened_store())
+_LARGEST_SIDE = 4096  # pixels; such a patch takes seconds, and larger ones gain nothing
+_SMALLEST_SIDE = 128  # pixels; reading and planning smaller patches takes longer than imaging
+_MOST_ON_CLUSTER = 1000  # patches submitted at once: enough for any cluster, few to wait for
+# Pixels times channels. Backprojecting a smaller patch takes less time than planning it.
+_WORTH_A_PLAN = 5e7
 
 
 def mosaic(
@@ -378,7 +205,7 @@ def mosaic(
     validate.instance("grid", grid, Grid)
     if len(grid.shape) != 2:
         raise ArgumentError("grid", "have two axes for a mosaic", f"shape {grid.shape}")
-    request = checked_request(tolerance_db, tolerance_wavelengths, stages, accuracy_db)
+    request = _checked_request(tolerance_db, tolerance_wavelengths, stages, accuracy_db)
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
     patch_shape = None if patches is None else patch_shape_of(patches, grid)
@@ -388,14 +215,15 @@ def mosaic(
     if not isinstance(source, RangeLines):
         source = validate.path("source", source)
     if client is not None:
-        check_client(client, source, store, device)
-    growth = checked_growth(source, follow_s)
+        _check_client(client, source, store, device)
+    growth = None if follow_s is None else Growth.checked(source, follow_s)
     opened = None if store is None else Store.at(validate.path("store", store))
     given, place = beam, None if opened is None else opened.path
     beam = beam_of_mosaic(beam, source, place, grows=growth is not None)
     devices = () if client is not None else open_devices(device)
+
     if growth is not None:
-        wait_for_first_file(growth)
+        growth.wait_for_first_file()
     survey = open_survey(source if isinstance(source, RangeLines) else source.resolve())
     grid = placed(survey.geometry, grid)
     visibility = SurveyVisibility.of(survey, beam)
@@ -404,41 +232,611 @@ def mosaic(
         warn_before_imaging(lines, grid, beam, last_range_m=survey.last_range_m)
         if beam is not None and beam.along is None:
             warn_of_order(survey)
-    if growth is None and not visibility.channels(grid).any():
-        warn_unreached(survey.geometry, grid, beam, visibility.along, survey.span_m)
+        if not visibility.channels(grid).any():
+            near_m, far_m = survey.geometry.first_range_m.min(), survey.last_range_m.max()
+            span_m = float(near_m), float(far_m)
+            warn_unreached(survey.geometry, grid, beam, visibility.along, span_m)
     if given is not None and given is not beam:
         warn = partial(warn_of_window, given, request=request)
         if growth is None:
             warn(survey.geometry)
         else:
             growth = replace(growth, at_end=warn)
+
     inputs = {} if opened is None else inputs_of(survey, grid, request, beam)
     stored = None if opened is None else opened.patch_shape
     if patch_shape is None:
-        patch_shape = stored or choose_patch_shape(visibility, grid, memory_bytes)
-    layout = Layout(grid, patch_shape)
-    job = Job(
-        files=(),
-        local=None,
-        request=request,
-        beam=beam,
-        memory_bytes=memory_bytes,
-        store=None if opened is None else opened.path,
-    )
+        patch_shape = stored or _choose_patch_shape(visibility, grid, memory_bytes)
     finished: dict[PatchIndex, Record] = {}
     if opened is not None:
         opened.begin(inputs, grid, patch_shape)
-        finished = _still_finished(opened, visibility, layout)
-    run = Run(layout, job, inputs, visibility, devices, client, growth)
-    return Mosaic(grid, patch_shape, finished, run)
+        # Patches to which channels contribute that were added since are formed again.
+        layout = Layout(grid, patch_shape)
+        finished = {
+            index: record
+            for index, record in opened.undamaged_records().items()
+            if not visibility.any_channel_from(record.survey_channels, layout.window(index).grid)
+        }
+    return Mosaic(
+        grid,
+        patch_shape,
+        finished,
+        _form=partial(form_patch, request, memory_bytes, opened),
+        _complete=None if opened is None else opened.complete_levels,
+        _visibility=visibility,
+        _store=opened,
+        _inputs=inputs,
+        _devices=devices,
+        _client=client,
+        _growth=growth,
+    )
 
 
-def _still_finished(
-    store: Store, visibility: SurveyVisibility, layout: Layout
-) -> dict[PatchIndex, Record]:
-    """Return the records of intact patches to which no channel added since then contributes."""
-    return {
-        index: record
-        for index, record in store.undamaged_records().items()
-        if not visibility.any_channel_from(record.survey_channels, layout.window(index).grid)
+def _checked_request(
+    tolerance_db: float | None,
+    tolerance_wavelengths: float | None,
+    stages: Sequence[tuple[int, int]] | None,
+    accuracy_db: float | None,
+) -> dict[str, Any]:
+    """Return the given one of `REQUESTS` after checking it, or the default tolerance."""
+    given = (tolerance_db, tolerance_wavelengths, stages, accuracy_db)
+    request: dict[str, Any] = {
+        name: value for name, value in zip(REQUESTS, given, strict=True) if value is not None
     }
+    if len(request) > 1:
+        first, second, *_ = request
+        raise ArgumentError(second, f"be left out if `{first}` is given")
+    tolerance_in_db(tolerance_db, tolerance_wavelengths)
+    if accuracy_db is not None:
+        validate.number("accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0)
+    # Convert to plain numbers, since the inputs are stored as JSON.
+    for name, value in request.items():
+        if name == "stages":
+            request[name] = checked_pairs(value)
+        elif not isinstance(value, (int, float)):
+            request[name] = float(value)
+    return request or {"tolerance_db": TOLERANCE_DB}
+
+
+def _check_client(client: object, source: object, store: object, device: object) -> None:
+    """Raise TypeError or ValueError unless the other arguments can be used with a client."""
+    if not hasattr(client, "get_executor"):
+        raise ArgumentTypeError("client", "be a `distributed.Client`", repr(client))
+    if store is None:
+        raise ArgumentError("store", "be given with a client, whose workers write to it")
+    if isinstance(source, RangeLines):
+        raise ArgumentError("source", "be a path with a client, whose workers read from it")
+    if device is not None:
+        raise ArgumentError(
+            "device", "be left out with a client", hint="every worker takes one itself"
+        )
+
+
+def beam_of_mosaic(
+    beam: BeamWindow | None, source: RangeLines | Path, store: Path | None, *, grows: bool
+) -> BeamWindow | None:
+    """Return a beam whose weights later pings do not change, if there may be any.
+
+    Files may be added to a folder that is followed, and to one without a file `end` whose mosaic is
+    stored. The mosaic of such a folder keeps its beam when the folder is complete.
+
+    Raises
+    ------
+    ValueError
+        If there may be later pings, and the weights depend on them.
+    """
+    if beam is None or isinstance(source, RangeLines) or not source.is_dir():
+        return beam
+    if grows or (store is not None and not has_ended(source)):
+        if beam.normalise:
+            raise ArgumentError(
+                "beam",
+                "not normalise for a folder that may grow, since the scale depends on the number "
+                "of all channels",
+                hint=f"put an empty file '{END}' into a complete folder",
+            )
+        return _beam_of_growing(beam)
+    if store is not None and is_there(store):
+        growing = _beam_of_growing(beam)
+        if Document.read(store).inputs.get("beam") == json.loads(beam_json(growing)):
+            return growing
+    return beam
+
+
+def _beam_of_growing(beam: BeamWindow) -> BeamWindow:
+    """Return a beam whose direction follows the track over a fixed number of pings."""
+    if beam.along is None and beam.track_pings is None:
+        return replace(beam, track_pings=MOST_TRACK_PINGS)
+    return beam
+
+
+def warn_of_window(beam: BeamWindow, geometry: RangeLines, request: dict[str, Any]) -> None:
+    """Warn if a growing survey's image differs from that of the same pings in one file.
+
+    `beam` is that of the file, whose direction follows the track over another number of pings.
+    The difference is the rms of that of the weights, relative to their own.
+    """
+    if len(geometry.ping_starts) < 2:
+        return
+    growing = _beam_of_growing(beam)
+    sine = np.linalg.norm(np.cross(beam.directions(geometry), growing.directions(geometry)), axis=1)
+    power = shift_error(beam, float(np.sqrt(np.mean(sine**2))), geometry)
+    ways = request.get("tolerance_db"), request.get("tolerance_wavelengths")
+    asked_db = request.get("accuracy_db") or tolerance_in_db(*ways) or TOLERANCE_DB
+    if power > 10 ** (asked_db / 10):
+        validate.warn(
+            "`source` may grow, or did when the mosaic began: the direction of the track is "
+            f"smoothed over {MOST_TRACK_PINGS} pings, whatever their number. The image may differ "
+            f"by {10 * np.log10(power):.0f} dB from that of the {len(geometry.ping_starts)} pings "
+            "in one file. Give `track_pings` for both, or put an empty file "
+            f"'{END}' into a complete folder before its mosaic begins"
+        )
+
+
+def _choose_patch_shape(
+    visibility: SurveyVisibility, grid: Grid, memory_bytes: int
+) -> tuple[int, int]:
+    """Return the number of pixels of the largest patches that are predicted to fit into memory.
+
+    Raises
+    ------
+    ValueError
+        If not even the smallest patches fit.
+    """
+    side = _LARGEST_SIDE
+    needed = 0
+    while side >= _SMALLEST_SIDE:
+        # Make the patches as equal as possible, and levels end at their borders.
+        height, width = aligned_shape(grid.shape, [math.ceil(n / side) for n in grid.shape])
+        most = 0
+        for row in (0, grid.shape[0] - 1):
+            top, left = row // height * height, grid.shape[1] // 2 // width * width
+            window = grid.window(slice(top, top + height), slice(left, left + width))
+            visible = visibility.channels(window)
+            if visible.any():
+                count, length = visibility.survey.extent(visible, *visibility.ranges_m(window))
+                most = max(most, count * length)
+        # Upsampled lines and stages on the device take about one and a half times the lines.
+        needed = _host_bytes(1, most, height * width) + 12 * most + (64 << 20)
+        if needed <= memory_bytes:
+            return height, width
+        side //= 2
+    raise ArgumentError(
+        "memory_bytes",
+        f"be at least {needed / 2**20:.0f} MiB for the smallest patches, of {height} x {width} "
+        "pixels",
+        f"{memory_bytes / 2**20:.3g} MiB",
+        "raise it or give `patches`",
+    )
+
+
+def inputs_of(
+    survey: Survey, grid: Grid, request: dict[str, Any], beam: BeamWindow | None
+) -> dict[str, Any]:
+    """Return the inputs of a mosaic as JSON types."""
+    inputs = {
+        "parts": survey.digests(),
+        "grid": grid_digest(grid),
+        "pixels": list(grid.shape),
+        "carrier_hz": survey.geometry.carrier_hz,
+        "sound_speed_m_s": survey.geometry.sound_speed_m_s,
+        "georeference": None if grid.georeference is None else asdict(grid.georeference),
+        "beam": None if beam is None else json.loads(beam_json(beam)),
+        **{name: request.get(name) for name in REQUESTS},
+    }
+    return json.loads(json.dumps(inputs))
+
+
+@dataclass(frozen=True, eq=False)
+class Mosaic:
+    """An image of any size, to be formed patch by patch or, with `image`, as a whole.
+
+    Iterating over the mosaic yields every `Patch` as soon as it is finished. A second iteration
+    forms only the patches that the store lacks.
+
+    A mosaic can be pickled, together with its lines unless they are in files. The process that
+    unpickles it opens devices of the same names. A mosaic with a client cannot be pickled, since
+    the connection belongs to this process.
+
+    Attributes
+    ----------
+    grid : Grid
+        Grid of the whole mosaic.
+    patch_shape : (rows, columns)
+        Number of pixels of a patch; the last patches along each axis may be smaller.
+    shape : (rows, columns)
+        Number of patches.
+    finished : dict of (row, column) to Record
+        Records of the finished patches in the store.
+
+    See Also
+    --------
+    mosaic : Prepare a mosaic.
+    Store : Read a mosaic from its store.
+    """
+
+    grid: Grid
+    patch_shape: tuple[int, int]
+    finished: dict[PatchIndex, Record]
+    _form: Callable[[PatchWindow, Source], tuple[Record, Image | None]]
+    _complete: Callable[[], object] | None  # called once all patches are finished
+    _visibility: SurveyVisibility  # the survey when the mosaic was requested
+    _store: Store | None
+    _inputs: dict[str, Any]  # as stored with the mosaic
+    _devices: tuple[Device, ...]  # of this process; empty with a client
+    _client: Client | None = None
+    _growth: Growth | None = None  # None if no files are to be added
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields to pickle; the process that unpickles them opens the devices again.
+
+        Raises
+        ------
+        TypeError
+            If the mosaic has a client, whose connection belongs to this process.
+        """
+        if self._client is not None:
+            raise TypeError(
+                "a mosaic with a client cannot be pickled, since the connection belongs to this "
+                "process: call `clsas.mosaic` where it is needed, with the same source and store"
+            )
+        return self.__dict__
+
+    def __repr__(self) -> str:
+        """Return the number of patches and of finished ones, the store and the extents."""
+        store = None if self._store is None else str(self._store.path)
+        return reprs.summary(
+            self,
+            f"{reprs.by(self.shape)} patches of {reprs.by(self.patch_shape)} pixels",
+            f"{len(self.finished)} of {len(self)} finished",
+            None if store is None else f"store {store!r}",
+            reprs.extents(*self.grid.bounds_m),
+        )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of patches along rows and columns."""
+        return self._layout.shape
+
+    def __len__(self) -> int:
+        """Return the number of patches, finished or not."""
+        return len(self._layout)
+
+    def __iter__(self) -> Generator[Patch, None, None]:
+        """Form the patches that are not finished, and yield each of them.
+
+        Raises
+        ------
+        OSError
+            If the store cannot be written, for example on a full disk. Finished patches remain.
+        ValueError
+            If a patch cannot be imaged; the message names the patch.
+        """
+        survey = GrowingSurvey(self._visibility, self._growth, self._store, self._inputs)
+        layout, finished = self._layout, self.finished
+        todo = dict.fromkeys(index for index in layout.indices() if index not in finished)
+        # For every patch, the number of channels in the survey when it was last formed or checked.
+        known = {index: record.survey_channels for index, record in finished.items()}
+        checked = survey.channels  # when all patches were last checked
+        executor: Executor
+        if self._client is not None:  # a cluster returns only records
+            executor, most_running = self._client.get_executor(pure=False), _MOST_ON_CLUSTER
+        else:
+            # One more than there are threads, since finished patches stay in memory until taken.
+            workers = max(min(len(self._devices), len(layout)), 1)
+            executor, most_running = device_threads(workers, self._devices), workers + 1
+        running: dict[Future, PatchIndex] = {}
+        try:
+            ready = survey.ready(layout, todo)
+            while True:
+                while ready and len(running) < most_running:
+                    index = ready.popleft()
+                    del todo[index]
+                    source = survey.visibility if self._client is None else survey.for_workers()
+                    with uninterrupted():
+                        future = executor.submit(self._form, layout.window(index), source)
+                        running[future] = index
+                    known[index] = survey.channels
+                if not running and not todo and survey.has_ended:
+                    if self._complete is not None:
+                        self._complete()
+                    return
+                timeout_s = None if survey.has_ended and running else POLL_S
+                done = wait(running or [Future()], timeout_s)
+                latest = [index for future, index in running.items() if future in done]
+                for future in [future for future in running if future in done]:
+                    with uninterrupted():
+                        index = running.pop(future)
+                        record, image = future.result()
+                    if self._store is not None:
+                        finished[index] = record
+                    yield self._patch(index, record, image)
+
+                # Form patches again if channels that were added later contribute to them. A patch
+                # that is running is checked when it is finished.
+                news = survey.update()
+                busy = set(running.values())
+                for index in known if survey.channels > checked else latest:
+                    if known[index] >= survey.channels or index in busy or index in todo:
+                        continue
+                    if survey.visibility.any_channel_from(known[index], layout.window(index).grid):
+                        todo[index] = None
+                        news = True
+                    known[index] = survey.channels
+                checked = survey.channels
+                if news:
+                    ready = survey.ready(layout, todo)
+        finally:
+            # If the caller stops early, patches that have been started are still completed.
+            with uninterrupted():
+                begun = {future for future in running if not future.cancel()}
+            # Wait for patches that this process's threads have begun. A cluster may be gone by now.
+            left = begun if self._client is None else set()
+            while left:
+                left = left - wait(left)
+            with uninterrupted():
+                executor.shutdown(wait=self._client is None)
+                if self._client is None and self._store is not None:
+                    for future in begun:
+                        if future.exception() is None:
+                            finished[running[future]] = future.result()[0]
+
+    def image(self, tell: Callable[[Patch], object] | None = None) -> Image:
+        """Form the patches that are not finished, and return the whole image.
+
+        Finished patches are read from the store. Patches from which no channel receives are zero.
+
+        Parameters
+        ----------
+        tell : callable, optional
+            Called with every patch once its pixels are in the image: first with those of the store,
+            then with the others as they are finished. If a patch is formed again, the function is
+            called with it again.
+
+        Returns
+        -------
+        Image
+            Image on all of `grid`. It takes 8 bytes of memory per pixel, in addition to the memory
+            of the patches that are being formed. `Image.formed` is None if patches were read from
+            the store, whose `Record` says how each was formed.
+
+        Raises
+        ------
+        OSError
+            If the store cannot be read or written. Finished patches remain.
+        ValueError
+            If the image does not fit into the memory of this machine, or a patch cannot be imaged;
+            the message names the patch.
+        """
+        validate.function("tell", tell)
+        validate.memory("the mosaic", 8 * self.grid.size)
+        stored = [self._patch(index, record, None) for index, record in self.finished.items()]
+        pixels: NDArray[np.complex64] | None = None
+        formed: dict[PatchIndex, Formed | None] = {}
+        for patch in chain(stored, self):
+            image = patch.image
+            if patch.record.has_pixels:
+                formed[patch.row, patch.column] = image.formed
+            if image.pixels.shape == self.grid.shape:
+                whole = image  # copying the pixels can take as long as forming the image
+            else:
+                if pixels is None:
+                    pixels = np.empty(self.grid.shape, np.complex64)
+                pixels[patch.rows, patch.columns] = image.pixels
+            if tell is not None:
+                tell(patch)
+        if pixels is None:
+            return whole
+        known = [each for each in formed.values() if each is not None]
+        if not known or len(known) < len(formed):
+            return Image(pixels, self.grid)
+        errors_db = [each.predicted_error_db for each in known]
+        how = Formed(
+            method="mosaic",
+            tolerance_db=known[0].tolerance_db,
+            plan=f"{reprs.by(self.shape)} patches of {reprs.by(self.patch_shape)} pixels",
+            predicted_error_db=max((e for e in errors_db if e is not None), default=None),
+            beam=self._visibility.beam,
+            left_out=tuple(dict.fromkeys(e for each in known for e in each.left_out)),
+            device=", ".join(dict.fromkeys(each.device for each in known)),
+            version=__version__,
+            lines_digest=digest(sorted(each.lines_digest for each in known)),
+        )
+        return Image(pixels, self.grid, how)
+
+    @property
+    def _layout(self) -> Layout:
+        return Layout(self.grid, self.patch_shape)
+
+    def _patch(self, index: PatchIndex, record: Record, formed: Image | None) -> Patch:
+        grid, row, column, rows, columns = self._layout.window(index)
+        return Patch(row, column, rows, columns, grid, record, formed, self._store)
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """A finished patch of a mosaic.
+
+    Attributes
+    ----------
+    row, column : int
+        Index of the patch.
+    rows, columns : slice
+        Pixels of the mosaic's grid that belong to the patch.
+    grid : Grid
+        Grid of these pixels.
+    record : Record
+        How the patch was formed: errors, seconds, plan, gaps.
+    """
+
+    row: int
+    column: int
+    rows: slice
+    columns: slice
+    grid: Grid
+    record: Record
+    _formed: Image | None
+    _store: Store | None
+
+    def __repr__(self) -> str:
+        """Return the patch's index, size and extents."""
+        return reprs.summary(
+            self,
+            f"row {self.row}",
+            f"column {self.column}",
+            f"{reprs.by(self.grid.shape)} pixels",
+            reprs.extents(*self.grid.bounds_m),
+        )
+
+    @property
+    def image(self) -> Image:
+        """Image of the patch. It is read from the store if another process formed it.
+
+        Raises
+        ------
+        ValueError
+            If the patch in the store is damaged.
+        OSError
+            If the store cannot be read.
+        """
+        if self._formed is not None:
+            return self._formed
+        if self._store is None:
+            raise RuntimeError("the patch has neither pixels nor a store to read them from")
+        return Image(self._store.read(self.rows, self.columns), self.grid)
+
+
+def form_patch(
+    request: dict[str, Any],
+    memory_bytes: int,
+    store: Store | None,
+    window: PatchWindow,
+    source: Source,
+) -> tuple[Record, Image | None]:
+    """Form one patch and write it to the store.
+
+    With a client, the arguments are pickled with every patch: one of `REQUESTS` with its value, and
+    no samples. A worker process returns no image: the main process reads the pixels from the store.
+    If the patch cannot be imaged, a note of the ValueError names it.
+    """
+    in_process = isinstance(source, SurveyVisibility)
+    try:
+        if isinstance(source, SurveyVisibility):
+            record, image = _image(request, memory_bytes, source, window.grid, thread_device())
+        else:
+            device = process_device()
+            visibility = opened_visibility(*source)
+            record, image = _image(request, memory_bytes, visibility, window.grid, device)
+    except ValueError as error:
+        error.add_note(f"patch {window.row},{window.column}")
+        raise
+    if store is not None:
+        place = (window.row, window.column, window.rows, window.columns)
+        store.write(*place, image.pixels, record)
+    return record, image if in_process else None
+
+
+def _image(
+    request: dict[str, Any],
+    memory_bytes: int,
+    visibility: SurveyVisibility,
+    grid: Grid,
+    device: Device,
+) -> tuple[Record, Image]:
+    """Return the image of one patch and the record of how it was formed."""
+    start = time.perf_counter()
+    survey, visible = visibility.survey, visibility.channels(grid)
+    known: dict[str, Any] = {
+        "survey_channels": survey.channels,
+        "device": device.info.label,
+        "driver": device.info.driver,
+        "channels": int(np.count_nonzero(visible)),
+    }
+
+    def empty() -> tuple[Record, Image]:
+        pixels: NDArray[np.complex64] = np.zeros(grid.shape, np.complex64)
+        return Record(**known, seconds=time.perf_counter() - start), Image(pixels, grid)
+
+    if not visible.any():
+        return empty()
+    lines, missing = survey.read(visible, *visibility.ranges_m(grid))
+    known |= {
+        "missing_channels": int(np.count_nonzero(missing)),
+        "gap_m": largest_gap_m(lines, missing),
+        "read_seconds": time.perf_counter() - start,
+    }
+    if missing.all():
+        return empty()
+    beam = visibility.beam
+    if beam is not None and visibility.along is not None:
+        beam = replace(beam, along=visibility.along[visible][~missing])
+    if missing.any():
+        lines = lines.select(~missing)
+    if not reaches(lines, grid, beam, None if beam is None else beam.along):
+        return empty()
+
+    image, how = _formed(request, memory_bytes, lines, grid, beam, device)
+    if beam is not None and beam.normalise:
+        # The beam was normalised by the number of channels of this patch instead of all channels.
+        scale = np.float32(survey.channels / lines.channels)
+        image = replace(image, pixels=scale * image.pixels) if scale != 1 else image
+    known |= how | {
+        "has_pixels": holds_any(image.pixels),
+        "seconds": time.perf_counter() - start,
+    }
+    return Record(**known), image
+
+
+def _formed(
+    request: dict[str, Any],
+    memory_bytes: int,
+    lines: RangeLines,
+    grid: Grid,
+    beam: BeamWindow | None,
+    device: Device,
+) -> tuple[Image, dict[str, Any]]:
+    """Return the image of some lines, and the fields of its record that describe the method."""
+    patch_bytes = _host_bytes(lines.channels, lines.length, grid.size)
+    if patch_bytes >= memory_bytes:
+        raise ArgumentError(
+            "memory_bytes",
+            f"be more than {patch_bytes / 2**20:.1f} MiB for {grid.shape[0]} x {grid.shape[1]} "
+            f"pixels from {lines.channels} lines of {lines.length} samples",
+            f"{memory_bytes / 2**20:.1f} MiB",
+            "use smaller patches",
+        )
+    accuracy_db = request.get("accuracy_db")
+    worth_a_plan = "stages" in request or lines.channels * grid.size > _WORTH_A_PLAN
+    if accuracy_db is None and not worth_a_plan:
+        accuracy_db = tolerance_in_db(*(request.get(name) for name in REQUESTS[:2]))
+    if accuracy_db is not None:
+        scene = Scene.of(lines, grid, beam, accuracy_db)
+        scene.warn("accuracy_db", accuracy_db, doubts=False)
+        # The record reports if the patch is zero.
+        imager = SceneImager(scene, ExactImage(accuracy_db), device, warned=True, keep=False)
+        assert imager.decision is not None
+        error_db = max(accuracy_db, imager.decision.error_db(scene))
+        how = {"predicted_error_db": error_db, "memory_bytes": patch_bytes}
+        return imager.form(lines), how
+
+    before = time.perf_counter()
+    available = min(memory_bytes - patch_bytes, device.info.memory_bytes // 2)
+    asked = Request(lines, grid, **request, beam=beam, memory_bytes=available)
+    scene = asked.scene()
+    scene.warn("tolerance_db", asked.tolerance_db, doubts=False)
+    chosen, track = planned(scene, asked, device)
+    # The beam's directions would be most of a record.
+    beam = None if chosen.beam is None else replace(chosen.beam, along=None)
+    how = {
+        "plan_seconds": time.perf_counter() - before,
+        "predicted_error_db": chosen.predicted_error_db,
+        "predicted_seconds": chosen.predicted_seconds,
+        "memory_bytes": patch_bytes + int(chosen.memory_bytes),
+        "plan": json.loads(replace(chosen, beam=beam).to_json()),
+    }
+    return form(scene, chosen, device, track=track, warned=True), how
+
+
+def _host_bytes(channels: int, length: int, pixels: int) -> int:
+    """Return the bytes for the lines and pixels of a patch, each with one working copy."""
+    return 2 * 8 * (channels * length + pixels)

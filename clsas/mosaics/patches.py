@@ -1,22 +1,18 @@
-"""Division of a mosaic into patches, and the choice of their size."""
+"""Division of a mosaic into patches."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 from clsas.engine.data import validate
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
+from clsas.mosaics.document import PatchIndex
 from clsas.mosaics.levels import aligned_side, factors_of
-from clsas.mosaics.record import PatchIndex
-from clsas.mosaics.visibility import SurveyVisibility
-
-_LARGEST_SIDE = 4096  # pixels; such a patch takes seconds, and larger ones gain nothing
-_SMALLEST_SIDE = 128  # pixels; reading and planning smaller patches takes longer than imaging
 
 
 class PatchWindow(NamedTuple):
@@ -70,77 +66,24 @@ class Layout:
         return itertools.product(range(rows), range(columns))
 
 
-@dataclass(frozen=True, eq=False)
-class Wide:
-    """A patch with a margin, as far as the grid of the mosaic reaches.
+def with_margin(
+    window: PatchWindow, margin: tuple[int, int], shape: tuple[int, ...]
+) -> tuple[slice, slice, tuple[slice, slice]]:
+    """Return a patch with so many pixels beyond each side, as far as a mosaic of a shape reaches.
 
-    Attributes
-    ----------
+    Returns
+    -------
     rows, columns : slice
         Its pixels in the mosaic.
     inside : (rows, columns)
         Where the patch lies in it.
     """
-
-    rows: slice
-    columns: slice
-    inside: tuple[slice, slice]
-
-    @classmethod
-    def of(cls, window: PatchWindow, margin: tuple[int, int], shape: tuple[int, ...]) -> Self:
-        """Return a patch with so many rows and columns beyond each side."""
-        outer, inner = [], []
-        for part, side, count in zip((window.rows, window.columns), margin, shape, strict=True):
-            begin = max(part.start - side, 0)
-            outer.append(slice(begin, min(part.stop + side, count)))
-            inner.append(slice(part.start - begin, part.stop - begin))
-        return cls(outer[0], outer[1], (inner[0], inner[1]))
-
-
-def host_bytes(channels: int, length: int, pixels: int) -> int:
-    """Return the bytes for the lines and pixels of a patch, each with one working copy."""
-    return 2 * 8 * (channels * length + pixels)
-
-
-def choose_patch_shape(
-    visibility: SurveyVisibility, grid: Grid, memory_bytes: int
-) -> tuple[int, int]:
-    """Return the number of pixels of the largest patches that are predicted to fit into memory.
-
-    Raises
-    ------
-    ValueError
-        If not even the smallest patches fit.
-    """
-    side = _LARGEST_SIDE
-    coarsest = factors_of(grid.shape)[-1]
-    needed = 0
-    while side >= _SMALLEST_SIDE:
-        # Make the patches as equal as possible, and levels end at their borders.
-        height, width = (
-            aligned_side(math.ceil(n / math.ceil(n / side)), math.ceil(n / side), n, coarsest)
-            for n in grid.shape
-        )
-        most = 0
-        for row in (0, grid.shape[0] - 1):
-            top, left = row // height * height, grid.shape[1] // 2 // width * width
-            window = grid.window(slice(top, top + height), slice(left, left + width))
-            visible = visibility.channels(window)
-            if visible.any():
-                count, length = visibility.survey.extent(visible, *visibility.ranges_m(window))
-                most = max(most, count * length)
-        # Upsampled lines and stages on the device take about one and a half times the lines.
-        needed = host_bytes(1, most, height * width) + 12 * most + (64 << 20)
-        if needed <= memory_bytes:
-            return height, width
-        side //= 2
-    raise ArgumentError(
-        "memory_bytes",
-        f"be at least {needed / 2**20:.0f} MiB for the smallest patches, of {height} x {width} "
-        "pixels",
-        f"{memory_bytes / 2**20:.3g} MiB",
-        "raise it or give `patches`",
-    )
+    outer, inner = [], []
+    for part, side, count in zip((window.rows, window.columns), margin, shape, strict=True):
+        begin = max(part.start - side, 0)
+        outer.append(slice(begin, min(part.stop + side, count)))
+        inner.append(slice(part.start - begin, part.stop - begin))
+    return outer[0], outer[1], (inner[0], inner[1])
 
 
 def patch_shape_of(patches: tuple[int, int], grid: Grid) -> tuple[int, int]:
@@ -159,7 +102,6 @@ def patch_shape_of(patches: tuple[int, int], grid: Grid) -> tuple[int, int]:
         raise ArgumentTypeError("patches", f"be {meaning}", repr(patches)) from None
     if len(counts) != 2:
         raise ArgumentError("patches", f"be {meaning}", repr(patches))
-    shape = []
     for count, pixels in zip(counts, grid.shape, strict=True):
         side = math.ceil(pixels / count)
         if math.ceil(pixels / side) != count:
@@ -170,5 +112,17 @@ def patch_shape_of(patches: tuple[int, int], grid: Grid) -> tuple[int, int]:
                 f"{count} patches of {side} for {pixels} pixels",
                 f"{fewer} are enough",
             )
-        shape.append(aligned_side(side, count, pixels, factors_of(grid.shape)[-1]))
-    return shape[0], shape[1]
+    return aligned_shape(grid.shape, counts)
+
+
+def aligned_shape(shape: tuple[int, ...], counts: Sequence[int]) -> tuple[int, int]:
+    """Return the pixels of a patch, given the number of patches along each axis.
+
+    They are rounded up so that as many levels as possible end at the borders of patches.
+    """
+    coarsest = factors_of(shape)[-1]
+    rows, columns = (
+        aligned_side(math.ceil(pixels / count), count, pixels, coarsest)
+        for pixels, count in zip(shape, counts, strict=True)
+    )
+    return rows, columns

@@ -9,7 +9,7 @@ Memory is that of a few patches.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -20,9 +20,9 @@ from clsas.engine.data.grid import Grid, without_heights
 from clsas.interferometry.baseline import Lattice
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.shadows import ReliefPart, Skyline
+from clsas.mosaics.document import PatchIndex, Record
 from clsas.mosaics.levels import LAYERS, SHADOWED
-from clsas.mosaics.patches import Layout, PatchWindow, Wide
-from clsas.mosaics.record import PatchIndex, Record
+from clsas.mosaics.patches import Layout, PatchWindow, with_margin
 from clsas.mosaics.store import Store
 
 _KEPT = 8  # patches whose skyline is kept: those that lines of sight from one patch cross at once
@@ -47,15 +47,20 @@ def of_shadows(
     sights : Lattice
         K and the tangent, over the patch with its margin.
     """
-    relief = _Relief.joined(layers)
-    z_m = without_heights(grid).positions_m()[..., 2] + relief.offset_m
+    offset_m, _ = _relief(layers)
+    valid = ~np.isnan(offset_m)
+    z_m = without_heights(grid).positions_m()[..., 2] + offset_m
+    # Tangents are rounded to some digits of the largest one.
+    tangent = sights.values[..., 1:]
+    largest = float(np.abs(tangent).max(initial=0.0))
+    decimals = _DIGITS - int(np.ceil(np.log10(largest))) if largest else 0
     return {
-        _HIGHEST: float(z_m[relief.valid].max()) if relief.valid.any() else None,
+        _HIGHEST: float(z_m[valid].max()) if valid.any() else None,
         _SIGHTS: {
             "rows": sights.rows.tolist(),
             "columns": sights.columns.tolist(),
             "offset_m": sights.offset_m.tolist(),
-            "tangent": _rounded(sights.values[..., 1:]).tolist(),
+            "tangent": np.round(tangent, decimals).tolist(),
         },
     }
 
@@ -82,195 +87,133 @@ def mask_shadows(store: Store) -> int:
     }
     if not records:
         return 0
-    seabed = _Seabed.of(store, records)
+    seabed, written = _Seabed(store, records), 0
     fine, coarse = seabed.skylines()
-    return sum(_masked(store, seabed, index, fine, coarse) for index in records)
+    for index, record in records.items():
+        window = seabed.layout.window(index)
+        rows, columns = window.rows, window.columns
+        part, inside, _ = seabed.part(index)
+        hidden = part.hidden_by(fine, coarse, inside)
+        layers = {name: store.read_layer(name, rows, columns) for name in (*LAYERS, *SHADOWED)}
+        if np.array_equal(hidden, ~np.isnan(layers[_SHADOW_HEIGHT])):
+            continue
+        offset_m, sd_m = _relief(layers)
+        for name, shadow, values in ((_HEIGHT, _SHADOW_HEIGHT, offset_m), (_SD, _SHADOW_SD, sd_m)):
+            layers[name] = np.where(hidden, np.float32(np.nan), values)
+            layers[shadow] = np.where(hidden, values, np.float32(np.nan))
+        assert record.heights is not None
+        valid = float(np.mean(~np.isnan(offset_m) & ~hidden))
+        masked = replace(record, heights=record.heights | {"valid": valid})
+        store.write(*index, rows, columns, store.read(rows, columns), masked, layers)
+        written += 1
+    return written
 
 
-def _masked(
-    store: Store, seabed: _Seabed, index: PatchIndex, fine: Skyline, coarse: Skyline
-) -> bool:
-    """Write the shadows of a patch unless they are as they should be; return whether it did."""
-    window = seabed.layout.window(index)
-    part, wide = seabed.part(index)
-    hidden = part.hidden_by(fine, coarse, wide.inside)
-    rows, columns = window.rows, window.columns
-    layers = {name: store.read_layer(name, rows, columns) for name in (*LAYERS, *SHADOWED)}
-    if np.array_equal(hidden, ~np.isnan(layers[_SHADOW_HEIGHT])):
-        return False
-    relief = _Relief.joined(layers)
-    for name, shadow, values in (
-        (_HEIGHT, _SHADOW_HEIGHT, relief.offset_m),
-        (_SD, _SHADOW_SD, relief.sd_m),
-    ):
-        layers[name] = np.where(hidden, np.float32(np.nan), values)
-        layers[shadow] = np.where(hidden, values, np.float32(np.nan))
-    record = seabed.records[index]
-    assert record.heights is not None
-    valid = float(np.mean(relief.valid & ~hidden))
-    record = replace(record, heights=record.heights | {"valid": valid})
-    store.write(*index, rows, columns, store.read(rows, columns), record, layers)
-    return True
+def _relief(
+    layers: dict[str, NDArray[np.float32]],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return heights of pixels, whether in shadow or not, and their deviations."""
+    offset_m, sd_m = (
+        np.where(np.isnan(layers[shadow]), layers[name], layers[shadow])
+        for name, shadow in ((_HEIGHT, _SHADOW_HEIGHT), (_SD, _SHADOW_SD))
+    )
+    return offset_m, sd_m
 
 
-@dataclass(frozen=True, eq=False)
-class _Relief:
-    """Heights of a window, whether in shadow or not, float32 [rows, columns].
-
-    Attributes
-    ----------
-    offset_m, sd_m : float32
-    """
-
-    offset_m: NDArray[np.float32]
-    sd_m: NDArray[np.float32]
-
-    @classmethod
-    def joined(cls, layers: dict[str, NDArray[np.float32]]) -> _Relief:
-        """Return what layers contain of a relief."""
-        return cls(
-            *(
-                np.where(np.isnan(layers[shadow]), layers[name], layers[shadow])
-                for name, shadow in ((_HEIGHT, _SHADOW_HEIGHT), (_SD, _SHADOW_SD))
-            )
-        )
-
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """Pixels with a height."""
-        return ~np.isnan(self.offset_m)
-
-
-@dataclass(frozen=True, eq=False)
 class _Seabed:
-    """Heights of a store, to be read patch by patch.
+    """Heights of a store, to be read patch by patch, given the records of patches with heights."""
 
-    Attributes
-    ----------
-    store : Store
-    layout : Layout
-    window : Window
-    margin : (rows, columns)
-        Pixels beyond each side of a patch that were measured with it.
-    records : dict of (row, column) to Record
-        Patches with heights.
-    """
-
-    store: Store
-    layout: Layout
-    window: Window
-    margin: tuple[int, int]
-    records: dict[PatchIndex, Record]
-
-    @classmethod
-    def of(cls, store: Store, records: dict[PatchIndex, Record]) -> _Seabed:
-        """Return the heights of a store, given the records of patches with heights."""
+    def __init__(self, store: Store, records: dict[PatchIndex, Record]) -> None:
         document = store.document
         assert document.window is not None  # the store has heights
-        down, across = document.inputs["margin"]
-        layout = Layout(without_heights(store.grid), document.patch_shape)
-        return cls(store, layout, Window(*document.window), (down, across), records)
+        self.layout = Layout(without_heights(store.grid), document.patch_shape)
+        self._store, self._records = store, records
+        self._window = Window(*document.window)
+        self._margin: tuple[int, int] = tuple(document.inputs["margin"])
 
-    def part(self, index: PatchIndex) -> tuple[ReliefPart, Wide]:
-        """Return a patch with heights and its margin, as it was measured."""
-        wide = Wide.of(self.layout.window(index), self.margin, self.layout.grid.shape)
-        relief = _Relief.joined(
-            {
-                name: self.store.read_layer(name, wide.rows, wide.columns)
-                for name in (_HEIGHT, _SD, _SHADOW_HEIGHT, _SHADOW_SD)
-            }
+    def part(
+        self, index: PatchIndex
+    ) -> tuple[ReliefPart, tuple[slice, slice], tuple[slice, slice]]:
+        """Return a patch and its margin, as it was measured; where it lies in it; and its pixels.
+
+        The pixels are those of the patch with its margin, rows and columns of the mosaic.
+        """
+        rows, columns, inside = with_margin(
+            self.layout.window(index), self._margin, self.layout.grid.shape
+        )
+        names = (_HEIGHT, _SD, _SHADOW_HEIGHT, _SHADOW_SD)
+        offset_m, sd_m = _relief(
+            {name: self._store.read_layer(name, rows, columns) for name in names}
+        )
+        heights = self._records[index].heights
+        assert heights is not None
+        sights = heights[_SIGHTS]
+        tangent = np.array(sights["tangent"], np.float64)
+        k = np.zeros_like(tangent[..., :1])  # which is not needed
+        lattice = Lattice(
+            np.array(sights["rows"], np.float64),
+            np.array(sights["columns"], np.float64),
+            np.array(sights["offset_m"], np.float64),
+            np.concatenate([k, tangent], axis=-1),
         )
         part = ReliefPart.of(
-            self.layout.grid.window(wide.rows, wide.columns),
-            np.nan_to_num(relief.offset_m.astype(np.float64)),
-            np.nan_to_num(relief.sd_m.astype(np.float64)),
-            relief.valid,
-            _lattice(self.records[index]),
-            self.window,
-            (wide.rows.start, wide.columns.start),
+            self.layout.grid.window(rows, columns),
+            np.nan_to_num(offset_m.astype(np.float64)),
+            np.nan_to_num(sd_m.astype(np.float64)),
+            ~np.isnan(offset_m),
+            lattice,
+            self._window,
+            (rows.start, columns.start),
         )
-        return part, wide
+        return part, inside, (rows, columns)
 
     def skylines(self) -> tuple[Skyline, Skyline]:
         """Return the skylines of pixels and of blocks, computed for the patches that are asked for.
 
         No roof is higher than the highest pixel.
         """
-        most_m = max(record.heights[_HIGHEST] for record in self.records.values() if record.heights)
-        every = max(min(self.window.sides) // 2, 1)
-        pixels = self.layout.grid.shape
-        blocks = tuple(-(-n // every) for n in pixels)
+        layout, records = self.layout, self._records
+        most_m = max(record.heights[_HIGHEST] for record in records.values() if record.heights)
+        every = max(min(self._window.sides) // 2, 1)
 
         @lru_cache(maxsize=_KEPT)
         def tiles(index: PatchIndex) -> tuple[_Tile, _Tile]:
-            part, wide = self.part(index)
-            window = self.layout.window(index)
-            return _Tile.of(part.roof_m, wide, window, 1), _Tile.of(
-                part.highest_m, wide, window, every
-            )
+            part, _, around = self.part(index)
+            window = layout.window(index)
+            fine = _tile(part.roof_m, around, window, 1)
+            return fine, _tile(part.highest_m, around, window, every)
 
         def at(place: NDArray[np.int64], side: int, which: int) -> NDArray[np.float64]:
-            of = place * side // np.array(self.layout.patch_shape)[:, None]
-            number = np.ravel_multi_index(tuple(of), self.layout.shape)
+            of = place * side // np.array(layout.patch_shape)[:, None]
+            number = np.ravel_multi_index(tuple(of), layout.shape)
             found = np.full(number.shape, -np.inf)
             for each in np.unique(number):
-                row, column = map(int, np.unravel_index(each, self.layout.shape))
-                if (row, column) in self.records:
+                row, column = map(int, np.unravel_index(each, layout.shape))
+                if (row, column) in records:
                     some = number == each
-                    found[some] = tiles((row, column))[which].at(place[:, some])
+                    values, first = tiles((row, column))[which]
+                    found[some] = values[tuple(place[:, some] - first)]
             return found
 
+        pixels = layout.grid.shape
+        blocks = tuple(-(-n // every) for n in pixels)
         return (
             Skyline(pixels, most_m, lambda place: at(place, 1, 0)),
             Skyline(blocks, most_m, lambda place: at(place, every, 1)),
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Tile:
-    """A skyline over a patch.
-
-    Attributes
-    ----------
-    values : float64 [rows, columns]
-    first : int64 [2, 1]
-        Place of the first of them.
-    """
-
-    values: NDArray[np.float64]
-    first: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, values: NDArray[np.float64], wide: Wide, window: PatchWindow, every: int) -> _Tile:
-        """Return the values at the first pixel of each block in a patch; it may have none."""
-        first = [-(-part.start // every) for part in (window.rows, window.columns)]
-        rows, columns = (
-            slice(n * every - around.start, part.stop - around.start, every)
-            for n, part, around in zip(
-                first, (window.rows, window.columns), (wide.rows, wide.columns), strict=True
-            )
-        )
-        return cls(values[rows, columns].copy(), np.array(first)[:, None])
-
-    def at(self, place: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the values at places, int64 [2, n]."""
-        return self.values[tuple(place - self.first)]
+_Tile = tuple[NDArray[np.float64], NDArray[np.int64]]  # values over a patch, place of the first
 
 
-def _lattice(record: Record) -> Lattice:
-    """Return the tangents in the record of a patch; K is not needed, and 0."""
-    assert record.heights is not None
-    stored = record.heights[_SIGHTS]
-    tangent = np.array(stored["tangent"], np.float64)
-    rows, columns, offset_m = (
-        np.array(stored[name], np.float64) for name in ("rows", "columns", "offset_m")
+def _tile(
+    values: NDArray[np.float64], around: tuple[slice, slice], window: PatchWindow, every: int
+) -> _Tile:
+    """Return the values at the first pixel of each block in a patch; it may have none."""
+    own = window.rows, window.columns
+    first = [-(-part.start // every) for part in own]
+    rows, columns = (
+        slice(n * every - wide.start, part.stop - wide.start, every)
+        for n, part, wide in zip(first, own, around, strict=True)
     )
-    values = np.concatenate([np.zeros_like(tangent[..., :1]), tangent], axis=-1)
-    return Lattice(rows, columns, offset_m, values)
-
-
-def _rounded(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return values rounded to some digits of the largest one."""
-    largest = float(np.abs(values).max(initial=0.0))
-    decimals = _DIGITS - int(np.ceil(np.log10(largest))) if largest else 0
-    return np.round(values, decimals)
+    return values[rows, columns].copy(), np.array(first)[:, None]

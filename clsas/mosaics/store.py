@@ -7,14 +7,14 @@ the disk.
 
 from __future__ import annotations
 
-import importlib
+import itertools
 import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
-from types import MappingProxyType, ModuleType
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,28 +25,37 @@ from clsas.engine.data.extras import needed
 from clsas.engine.data.grid import Grid, without_heights
 from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
+from clsas.interferometry.refinement import filled
 from clsas.interferometry.result import Heights
-from clsas.mosaics import stored_heights
 from clsas.mosaics.document import (
     GROUP,
     REPAIR,
     DamageError,
     Document,
+    OtherInputsError,
+    PatchIndex,
+    Record,
     check_inputs,
     check_place,
+    describe_arrays,
+    describe_damage,
+    differences,
     is_there,
+    stamp_of,
 )
-from clsas.mosaics.levels import LEVELS, SHADOWED
+from clsas.mosaics.levels import LAYERS, LEVELS, SHADOWED, level_shape
 from clsas.mosaics.overview import Reading, reduced, step_of
-from clsas.mosaics.provenance import OtherInputsError, differences
-from clsas.mosaics.record import PatchIndex, Record, describe_arrays, describe_damage
+from clsas.mosaics.pyramid import coarser
 
 if TYPE_CHECKING:
     import zarr
 
-    from clsas.mosaics.patch_files import PatchFiles
+    from clsas.mosaics.store_files import StoreFiles
 
 _OVERVIEW = 1024  # pixels along the longer side, which fills a screen
+_READ = 2048  # pixels along a side that are read at once; a plain choice
+_AMPLITUDE = "amplitude"
+_HEIGHTS_BYTES = 100  # per pixel of `Heights`: eight numbers and their copies
 
 
 @dataclass(frozen=True)
@@ -78,7 +87,7 @@ class Store:
         ImportError
             If Zarr is not installed.
         """
-        _zarr("patch_files")
+        _store_files()
         return cls(validate.path("path", path).resolve())
 
     @classmethod
@@ -121,7 +130,7 @@ class Store:
     @property
     def pixels(self) -> zarr.Array:
         """Pixels on disk, complex64 [rows, columns]. Zarr verifies their checksums on reading."""
-        return self._files.arrays.opened("pixels")
+        return self._files.opened("pixels")
 
     @property
     def layers(self) -> tuple[str, ...]:
@@ -136,7 +145,7 @@ class Store:
         has finished all patches.
         """
         levels = self.document.levels
-        if levels.of_mosaic and _zarr("completing").is_current(self._files):
+        if levels.of_mosaic and self._files.levels_are_current():
             return levels.factors
         return tuple(factor for factor in levels.of_patches if factor > 1)
 
@@ -150,7 +159,7 @@ class Store:
             If the mosaic has arbitrary points, which are not stored, or if heights are damaged.
         """
         try:
-            grid = self._files.arrays.grid()
+            grid = self._files.grid()
         except DamageError as error:
             raise ValueError(f"{self.path} is damaged: height: {error}{REPAIR}") from error
         if grid is None:
@@ -175,7 +184,7 @@ class Store:
         ValueError
             If the store's own document is damaged.
         """
-        return _zarr("completing").damage(self._files) | self._files.arrays.damage()
+        return self._files.level_damage() | self._files.array_damage()
 
     def begin(
         self,
@@ -219,7 +228,7 @@ class Store:
             plane = None if grid.points_m is not None else without_heights(grid)
             has_height = grid.height_m is not None
             document = Document(inputs, patch_shape, plane, has_height, window_shape, {})
-            _zarr("arrays").StoredArrays.create(self.path, document, grid)
+            _store_files().create(self.path, document, grid)
         if found := differences(self.document, inputs, patch_shape):
             ways = "choose another path or repeat the inputs"
             if not any((self.path / GROUP).glob("*/zarr.json")):
@@ -227,11 +236,11 @@ class Store:
             raise OtherInputsError(
                 f"{self.path} was made with other inputs: {'; '.join(found)}; {ways}"
             )
-        if repaired := self._files.arrays.repair(grid):
+        if repaired := self._files.repair(grid):
             validate.warn(
                 f"{self.path} was damaged and has been repaired: {describe_arrays(repaired)}"
             )
-        if damaged := _zarr("completing").damage(self._files):
+        if damaged := self._files.level_damage():
             # Without their record, the run computes them again when all patches are finished.
             (self.path / LEVELS / "zarr.json").unlink()
             validate.warn(
@@ -358,10 +367,10 @@ class Store:
             If the store cannot be read or written.
         """
         validate.progress(progress)
-        files, completing = self._files, _zarr("completing")
-        if not files.document.of_mosaic or completing.is_current(files):
+        files = self._files
+        if not files.document.of_mosaic or files.levels_are_current():
             return False
-        completing.complete(files, progress)
+        files.complete_levels(progress)
         return True
 
     def read(
@@ -485,7 +494,11 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        return stored_heights.window_of(self, rows, columns)
+        check_heights(self)
+        plane = without_heights(self.grid.window(rows, columns))
+        validate.memory("heights", _HEIGHTS_BYTES * plane.size)
+        layers = {name: self.read_layer(name, rows, columns) for name in LAYERS}
+        return self._heights(plane, self.read(rows, columns), layers)
 
     def sampled_heights(self, per_window: int = 6) -> Heights:
         """Return the heights of some pixels of every window of a mosaic of heights.
@@ -507,7 +520,13 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        return stored_heights.sampled(self, validate.count("per_window", per_window))
+        validate.count("per_window", per_window)
+        check_heights(self)
+        assert self.document.window is not None  # the store has heights
+        rows, columns = (
+            slice(None, None, max(side // per_window, 1)) for side in self.document.window
+        )
+        return self.heights(rows, columns)
 
     def overview_heights(
         self,
@@ -532,7 +551,78 @@ class Store:
         OSError
             If a file cannot be read.
         """
-        return stored_heights.overview_of(self, validate.count("most", most), rows, columns)
+        validate.count("most", most)
+        check_heights(self)
+        grid, window = self.grid, self.document.window
+        part = without_heights(grid.window(rows, columns))
+        first, last = [], []
+        for name, given, count in zip(
+            ("rows", "columns"), (rows, columns), grid.shape, strict=True
+        ):
+            pixels = range(count)[validate.selection(name, given, ascending=True)]
+            if pixels.step != 1:
+                raise ArgumentError(name, "have no step for an overview", str(pixels.step))
+            first.append(pixels.start)
+            last.append(pixels.stop)
+        factor = 1
+        while math.ceil(max(part.shape) / factor) > most:
+            factor *= 2
+        if factor == 1:
+            return self.heights(rows, columns)
+        # A level serves if the part begins and ends with one of its pixels.
+        finest = max(
+            level
+            for level in (1, *self.levels)
+            if level <= factor
+            and not any(start % level for start in first)
+            and all(n % level == 0 or n == count for n, count in zip(last, grid.shape, strict=True))
+        )
+        read = self.read if finest == 1 else partial(self.read_level, finest)
+        shape = level_shape(part.shape, factor)
+        found = {name: np.empty(shape, np.float32) for name in (*LAYERS, _AMPLITUDE)}
+        side = max(_READ * finest // factor, 1)
+        for top, left in itertools.product(range(0, shape[0], side), range(0, shape[1], side)):
+            down, across = (
+                slice(
+                    (begin + start * factor) // finest,
+                    -(-min(begin + (start + side) * factor, end) // finest),
+                )
+                for start, begin, end in zip((top, left), first, last, strict=True)
+            )
+            block: dict[str, NDArray[Any]] = {
+                name: self.read_layer(name, down, across, factor=finest) for name in LAYERS
+            }
+            block[_AMPLITUDE] = np.abs(read(down, across))
+            level = finest
+            while level < factor:
+                level *= 2
+                height, width = block[_AMPLITUDE].shape
+                block = coarser(block, level, np.ones(height), np.ones(width), window)
+            for name, values in block.items():
+                found[name][top : top + side, left : left + side] = values
+        # Pixels of a level lie in the middle of those that they cover.
+        origin_m, row_step_m, column_step_m = part.vectors_m
+        plane = Grid.oriented(
+            origin_m + (factor - 1) / 2 * (row_step_m + column_step_m),
+            factor * row_step_m,
+            factor * column_step_m,
+            shape,
+            georeference=part.georeference,
+        )
+        return self._heights(plane, found.pop(_AMPLITUDE).astype(np.complex64), found)
+
+    def _heights(
+        self, plane: Grid, pixels: NDArray, layers: dict[str, NDArray[np.float32]]
+    ) -> Heights:
+        """Return heights of a plane's pixels, with the image on their relief."""
+        values = {name: each.astype(np.float64) for name, each in layers.items()}
+        mask = ~np.isnan(values["height_m"])
+        # Patches that are not finished or not seen have neither coherence nor sensitivity.
+        for name in ("coherence", "looks", "m_per_rad"):
+            values[name] = np.nan_to_num(values[name])
+        image = Image(pixels, plane.with_height(filled(values["height_m"], mask)))
+        window_m = float(self.document.inputs["window_m"])
+        return Heights(**values, mask=mask, image=image, window_m=window_m)
 
     def overview(
         self,
@@ -593,7 +683,7 @@ class Store:
         """Return the factor of a level; raise ValueError if there is none."""
         factor = validate.count("factor", factor)
         if factor not in (found := self.levels):
-            if damaged := _zarr("completing").damage(self._files):
+            if damaged := self._files.level_damage():
                 raise ValueError(f"{self.path} is damaged: {describe_arrays(damaged)}{REPAIR}")
             known = ", ".join(map(str, found)) or "none"
             raise ArgumentError(
@@ -602,21 +692,31 @@ class Store:
         return factor
 
     @property
-    def _files(self) -> PatchFiles:
-        """Files of the patches, opened again if the document has been replaced."""
+    def _files(self) -> StoreFiles:
+        """Files of the store, opened again if the document has been replaced."""
         try:
-            stamp = _zarr("patch_files").stamp_of(self.path / "zarr.json")
+            stamp = stamp_of(self.path / "zarr.json")
         except OSError:  # reading the document raises an error that says what is wrong
-            return _zarr("patch_files").PatchFiles.of(self.path)
+            return _store_files()(self.path, Document.read(self.path))
         return _opened(self.path, stamp)
 
 
 @lru_cache(maxsize=4)
-def _opened(path: Path, stamp: tuple[int, int, int]) -> PatchFiles:
-    return _zarr("patch_files").PatchFiles.of(path)
+def _opened(path: Path, stamp: tuple[int, int, int]) -> StoreFiles:
+    return _store_files()(path, Document.read(path))
 
 
-def _zarr(module: str) -> ModuleType:
-    """Return a module of this package that needs Zarr."""
+def _store_files() -> type[StoreFiles]:
+    """Return the class of the files of stores, which needs Zarr."""
     with needed("stores of mosaics"):
-        return importlib.import_module(f"clsas.mosaics.{module}")
+        from clsas.mosaics import store_files
+    return store_files.StoreFiles
+
+
+def check_heights(store: Store) -> None:
+    """Raise ValueError if a store has no heights."""
+    if not store.layers:
+        raise ValueError(
+            f"{store.path} must be a mosaic of heights, got one of images: `clsas.mosaic_heights` "
+            "makes one of heights"
+        )

@@ -3,14 +3,21 @@
 A survey is one file of range lines, or a folder of such files in the order of their names, where
 numbers count as numbers: "ping_9.h5" comes before "ping_10.h5". Files may be added while the survey
 is recorded. Only the geometry is kept in memory; samples are read when a patch needs them.
+`SurveyVisibility` says which channels reach a patch with their beam and their recorded ranges, and
+`GrowingSurvey` which patches can be formed while files are still added.
 """
 
 from __future__ import annotations
 
+import functools
+import json
 import os
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +26,34 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from clsas.engine.data import validate
+from clsas.engine.data.beam import MOST_TRACK_PINGS, BeamWindow
+from clsas.engine.data.declared import Number
 from clsas.engine.data.digests import Without, digest
+from clsas.engine.data.geometry import bistatic_range_m
+from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError
+from clsas.engine.data.visibility import BeamTrack, Boxes
 from clsas.files.hdf5 import FileFormatError, read_geometry, read_samples
+from clsas.mosaics.document import PatchIndex
+from clsas.mosaics.patches import Layout
+from clsas.mosaics.store import Store
 
 END = "end"
 """Name of the file that marks a folder as complete."""
 
+POLL_S = 0.5
+"""Seconds between searches for new files of a survey: a plain choice."""
+
+StampedFiles = tuple[tuple[Path, tuple[int, int]], ...]
+"""Files of a survey, each with its size in bytes and time of change in ns."""
+
+FOLLOW = Number(
+    "s",
+    above=0.0,
+    help="Stop after this time without a new file. A file named `end` stops it at once.",
+)
+"""Declares for how long the folder of a survey is followed."""
 _TAPER = 64  # samples over which a line fades where it is cut
 _MARGIN = 32  # unchanged samples between pixels and taper, for interpolation and its ringing
 _DIGESTED = 16  # lines of a file that enter its digest; all of them would take too long to read
@@ -40,6 +67,12 @@ _GAP = 3.0  # a gap is a distance between pings of more than this many median di
 # plain choices. Shuffled names reach 0.9. A file is out of place if the next one begins so many
 # times farther away than the nearest, and that lies as near as adjacent files do.
 _LEAST_FILES, _REPORTED, _OUT_OF_PLACE, _ADJACENT = 4, 0.25, 2.0, 1.5
+# Bytes per channel that finding the visibility takes, without and with a beam: measured with 1e6
+# pings.
+_CHANNEL_BYTES, _BEAM_CHANNEL_BYTES = 200, 400
+
+_OPENING = threading.Lock()
+_LATEST: list[Survey] = []  # at most one entry: the survey that this process opened last
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,19 +111,10 @@ class Survey:
         return tuple(part for part in self.parts if isinstance(part, Path))
 
     @property
-    def length(self) -> NDArray[np.int64]:
-        """Samples of every channel, [channels]."""
-        return np.repeat(self.lengths, np.diff(self.begins))
-
-    @property
     def last_range_m(self) -> NDArray[np.float64]:
         """Range of each channel's last sample, metres, [channels]."""
-        return self.geometry.first_range_m + (self.length - 1) * self.geometry.range_step_m
-
-    @property
-    def span_m(self) -> tuple[float, float]:
-        """Nearest and farthest range of all channels, metres."""
-        return float(self.geometry.first_range_m.min()), float(self.last_range_m.max())
+        length = np.repeat(self.lengths, np.diff(self.begins))
+        return self.geometry.first_range_m + (length - 1) * self.geometry.range_step_m
 
     def digests(self, first: int = 0) -> list[str]:
         """Return digests of the geometry and samples of every part from number `first` on.
@@ -111,13 +135,6 @@ class Survey:
             geometry = self.geometry.select(slice(*self.begins[index : index + 2]))
             found.append(digest([geometry.without_samples(), *samples], _NOT_IN_PARTS))
         return found
-
-    def within(self, near_m: NDArray[np.float64], far_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which channels recorded any range between two bounds, bool [channels].
-
-        Bounds are in metres, float64 [channels].
-        """
-        return (far_m >= self.geometry.first_range_m) & (near_m <= self.last_range_m)
 
     def extent(
         self, visible: NDArray[np.bool_], near_m: NDArray[np.float64], far_m: NDArray[np.float64]
@@ -243,21 +260,18 @@ def open_survey(source: RangeLines | str | os.PathLike) -> Survey:
 
 
 def files_of(source: str | os.PathLike) -> tuple[Path, ...]:
-    """Return the files of a survey, sorted by name; numbers in names count as numbers."""
+    """Return the files of a survey, sorted by name as people do: "ping_9" before "ping_10"."""
     path = validate.path("source", source)
     if not path.is_dir():
         return (path,)
-    found = (each for each in path.glob("*.h5") if not each.name.startswith("."))
-    return tuple(sorted(found, key=lambda each: natural(each.stem)))
-
-
-def natural(name: str) -> tuple[list[int | str], str]:
-    """Return a key that sorts names as people do: "ping_9" comes before "ping_10".
-
-    Names that differ by leading zeros only are sorted by their characters.
-    """
-    parts = re.split(r"(\d+)", name)  # texts and digits in turn
-    return [int(part) if n % 2 else part.casefold() for n, part in enumerate(parts)], name
+    found = []
+    for file in path.glob("*.h5"):
+        if not file.name.startswith("."):
+            parts = re.split(r"(\d+)", file.stem)  # texts and digits in turn
+            natural = [int(part) if n % 2 else part.casefold() for n, part in enumerate(parts)]
+            # Names that differ by leading zeros only are sorted by their characters.
+            found.append((natural, file.stem, file))
+    return tuple(file for _, _, file in sorted(found))
 
 
 def warn_of_order(survey: Survey) -> None:
@@ -352,6 +366,261 @@ def open_files(paths: tuple[Path, ...], before: Survey | None = None) -> Survey:
     return Survey(geometry, tuple(paths), tuple(begins), tuple(lengths), tuple(stamps))
 
 
+def _stamp(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyVisibility:
+    """A survey and a beam, which determine the channels that contribute to a patch.
+
+    Attributes
+    ----------
+    survey : Survey
+    beam : BeamWindow or None
+    along : float64 [channels, 3] or None
+        Unit direction of the track at every channel; None without a beam.
+    phase_centres_m : float64 [channels, 3]
+    """
+
+    survey: Survey
+    beam: BeamWindow | None
+    along: NDArray[np.float64] | None
+    phase_centres_m: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, survey: Survey, beam: BeamWindow | None) -> SurveyVisibility:
+        """Return the visibility of a survey, with the directions of its track if there is a beam.
+
+        Raises
+        ------
+        ValueError
+            If the channels of the survey do not fit into memory.
+        """
+        per_channel = _CHANNEL_BYTES if beam is None else _BEAM_CHANNEL_BYTES
+        validate.memory(f"the {survey.channels} channels of source", per_channel * survey.channels)
+        geometry = survey.geometry
+        along = None if beam is None else beam.directions(geometry)
+        return cls(survey, beam, along, geometry.phase_centres_m)
+
+    @property
+    def settled(self) -> int:
+        """Number of leading channels whose direction later channels cannot change."""
+        if self.beam is None:
+            return 0  # later channels may receive from any patch
+        if self.beam.along is not None:
+            return self.survey.channels
+        pings = self.survey.geometry.ping_starts
+        later = (self.beam.track_pings or MOST_TRACK_PINGS) // 2 + 1
+        return int(pings[-later]) if len(pings) > 2 * later else 0
+
+    def ranges_m(self, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return bounds of the nearest and farthest range of a grid from every channel, metres."""
+        centre_m, half_m = bounding_box(grid)
+        geometry = self.survey.geometry
+        middle_m = bistatic_range_m(centre_m, geometry.tx_m, geometry.rx_m)
+        radius_m = np.linalg.norm(np.abs(half_m).sum(axis=0))
+        extent_m = np.full(len(middle_m), radius_m + 2 * geometry.range_step_m)
+        if geometry.rx_velocity_m_s is not None:
+            speed = np.linalg.norm(geometry.rx_velocity_m_s, axis=1) / geometry.sound_speed_m_s
+            extent_m += 1.1 * speed * (middle_m + radius_m)
+        near_m, far_m = middle_m - extent_m, middle_m + extent_m
+        if (profile := geometry.sound_speed) is not None:
+            near_m = near_m * (geometry.sound_speed_m_s / profile.speed_m_s.max())
+            far_m = far_m * (geometry.sound_speed_m_s / profile.speed_m_s.min())
+        return near_m, far_m
+
+    def channels(self, grid: Grid) -> NDArray[np.bool_]:
+        """Return which channels may contribute to a grid, bool [channels]."""
+        survey, (near_m, far_m) = self.survey, self.ranges_m(grid)
+        found = (far_m >= survey.geometry.first_range_m) & (near_m <= survey.last_range_m)
+        if self._beam_track is not None:
+            centre_m, half_m = bounding_box(grid)
+            found &= self._beam_track.touching(Boxes.equal(centre_m[None], half_m))[0]
+        return found
+
+    @functools.cached_property
+    def _beam_track(self) -> BeamTrack | None:
+        if self.beam is None or self.along is None:
+            return None
+        return BeamTrack(self.beam.limits, self.phase_centres_m, self.along)
+
+    def any_channel_from(self, first: int, grid: Grid) -> bool:
+        """Return whether any channel from number `first` on may contribute to a grid."""
+        return first < self.survey.channels and bool(self.channels(grid)[first:].any())
+
+    def has_passed(self, grid: Grid, settled: int) -> bool:
+        """Return whether the beam of the latest settled channel has passed a grid completely."""
+        if self.beam is None or self.along is None or self.any_channel_from(settled, grid):
+            return False
+        centre_m, half_m = bounding_box(grid)
+        offset_m = centre_m - self.phase_centres_m[settled - 1]
+        direction = self.along[settled - 1]
+        extent_m = np.abs(half_m @ direction).sum()
+        low, away_m = max(self.beam.limits[0], -1.0), float(np.linalg.norm(offset_m))
+        radius_m = float(np.linalg.norm(np.abs(half_m).sum(axis=0)))
+        # The beam leaves the farthest point of the box last, or the nearest if it points ahead.
+        distance_m = away_m + radius_m if low < 0 else max(away_m - radius_m, 0.0)
+        return bool(direction @ offset_m + extent_m < low * distance_m)
+
+
+def bounding_box(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the centre of a box around a grid, and half its edges as vectors [n, 3], metres."""
+    if grid.points_m is not None:
+        low, high = (edge(grid.points_m, axis=(0, 1)) for edge in (np.min, np.max))
+        return (low + high) / 2, np.diag((high - low) / 2)
+    rows, columns = grid.shape
+    origin_m, row_step_m, column_step_m = grid.vectors_m
+    half_m = np.array([row_step_m * (rows - 1), column_step_m * (columns - 1)]) / 2
+    centre_m = origin_m + half_m.sum(axis=0)
+    if grid.height_m is None:
+        return centre_m, half_m
+    low, high = grid.height_m.min(), grid.height_m.max()
+    up = np.array([0.0, 0.0, 1.0])
+    return centre_m + up * (low + high) / 2, np.concatenate([half_m, [up * (high - low) / 2]])
+
+
+Source = SurveyVisibility | tuple[StampedFiles, str | None]
+"""A survey and a beam in this process, or files and JSON by which worker processes open them."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Folder to which files of a survey are being added.
+
+    Attributes
+    ----------
+    folder : Path
+    idle_s : float
+        Seconds without a new file after which the survey has ended.
+    at_end : callable, optional
+        Called with the geometry of the survey when it has ended.
+    """
+
+    folder: Path
+    idle_s: float
+    at_end: Callable[[RangeLines], object] | None = None
+
+    @classmethod
+    def checked(cls, source: RangeLines | Path, idle_s: float) -> Growth:
+        """Return the folder to follow; other sources raise ValueError."""
+        idle_s = FOLLOW.check("follow_s", idle_s)
+        if isinstance(source, RangeLines) or not source.is_dir():
+            got = "lines in memory" if isinstance(source, RangeLines) else repr(str(source))
+            raise ArgumentError("source", "be a folder if `follow_s` is given", got)
+        return cls(source.resolve(), idle_s)
+
+    def wait_for_first_file(self) -> None:
+        """Wait for the first file of the folder; raise ValueError if none comes."""
+        start, folder = time.monotonic(), self.folder
+        while not files_of(folder):
+            if has_ended(folder) or time.monotonic() - start > self.idle_s:
+                got = f"{folder}, which has no file *.h5"
+                raise ArgumentError("source", "contain range lines", got)
+            time.sleep(POLL_S)
+
+
+class GrowingSurvey:
+    """A survey to which files may be added.
+
+    Attributes
+    ----------
+    visibility : SurveyVisibility
+        The survey at present.
+    has_ended : bool
+        True once no more files will come.
+    """
+
+    def __init__(
+        self,
+        visibility: SurveyVisibility,
+        growth: Growth | None,
+        store: Store | None,
+        inputs: dict[str, Any],
+    ) -> None:
+        self._growth, self._store, self._inputs = growth, store, inputs
+        self._latest_s = time.monotonic()
+        self.visibility = visibility
+        self.has_ended = growth is None
+
+    @property
+    def channels(self) -> int:
+        """Number of channels at present."""
+        return self.visibility.survey.channels
+
+    def for_workers(self) -> tuple[StampedFiles, str | None]:
+        """Return the files and the beam from which worker processes open the present survey."""
+        beam = self.visibility.beam
+        return stamped_files(self.visibility.survey), None if beam is None else beam_json(beam)
+
+    def update(self) -> bool:
+        """Look for new files; return whether any came or the survey has ended."""
+        growth = self._growth
+        if growth is None or self.has_ended:
+            return False
+        # Ask before listing the files, since none is added after the end.
+        ended = has_ended(growth.folder)
+        paths, survey = files_of(growth.folder), self.visibility.survey
+        grown = paths != survey.files
+        if grown:
+            first = len(survey.parts)
+            survey = open_files(paths, survey)
+            self.visibility = SurveyVisibility.of(survey, self.visibility.beam)
+            self._latest_s = time.monotonic()
+            if self._store is not None:
+                parts = [*self._inputs["parts"], *survey.digests(first)]
+                self._inputs = self._inputs | {"parts": parts}
+                self._store.grow(self._inputs)
+        self.has_ended = ended or time.monotonic() - self._latest_s > growth.idle_s
+        if self.has_ended and growth.at_end is not None:
+            growth.at_end(self.visibility.survey.geometry)
+        return grown or self.has_ended
+
+    def ready(self, layout: Layout, todo: Iterable[PatchIndex]) -> deque[PatchIndex]:
+        """Return the patches whose channels have all been recorded, in the given order."""
+        if self.has_ended:
+            return deque(todo)
+        settled = self.visibility.settled
+        if settled < 1:
+            return deque()
+        return deque(i for i in todo if self.visibility.has_passed(layout.window(i).grid, settled))
+
+
+def stamped_files(survey: Survey) -> StampedFiles:
+    """Return the files of a survey with their stamps."""
+    pairs = zip(survey.parts, survey.stamps, strict=True)
+    return tuple((part, stamp) for part, stamp in pairs if isinstance(part, Path))
+
+
+def opened_visibility(files: StampedFiles, beam: str | None) -> SurveyVisibility:
+    """Return a survey that a worker process opens once for all of its threads.
+
+    Raises
+    ------
+    ValueError
+        If a file has changed.
+    """
+    with _OPENING:
+        return _open_visibility(files, beam)
+
+
+@functools.lru_cache(maxsize=2)
+def _open_visibility(files: StampedFiles, beam: str | None) -> SurveyVisibility:
+    # If files have been added to the survey, open only these.
+    before = next((s for s in _LATEST if files[: len(s.parts)] == stamped_files(s)), None)
+    survey = open_files(tuple(path for path, _ in files), before)
+    if survey.stamps != tuple(stamp for _, stamp in files):
+        raise ArgumentError("source", "not change while a mosaic is formed, but a file of it did")
+    _LATEST[:] = [survey]
+    return SurveyVisibility.of(survey, None if beam is None else BeamWindow(**json.loads(beam)))
+
+
+def beam_json(beam: BeamWindow) -> str:
+    """Return a beam as JSON, which can be hashed and compared."""
+    return json.dumps(asdict(beam), default=lambda value: value.tolist())
+
+
 def largest_gap_m(lines: RangeLines, missing: NDArray[np.bool_]) -> float:
     """Return the longest distance between consecutive pings, metres, or 0 if it is not a gap.
 
@@ -368,8 +637,3 @@ def largest_gap_m(lines: RangeLines, missing: NDArray[np.bool_]) -> float:
     median_m = float(np.median(steps_m[steps_m > 0])) if steps_m.any() else 0.0
     longest_m = float(np.diff(np.sort(some_m[:, axis])).max(initial=0.0))
     return longest_m if longest_m > _GAP * median_m else 0.0
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    status = path.stat()
-    return status.st_size, status.st_mtime_ns

@@ -72,7 +72,9 @@ def local_client(workers: int) -> Iterator[Client]:
 
 
 def _cluster(workers: int, folder: Path) -> SpecCluster:
-    security = _certificate()
+    with needed("the certificate that keeps other users out of worker processes"):
+        import cryptography  # noqa: F401 (Dask imports it, and reports its absence otherwise)
+    security = Security.temporary()
     shared = {
         "host": "127.0.0.1",
         "protocol": "tls://",
@@ -140,12 +142,6 @@ def _environment_of_workers() -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
-
-
-def _certificate() -> Security:
-    with needed("the certificate that keeps other users out of worker processes"):
-        import cryptography  # noqa: F401 (Dask imports it, and reports its absence otherwise)
-    return Security.temporary()
 
 
 def _cause(error: BaseException) -> str:

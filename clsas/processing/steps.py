@@ -29,9 +29,9 @@ from clsas.interferometry.heights import heights
 from clsas.interferometry.pair_errors import pair_errors
 from clsas.interferometry.pair_errors_result import with_bank
 from clsas.interferometry.result import Heights
+from clsas.mosaics.document import OtherInputsError, stored_digest
 from clsas.mosaics.height_mosaic import mosaic_heights
 from clsas.mosaics.mosaic import Mosaic, mosaic
-from clsas.mosaics.provenance import OtherInputsError, stored_digest
 from clsas.mosaics.store import Store
 from clsas.navigation.autofocus import autofocus
 from clsas.navigation.calibration import calibrate_track

@@ -14,10 +14,10 @@ import numpy as np
 import clsas
 from clsas.engine.data.digests import grid_digest
 from clsas.engine.data.grid import Grid
+from clsas.mosaics.document import Record
 from clsas.mosaics.levels import Levels, levels_of
 from clsas.mosaics.patches import Layout, PatchWindow, patch_shape_of
 from clsas.mosaics.pyramid import pyramid
-from clsas.mosaics.record import Record
 
 SIDE, PATCHES = 20_000, (5, 5)
 OVERVIEW = 1000  # pixels a side
@@ -42,7 +42,7 @@ def rows() -> list[Row]:
         # Without levels and with one chunk for each patch.
         with (
             mock.patch("clsas.mosaics.levels.CHUNK_SIDE", SIDE),
-            mock.patch("clsas.mosaics.arrays.levels_of", return_value=Levels(())),
+            mock.patch("clsas.mosaics.document.levels_of", return_value=Levels(())),
             mock.patch("clsas.mosaics.levels.levels_of", return_value=Levels(())),
         ):
             found.append(measured("writing 25 patches alone", writing(old, grid, windows)))

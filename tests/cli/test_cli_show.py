@@ -12,7 +12,7 @@ from click.testing import CliRunner
 import clsas
 from clsas.cli import main
 from clsas.engine.data.image import Formed
-from clsas.mosaics.patch_files import PatchFiles
+from clsas.mosaics.store_files import StoreFiles
 
 pytest.importorskip("matplotlib")
 
@@ -216,14 +216,14 @@ def test_a_mosaic_and_a_part_of_it(store, figures):
 @pytest.mark.slow
 def test_a_mosaic_is_read_patch_by_patch(store, monkeypatch):
     """So one larger than memory is drawn as well."""
-    read, sizes = PatchFiles.read, []
+    read, sizes = StoreFiles.read, []
 
     def recorded(self, *window):
         found = read(self, *window)
         sizes.append(found.size)
         return found
 
-    monkeypatch.setattr(PatchFiles, "read", recorded)
+    monkeypatch.setattr(StoreFiles, "read", recorded)
     run(store)
     assert sum(sizes) == PLANE.size
     assert max(sizes) <= 14 * 21  # pixels of a patch

@@ -20,10 +20,9 @@ import clsas
 from clsas.engine.data.digests import grid_digest
 from clsas.engine.data.validate import ClsasWarning
 from clsas.mosaics import pyramid
-from clsas.mosaics.document import Document
+from clsas.mosaics.document import Document, Record
 from clsas.mosaics.levels import LAYERS, SHADOWED
 from clsas.mosaics.patches import Layout
-from clsas.mosaics.record import Record
 
 GRID = clsas.Grid.plane((-0.6, 0.6, 61), (31.2, 32.8, 81))
 REQUEST = {"search_m": (-0.5, 0.5), "window_m": 0.22, "patch_m": 0.7}

@@ -17,11 +17,10 @@ from clsas.cli import main
 from clsas.engine.data.digests import grid_digest
 from clsas.engine.data.grid import Grid
 from clsas.mosaics import pyramid
-from clsas.mosaics.document import read_attributes
+from clsas.mosaics.document import Record, read_attributes
 from clsas.mosaics.levels import Levels, aligned_side, chunk_side, levels_of
-from clsas.mosaics.patch_files import PatchFiles
 from clsas.mosaics.patches import Layout
-from clsas.mosaics.record import Record
+from clsas.mosaics.store_files import StoreFiles
 
 GRID = Grid.plane((-4, 4.3, 84), (30, 36.9, 70))
 RECORD = Record(channels=1, survey_channels=1, has_pixels=True)
@@ -253,8 +252,8 @@ def test_the_overview_reads_the_level_that_makes_up_its_pixels(tmp_path, monkeyp
         read.append(name)
         return unrecorded(self, name, *window)
 
-    unrecorded = PatchFiles.read
-    monkeypatch.setattr(PatchFiles, "read", recorded)
+    unrecorded = StoreFiles.read
+    monkeypatch.setattr(StoreFiles, "read", recorded)
     for most, image in plain.items():
         read.clear()
         ours = store.overview(most)

@@ -149,7 +149,7 @@ def test_metadata_that_were_changed_elsewhere_are_found(path, kept):
 
 def test_a_killed_run_leaves_a_store_that_is_repaired_by_the_next(path, kept, monkeypatch):
     """Between the removal of the damaged part and the writing of the new one."""
-    from clsas.mosaics import arrays
+    from clsas.mosaics import store_files
 
     empty(path / "height")
     remove = shutil.rmtree
@@ -159,7 +159,7 @@ def test_a_killed_run_leaves_a_store_that_is_repaired_by_the_next(path, kept, mo
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(arrays.shutil, "rmtree", killed)
+        patch.setattr(store_files.shutil, "rmtree", killed)
         with pytest.raises(KeyboardInterrupt):
             clsas.mosaic(LINES, GRID, path, **REQUEST)
     assert not (path / "height/c").exists()

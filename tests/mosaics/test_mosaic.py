@@ -31,15 +31,17 @@ from clsas.engine.data.image_error import relative_error_db
 from clsas.engine.data.validate import ClsasWarning
 from clsas.engine.device.device import list_devices
 from clsas.engine.factorized import planner
-from clsas.mosaics import scheduling
 from clsas.mosaics.devices import claim_device
-from clsas.mosaics.document import Document
-from clsas.mosaics.forming import Job, open_visibility, stamped_files
+from clsas.mosaics.document import Document, Record
 from clsas.mosaics.patches import Layout
-from clsas.mosaics.record import Record
 from clsas.mosaics.store import Store
-from clsas.mosaics.survey import END, open_survey
-from clsas.mosaics.visibility import SurveyVisibility
+from clsas.mosaics.survey import (
+    END,
+    SurveyVisibility,
+    open_survey,
+    opened_visibility,
+    stamped_files,
+)
 
 GRID = Grid.plane((-4, 4, 80), (30, 40, 60))
 LINES = lines_over(GRID, along_x(160, 0.05), carrier_hz=100e3, step_m=0.03)
@@ -61,7 +63,9 @@ def file(tmp_path):
 def test_work_grows_as_the_number_of_patches(monkeypatch):
     count = mock.Mock(side_effect=Layout.window)
     monkeypatch.setattr(Layout, "window", lambda *arguments: count(*arguments))
-    monkeypatch.setattr(Job, "form", lambda *_: (Record(1, LINES.channels), None))
+    monkeypatch.setattr(
+        "clsas.mosaics.mosaic.form_patch", lambda *_: (Record(1, LINES.channels), None)
+    )
     formed = clsas.mosaic(LINES, GRID, accuracy_db=-40, patches=(20, 20))
     assert len(list(formed)) == 400
     assert count.call_count == 2 * 400  # when a patch is submitted, and when it is handed out
@@ -88,7 +92,9 @@ def test_every_patch_has_its_own_pixels(exact):
 @pytest.mark.exhaustive
 def test_patches_of_one_device_come_in_order(monkeypatch):
     """Even if several are finished before the caller takes the first."""
-    monkeypatch.setattr(scheduling, "wait", lambda futures, timeout: set(wait(futures).done))
+    monkeypatch.setattr(
+        "clsas.mosaics.mosaic.wait", lambda futures, timeout: set(wait(futures).done)
+    )
     wish = REQUEST | {"patches": (6, 8)}
     patches = [(patch.row, patch.column) for patch in clsas.mosaic(LINES, GRID, **wish)]
     assert patches == list(np.ndindex(6, 8))
@@ -367,7 +373,7 @@ def test_missing_samples_are_flagged(file, tmp_path):
 @pytest.mark.parametrize("wish", [{}, {"accuracy_db": None, "tolerance_db": -65}])
 def test_missing_channels_weigh_nothing(file, wish, monkeypatch):
     """Neither in a beam that divides by the sum of weights, nor in a plan."""
-    monkeypatch.setattr("clsas.mosaics.forming._WORTH_A_PLAN", 0)
+    monkeypatch.setattr("clsas.mosaics.mosaic._WORTH_A_PLAN", 0)
     beam = BeamWindow(8.0, "hann", normalise=True)
     kept = np.random.default_rng(1).random(160) > 0.2
     with h5py.File(file, "r+") as lines:
@@ -912,7 +918,7 @@ class TestFollowing:
             """Return the number of channels that a worker knows, and the files that it opened."""
             files = stamped_files(survey.open_survey(folder))
             opened.clear()
-            return open_visibility(files, None).survey.channels, list(opened)
+            return opened_visibility(files, None).survey.channels, list(opened)
 
         add(range(2))
         assert seen() == (400, ["0.h5", "1.h5"])

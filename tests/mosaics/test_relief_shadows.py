@@ -9,9 +9,9 @@ from clsas.engine.data.digests import grid_digest
 from clsas.interferometry.baseline import Lattice
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.shadows import in_shadow
+from clsas.mosaics.document import Record
 from clsas.mosaics.levels import LAYERS, SHADOWED
-from clsas.mosaics.patches import Layout, Wide
-from clsas.mosaics.record import Record
+from clsas.mosaics.patches import Layout, with_margin
 from clsas.mosaics.relief_shadows import mask_shadows, of_shadows
 
 GRID = clsas.Grid.plane((0, 5.9, 60), (30, 41.9, 120))
@@ -49,9 +49,9 @@ def write(store, index, height_m, shadowed):
     for name, values in {"height_m": own, "sd_m": sd_m}.items():
         layers[name] = np.where(hidden, np.nan, values).astype(np.float32)
         layers[f"shadow_{name}"] = np.where(hidden, values, np.nan).astype(np.float32)
-    wide = Wide.of(window, MARGIN, GRID.shape)
-    shape = wide.rows.stop - wide.rows.start, wide.columns.stop - wide.columns.start
-    sights = tangents((wide.rows.start, wide.columns.start), shape)
+    around = with_margin(window, MARGIN, GRID.shape)[:2]
+    shape = tuple(part.stop - part.start for part in around)
+    sights = tangents(tuple(part.start for part in around), shape)
     heights = {"valid": 0.0, "converged": True} | of_shadows(layers, window.grid, sights)
     record = Record(channels=1, survey_channels=1, has_pixels=True, heights=heights)
     pixels = np.ones(window.grid.shape, np.complex64)

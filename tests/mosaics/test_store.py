@@ -194,7 +194,7 @@ def test_a_patch_that_is_written_anew_has_no_record_meanwhile(path, monkeypatch)
     def killed(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("clsas.mosaics.arrays.StoredArrays.write", killed)
+    monkeypatch.setattr("clsas.mosaics.store_files.StoreFiles._write_chunks", killed)
     with pytest.raises(KeyboardInterrupt):
         store.write(1, 2, slice(15, 30), slice(28, 42), np.ones((15, 12), np.complex64), record)
     assert (1, 2) not in store.records()

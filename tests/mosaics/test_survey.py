@@ -20,6 +20,7 @@ from clsas.files.hdf5 import FileFormatError, load, save
 from clsas.mosaics.mosaic import mosaic
 from clsas.mosaics.survey import (
     END,
+    SurveyVisibility,
     files_of,
     has_ended,
     largest_gap_m,
@@ -51,7 +52,7 @@ def test_geometry_is_that_of_the_lines(folder):
     for name in ("tx_m", "rx_m", "first_range_m"):
         np.testing.assert_array_equal(getattr(survey.geometry, name), getattr(LINES, name))
     assert survey.channels == 120
-    assert set(survey.length) == {LINES.length}
+    assert set(survey.lengths) == {LINES.length}
     assert survey.geometry.samples.shape == (120, 1)
 
 
@@ -90,9 +91,8 @@ def test_nothing_is_read_beyond_what_is_recorded():
     survey = open_survey(LINES)
     lines, _ = survey.read(np.ones(120, bool), np.full(120, -1e3), np.full(120, 1e3))
     np.testing.assert_array_equal(lines.samples, LINES.samples)
-    np.testing.assert_array_equal(
-        survey.within(np.full(120, 1e3), np.full(120, 2e3)), np.zeros(120, bool)
-    )
+    beyond = Grid.plane((-3, 3, 61), (1e3, 2e3, 121))
+    assert not SurveyVisibility.of(survey, None).channels(beyond).any()
 
 
 def test_channels_without_samples_are_told(tmp_path):

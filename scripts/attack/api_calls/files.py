@@ -12,7 +12,7 @@ import clsas
 from api_calls.scene import Call, nothing, scene
 from clsas.engine.data.digests import grid_digest
 from clsas.engine.factorized.costs import Costs
-from clsas.mosaics.record import Record
+from clsas.mosaics.document import Record
 
 
 def files(folder: Path) -> dict[str, Call]:
