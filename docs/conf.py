@@ -54,7 +54,7 @@ autosummary_filename_map |= {
         "engine.factorized.plan.ExactImage",
         "engine.factorized.plan.Factorization",
         "engine.factorized.plan.Prediction",
-        "measures.cuts.Cut",
+        "measures.quality.Cut",
         "measures.quality.PointResponse",
         "mosaics.document.Record",
         "engine.device.device.DeviceInfo",

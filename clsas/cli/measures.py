@@ -17,9 +17,7 @@ from clsas.cli.wording import command
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import Request
 from clsas.files.scene_files import SceneFile
-from clsas.measures.cuts import Cut
-from clsas.measures.quality import PointResponse
-from clsas.measures.shadows import DARKEST, dark_level_db
+from clsas.measures.quality import DARKEST, Cut, PointResponse, dark_level_db
 
 
 @command()

@@ -173,7 +173,7 @@ def _of_bank(lines: RangeLines, bank: str = "") -> NDArray[np.float64]:
         if bank:
             error.add_note(bank)
         raise
-    lengths_m = lengths(along_m, pings.usual_step_m)
+    lengths_m = _lengths_m(along_m, pings.usual_step_m)
     weights: NDArray[np.float64] = lengths_m / lengths_m.mean()
     penalty_db = noise_penalty_db(weights)
     if penalty_db > _MUCH_NOISE_DB:
@@ -195,7 +195,13 @@ def _along_m(lines: RangeLines, pings: Transmissions) -> NDArray[np.float64]:
     numbers = np.flatnonzero(pings.advancing(STILL * pings.usual_step_m))
     moves_m = np.diff(pings.places_m[numbers], axis=0)
     receivers_m = means(lines.rx_m, pings.starts[:-1])[numbers]
-    _check_moving(pings, receivers_m)
+    needed = "come from receivers that move along a track"
+    if pings.count == 1:
+        raise ArgumentError("lines", needed, "a single ping")
+    moved_m = float(np.ptp(receivers_m, axis=0).max(initial=0.0))
+    if len(receivers_m) < 2 or moved_m <= STILL * pings.usual_step_m:
+        got = f"{pings.count} pings whose receivers move by {reprs.quantity(moved_m, 'm')} in all"
+        raise ArgumentError("lines", needed, got, "receivers that stay in place need no weights")
     course = _courses(moves_m, numbers)
     # From ping to ping, the mean of both courses.
     steps_m = np.einsum("pi,pi->p", moves_m, course[:-1] + course[1:]) / 2
@@ -204,17 +210,6 @@ def _along_m(lines: RangeLines, pings: Transmissions) -> NDArray[np.float64]:
     knot = np.searchsorted(numbers, ping, side="right") - 1
     ahead_m = lines.phase_centres_m - pings.places_m[numbers][knot]
     return knots_m[knot] + np.einsum("ci,ci->c", ahead_m, course[knot])
-
-
-def _check_moving(pings: Transmissions, receivers_m: NDArray[np.float64]) -> None:
-    """Raise ValueError unless the receivers move from ping to ping, [pings, 3]."""
-    needed = "come from receivers that move along a track"
-    if pings.count == 1:
-        raise ArgumentError("lines", needed, "a single ping")
-    moved_m = float(np.ptp(receivers_m, axis=0).max(initial=0.0))
-    if len(receivers_m) < 2 or moved_m <= STILL * pings.usual_step_m:
-        got = f"{pings.count} pings whose receivers move by {reprs.quantity(moved_m, 'm')} in all"
-        raise ArgumentError("lines", needed, got, "receivers that stay in place need no weights")
 
 
 def _courses(moves_m: NDArray[np.float64], numbers: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -245,7 +240,7 @@ def _courses(moves_m: NDArray[np.float64], numbers: NDArray[np.int64]) -> NDArra
     return unit
 
 
-def lengths(along_m: NDArray[np.float64], advance_m: float) -> NDArray[np.float64]:
+def _lengths_m(along_m: NDArray[np.float64], advance_m: float) -> NDArray[np.float64]:
     """Return the length of track that each phase centre stands for, metres; `density_weights`.
 
     `along_m` are the distances of the phase centres along the track, [channels], in any order, and
@@ -255,7 +250,14 @@ def lengths(along_m: NDArray[np.float64], advance_m: float) -> NDArray[np.float6
     sorted_m = along_m[order]
     gaps_m = np.diff(sorted_m)
     usual_m = _usual(gaps_m, advance_m)
-    group = _groups(sorted_m, _COINCIDENT * usual_m)
+    # Phase centres that coincide share their part. A group of them begins after a gap, and again
+    # where it would be longer than one.
+    most_m = _COINCIDENT * usual_m
+    begins = np.append(True, gaps_m > most_m)
+    first_m = sorted_m[begins][np.cumsum(begins) - 1]
+    if most_m:
+        begins[1:] |= np.diff(np.floor((sorted_m - first_m) / most_m)) != 0
+    group = np.cumsum(begins) - 1
     members = np.bincount(group)
     means_m = np.bincount(group, sorted_m) / members
     halves_m = np.minimum(np.diff(means_m), _MOST_SPACING * usual_m) / 2
@@ -291,16 +293,3 @@ def _usual(gaps_m: NDArray[np.float64], advance_m: float) -> float:
     counted_m = np.minimum(ascending_m, _MOST_ADVANCE * advance_m) if advance_m else ascending_m
     covered_m = np.cumsum(counted_m)
     return float(ascending_m[np.searchsorted(covered_m, covered_m[-1] / 2)])
-
-
-def _groups(sorted_m: NDArray[np.float64], most_m: float) -> NDArray[np.int64]:
-    """Return numbers of groups of ascending positions, each at most `most_m` long.
-
-    A group begins after a gap of `most_m`, and again where it would be longer.
-    """
-    begins = np.append(True, np.diff(sorted_m) > most_m)
-    first_m = sorted_m[begins][np.cumsum(begins) - 1]
-    part = np.floor((sorted_m - first_m) / most_m) if most_m else np.zeros(len(sorted_m))
-    begins[1:] |= np.diff(part) != 0
-    numbers: NDArray[np.int64] = np.cumsum(begins) - 1
-    return numbers

@@ -53,3 +53,27 @@ def sight_along(
     rises = np.abs(rise) > _LEAST_RISE * np.linalg.norm(tangent, axis=1)
     tangent = np.where(rises[:, None], tangent / np.where(rises, rise, 1)[:, None], 0)
     return Sight(rad_per_m * np.einsum("pi,pi->p", difference, tangent), tangent[:, :2])
+
+
+def phase_per_height(
+    points_m: NDArray[np.float64],
+    tx_m: NDArray[np.float64],
+    low_m: NDArray[np.float64],
+    high_m: NDArray[np.float64],
+    wavelength_m: float,
+) -> NDArray[np.float64]:
+    """Return how fast the phase between two receivers changes with height, rad/m, [points].
+
+    The track is taken to pass at right angles to the vertical plane through the transmitter and
+    the point.
+
+    Parameters
+    ----------
+    points_m, tx_m, low_m, high_m : float64 [points, 3]
+        Points, and the transmitter and the receivers that see each of them.
+    wavelength_m : float
+    """
+    ways_m = [points_m - each_m for each_m in (tx_m, low_m, high_m)]
+    w, u, v = (way_m / np.linalg.norm(way_m, axis=1, keepdims=True) for way_m in ways_m)
+    along = np.cross(ways_m[0], [0.0, 0.0, 1.0])
+    return sight_along(along, (2 * w + u + v) / 4, (v - u) / 2, 4 * np.pi / wavelength_m).rad_m

@@ -11,7 +11,6 @@ from scipy.ndimage import uniform_filter
 
 from clsas.engine.data import validate
 from clsas.engine.data.digests import digest
-from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
 
@@ -67,30 +66,9 @@ def multilook(images: Image | Sequence[Image], *, window_m: float | None = None)
     >>> f"{clsas.contrast(speckle):.2f}, of 25 looks {clsas.contrast(smooth):.2f}"
     '1.01, of 25 looks 0.20'
     """
-    looks = _checked(images)
-    grid = looks[0].grid
-    if len(looks) == 1 and window_m is None:
-        allowed = "be given for a single image, or `images` be several looks"
-        raise ArgumentError("window_m", allowed)
-    size = None if window_m is None else window_pixels(grid, window_m)
-    validate.memory("images", 32 * grid.size)
-    largest = max(float(np.abs(look.pixels).max()) for look in looks) or 1.0
-    power, received = np.zeros(grid.shape), np.zeros(grid.shape)
-    for look in looks:
-        # Squares of large and of small pixels stay within floating point.
-        power += np.abs(look.pixels / np.float32(largest)).astype(np.float64) ** 2
-        received += look.pixels != 0
-    if size is not None:
-        power, received = _windowed(power, size), np.rint(_windowed(received, size))
-    power = np.divide(power, received, out=np.zeros(grid.shape), where=received > 0)
-    return Image((largest * np.sqrt(power)).astype(np.complex64), grid)
-
-
-def _checked(images: Image | Sequence[Image]) -> list[Image]:
-    """Return the looks as a list, all on one grid."""
     if isinstance(images, Image):
-        return [images]
-    looks = validate.entries("images", images, "an Image, or a sequence of them")
+        images = [images]
+    looks: list[Image] = validate.entries("images", images, "an Image, or a sequence of them")
     if not looks:
         raise ArgumentError("images", "have at least one image", "none")
     for look in looks:
@@ -98,33 +76,38 @@ def _checked(images: Image | Sequence[Image]) -> list[Image]:
     digests = {digest(look.grid) for look in looks}
     if len(digests) > 1:
         raise ArgumentError("images", "have one grid", f"{len(digests)} different ones")
-    return looks
+    if len(looks) == 1 and window_m is None:
+        allowed = "be given for a single image, or `images` be several looks"
+        raise ArgumentError("window_m", allowed)
+
+    grid = looks[0].grid
+    size = []  # rows and columns of the window, both odd
+    if window_m is not None:
+        if grid.points_m is not None:
+            hint = "the images have points, not rows and columns"
+            raise ArgumentError("window_m", "be left out", hint=hint)
+        window_m = validate.positive("window_m", window_m, "m")
+        for step_m, count in zip(grid.vectors_m[1:], grid.shape, strict=True):
+            step = float(np.linalg.norm(step_m))
+            if window_m > count * step:
+                allowed = f"be at most the extent of the grid, {count * step:.4g} m"
+                raise ArgumentError("window_m", allowed, f"{window_m:g} m")
+            size.append(2 * math.floor(window_m / step / 2) + 1)
+
+    validate.memory("images", 32 * grid.size)
+    largest = max(float(np.abs(look.pixels).max()) for look in looks) or 1.0
+    power, received = np.zeros(grid.shape), np.zeros(grid.shape)
+    for look in looks:
+        # Squares of large and of small pixels stay within floating point.
+        power += np.abs(look.pixels / np.float32(largest)).astype(np.float64) ** 2
+        received += look.pixels != 0
+    if size:
+        power, received = _windowed(power, size), np.rint(_windowed(received, size))
+    power = np.divide(power, received, out=np.zeros(grid.shape), where=received > 0)
+    return Image((largest * np.sqrt(power)).astype(np.complex64), grid)
 
 
-def window_pixels(grid: Grid, window_m: float) -> tuple[int, int]:
-    """Return the odd numbers of rows and columns that a window of a side in metres spans.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the grid consists of points, or the window is not a positive number or larger than the
-        grid.
-    """
-    if grid.points_m is not None:
-        hint = "the images have points, not rows and columns"
-        raise ArgumentError("window_m", "be left out", hint=hint)
-    window_m = validate.positive("window_m", window_m, "m")
-    counts = []
-    for step_m, count in zip(grid.vectors_m[1:], grid.shape, strict=True):
-        step = float(np.linalg.norm(step_m))
-        if window_m > count * step:
-            allowed = f"be at most the extent of the grid, {count * step:.4g} m"
-            raise ArgumentError("window_m", allowed, f"{window_m:g} m")
-        counts.append(2 * math.floor(window_m / step / 2) + 1)
-    return counts[0], counts[1]
-
-
-def _windowed(values: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
+def _windowed(values: NDArray[np.float64], size: list[int]) -> NDArray[np.float64]:
     """Return the sum over the pixels of a window around each pixel that lie in the image."""
     # Running sums leave rounding errors behind large values, which must not become negative.
     return math.prod(size) * np.maximum(uniform_filter(values, size, mode="constant"), 0.0)

@@ -1,7 +1,10 @@
-"""Time against error: one image formed by many methods, timed and compared."""
+"""Time against error: one image formed by many methods, timed and compared, as a table and CSV."""
 
 from __future__ import annotations
 
+import csv
+import math
+import os
 import statistics
 import time
 import warnings
@@ -13,34 +16,30 @@ from typing import Annotated
 
 import numpy as np
 
-from clsas.engine.data import validate
+from clsas.engine.data import reprs, validate
+from clsas.engine.data.atomic import replacing
 from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.declared import Count, Flag, Several
+from clsas.engine.data.declared import Count, Flag, Several, check_declared
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.image_error import relative_error_db
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.reprs import Report, Table
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.engine.factorized.filters import ALIGN_TAPS, APERTURE_TAPS
 from clsas.engine.factorized.plan import Plan
 from clsas.engine.factorized.planner import (
-    BEST_TOLERANCE_DB,
     THESIS_STAGES,
     TOLERANCE,
-    WORST_TOLERANCE_DB,
     Request,
-    checked_pairs,
     planned,
 )
 from clsas.engine.forming import form_exactly
 from clsas.engine.imaging import factorize
 from clsas.engine.signal.doubts import warn_before_imaging
-from clsas.measures.cuts import Cut
-from clsas.measures.quality import measure_point
-from clsas.measures.shadows import DARKEST, dark_level_db
-from clsas.measures.tradeoff_result import Response, Row, Tradeoff
+from clsas.measures.quality import DARKEST, dark_level_db, measure_point
 
 TOLERANCES_DB = (-20.0, -30.0, -40.0, -50.0, -60.0, -70.0)
 STAGES = (*(((2, 2),) * count for count in range(1, 6)), ((2, 4),) * 2)
@@ -52,6 +51,17 @@ STUDIED_DEPTHS = (1, 2, 3, 4)
 
 REFERENCE_DB = -85.0
 """Accuracy of the exact image that all errors are relative to, in dB."""
+
+_FIGURES = ("resolution_m", "pslr_db", "islr_db")
+_COLUMNS = (
+    "", "time (s)", "predicted (s)", "speedup", "error (dB)", "predicted (dB)", "in the dark (dB)",
+    "azimuth", "range", "azimuth PSLR", "range PSLR",
+)  # fmt: skip
+_HEADER = (
+    "label", "method", "plan", "plan_s", "time_s", "predicted_time_s", "error_db",
+    "predicted_error_db", "dark_error_db",
+    *(f"{axis}_{figure}" for axis in ("azimuth", "range") for figure in _FIGURES),
+)  # fmt: skip
 
 
 def tradeoff(
@@ -142,19 +152,20 @@ def tradeoff(
     >>> measured.rows[0].error_db < -30
     True
     """
-    repeats = _check(lines, grid, beam, repeats, study)
+    validate.instance("lines", lines, RangeLines)
+    validate.instance("grid", grid, Grid)
+    if beam is not None:
+        validate.instance("beam", beam, BeamWindow)
+    options = {
+        "tolerances_db": tolerances_db, "stages": stages, "repeats": repeats, "study": study
+    }  # fmt: skip
+    tolerances, stages, repeats, study = check_declared(tradeoff, options).values()
     validate.progress(progress)
-    if stages is not None:
-        given = validate.entries("stages", stages, "a sequence of plans' (QR, QI)")
-        stages = [checked_pairs(each) for each in given]
-    tolerances = _checked_tolerances(tolerances_db)
     device = open_device(device)
     warn_before_imaging(lines, grid, beam)
-    requests = _requests(
-        tolerances, study, _feasible(lines, grid, beam) if stages is None else stages
-    )
-    candidates = list(_planned(requests, lines, grid, beam, device))
-    candidates.append(_exactly(min([ACCURACY_DB, *tolerances]), lines, grid, beam, device))
+    if stages is None:
+        stages = _feasible_stages(lines, grid, beam)
+    candidates = list(_candidates(lines, grid, beam, device, tolerances, stages, study))
 
     total, done = 1 + len(candidates) * (1 + repeats), count(1)
 
@@ -168,141 +179,31 @@ def tradeoff(
         raise ArgumentError("grid", "lie where the lines have echoes", hint=hint)
     step()
     rows = []
-    for each in candidates:  # the first run builds the kernels, and its image is measured
-        rows.append(_measured(each.row, each.form(), reference))
+    for row, form in candidates:  # the first run builds the kernels, and its image is measured
+        rows.append(_with_errors(row, form(), reference))
         step()
-    seconds = _timed(candidates, repeats, step)
+    seconds: list[list[float]] = [[] for _ in candidates]
+    for _ in range(repeats):
+        for (_, form), taken in zip(candidates, seconds, strict=True):
+            start = time.perf_counter()
+            form()
+            taken.append(time.perf_counter() - start)
+            step()
     return Tradeoff(
         device=device.info.label,
         driver=device.info.driver,
         channels=lines.channels,
         pixels=grid.shape,
         repeats=repeats,
-        rows=tuple(replace(row, seconds=median) for row, median in zip(rows, seconds, strict=True)),
+        rows=tuple(
+            replace(row, seconds=statistics.median(taken))
+            for row, taken in zip(rows, seconds, strict=True)
+        ),
         dark_level_db=dark_level_db(reference),
     )
 
 
-@dataclass(frozen=True)
-class _Request:
-    """Arguments of `clsas.plan` for one method, and how its row is labelled."""
-
-    label: str
-    method: str
-    tolerance_db: float | None = None
-    stages: Sequence[tuple[int, int]] | None = None
-    taps: tuple[int, int] | None = None
-    depth: int | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class _Candidate:
-    """A method: its row as planned, without measurements, and a function that forms its image."""
-
-    row: Row
-    form: Callable[[], Image]
-
-
-def _check(lines: object, grid: object, beam: object, repeats: int, study: object) -> int:
-    """Return the repeats; raise TypeError or ValueError if an argument has the wrong type."""
-    validate.instance("lines", lines, RangeLines)
-    validate.instance("grid", grid, Grid)
-    validate.flag("study", study)
-    if beam is not None:
-        validate.instance("beam", beam, BeamWindow)
-    return validate.count("repeats", repeats)
-
-
-def _checked_tolerances(tolerances_db: Sequence[float]) -> list[float]:
-    """Return the tolerances, which may be an empty list."""
-    given = validate.array("tolerances_db", tolerances_db, np.float64, None)
-    return [
-        validate.number(
-            "every entry of tolerances_db", each, "dB", least=BEST_TOLERANCE_DB,
-            most=WORST_TOLERANCE_DB,
-        )
-        for each in given.ravel()
-    ]  # fmt: skip
-
-
-def _requests(
-    tolerances_db: Sequence[float], study: bool, stages: Sequence[Sequence[tuple[int, int]]]
-) -> list[_Request]:
-    """Return a request for every method but the exact one."""
-    requests = [_Request(f"{each:g} dB", "tolerance", each) for each in tolerances_db]
-    if study:
-        for each, taps, depth in product(tolerances_db, STUDIED_TAPS, STUDIED_DEPTHS):
-            label = f"{each:g} dB, {taps[0]}+{taps[1]} taps, {depth} stage{'s' * (depth > 1)}"
-            requests.append(_Request(label, "study", each, taps=taps, depth=depth))
-    return requests + [_Request(_label(each), "stages", stages=each) for each in stages]
-
-
-def _label(stages: Sequence[tuple[int, int]]) -> str:
-    """Return "3 of 2x2" for equal stages, "2x2,4x2" for others."""
-    each = [f"{beams}x{divisions}" for beams, divisions in stages]
-    return f"{len(each)} of {each[0]}" if len(set(each)) == 1 else ",".join(each)
-
-
-def _planned(
-    requests: Sequence[_Request],
-    lines: RangeLines,
-    grid: Grid,
-    beam: BeamWindow | None,
-    device: Device,
-) -> Iterator[_Candidate]:
-    """Yield the planned methods, without those of a study that cannot keep the tolerance."""
-    for request in requests:
-        start = time.perf_counter()
-        asked = Request(
-            lines, grid, tolerance_db=request.tolerance_db, stages=request.stages,
-            taps=request.taps, depth=request.depth, beam=beam,
-        )  # fmt: skip
-        scene = asked.scene()
-        scene.warn("tolerance_db", asked.tolerance_db, doubts=False)
-        chosen, _ = planned(scene, asked, device)
-        plan_seconds = time.perf_counter() - start
-        if request.taps is not None and chosen.is_exact:
-            continue
-        form = partial(factorize, lines, grid, chosen, device=device)
-        yield _Candidate(_row(request.label, request.method, chosen, plan_seconds), form)
-
-
-def _exactly(
-    accuracy_db: float, lines: RangeLines, grid: Grid, beam: BeamWindow | None, device: Device
-) -> _Candidate:
-    """Return the exact image as a candidate."""
-    asked = Request(lines, grid, stages=[], beam=beam)
-    chosen, _ = planned(asked.scene(), asked, device)
-    row = replace(_row("exact", "exact", chosen, 0.0), predicted_error_db=accuracy_db)
-    form = partial(form_exactly, lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
-    return _Candidate(row, form)
-
-
-def _timed(candidates: Sequence[_Candidate], repeats: int, step: Callable[[], None]) -> list[float]:
-    """Return the median time of every candidate in seconds; they are formed in turns."""
-    seconds: list[list[float]] = [[] for _ in candidates]
-    for _ in range(repeats):
-        for each, taken in zip(candidates, seconds, strict=True):
-            start = time.perf_counter()
-            each.form()
-            taken.append(time.perf_counter() - start)
-            step()
-    return [statistics.median(taken) for taken in seconds]
-
-
-def summary(chosen: Plan) -> str:
-    """Return a plan as one line: the subimages (rows x columns) of every stage, and its filters."""
-    if chosen.is_exact:
-        return "plain backprojection"
-    sides = ", ".join(f"{rows}x{columns}" for rows, columns in chosen.sides)
-    image = chosen.factorization
-    return (
-        f"{sides}; {image.align.taps} taps in range, {image.final.taps} at the end, "
-        f"{image.aperture.describe()}"
-    )
-
-
-def _feasible(
+def _feasible_stages(
     lines: RangeLines, grid: Grid, beam: BeamWindow | None
 ) -> list[tuple[tuple[int, int], ...]]:
     """Return those of `STAGES` for which there are enough lines and pixels."""
@@ -317,7 +218,53 @@ def _feasible(
     ]
 
 
-def _row(label: str, method: str, chosen: Plan, plan_seconds: float) -> Row:
+def _candidates(
+    lines: RangeLines,
+    grid: Grid,
+    beam: BeamWindow | None,
+    device: Device,
+    tolerances: Sequence[float],
+    stages: Sequence[Sequence[tuple[int, int]]],
+    study: bool,
+) -> Iterator[tuple[Row, Callable[[], Image]]]:
+    """Yield every method: its row without measurements, and a function that forms its image.
+
+    Methods of a study that cannot keep the tolerance are left out.
+    """
+    ask = partial(Request, lines, grid, beam=beam)
+    methods = [
+        (f"{each:g} dB", "tolerance", partial(ask, tolerance_db=each)) for each in tolerances
+    ]
+    if study:
+        for each, taps, depth in product(tolerances, STUDIED_TAPS, STUDIED_DEPTHS):
+            label = f"{each:g} dB, {taps[0]}+{taps[1]} taps, {depth} stage{'s' * (depth > 1)}"
+            methods.append(
+                (label, "study", partial(ask, tolerance_db=each, taps=taps, depth=depth))
+            )
+    for pairs in stages:
+        names = [f"{beams}x{divisions}" for beams, divisions in pairs]
+        label = f"{len(names)} of {names[0]}" if len(set(names)) == 1 else ",".join(names)
+        methods.append((label, "stages", partial(ask, stages=pairs)))
+    for label, method, asked_for in methods:
+        start = time.perf_counter()
+        asked = asked_for()
+        scene = asked.scene()
+        scene.warn("tolerance_db", asked.tolerance_db, doubts=False)
+        chosen, _ = planned(scene, asked, device)
+        plan_seconds = time.perf_counter() - start
+        if method == "study" and chosen.is_exact:
+            continue
+        row = _planned_row(label, method, chosen, plan_seconds)
+        yield row, partial(factorize, lines, grid, chosen, device=device)
+
+    accuracy_db = min([ACCURACY_DB, *tolerances])
+    asked = ask(stages=[])
+    chosen, _ = planned(asked.scene(), asked, device)
+    row = replace(_planned_row("exact", "exact", chosen, 0.0), predicted_error_db=accuracy_db)
+    yield row, partial(form_exactly, lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
+
+
+def _planned_row(label: str, method: str, chosen: Plan, plan_seconds: float) -> Row:
     return Row(
         label=label,
         method=method,
@@ -330,9 +277,34 @@ def _row(label: str, method: str, chosen: Plan, plan_seconds: float) -> Row:
     )
 
 
-def _measured(row: Row, image: Image, reference: Image) -> Row:
+def summary(chosen: Plan) -> str:
+    """Return a plan as one line: the subimages (rows x columns) of every stage, and its filters."""
+    if chosen.is_exact:
+        return "plain backprojection"
+    sides = ", ".join(f"{rows}x{columns}" for rows, columns in chosen.sides)
+    image = chosen.factorization
+    return (
+        f"{sides}; {image.align.taps} taps in range, {image.final.taps} at the end, "
+        f"{image.aperture.describe()}"
+    )
+
+
+def _with_errors(row: Row, image: Image, reference: Image) -> Row:
     """Return a row with the error of its image and the response of the strongest point."""
-    azimuth, range_ = _responses(image, reference)
+    azimuth = range_ = None
+    if image.grid.points_m is None:
+        across, upward = image.grid.sides
+        at = np.unravel_index(np.abs(reference.pixels).argmax(), reference.grid.shape)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", validate.ClsasWarning)  # about other targets nearby
+                point = measure_point(image, (across.places_m[at[1]], upward.places_m[at[0]]))
+            azimuth, range_ = (
+                Response(cut.resolution_m, max(cut.pslr_nearest_db), cut.islr_db)
+                for cut in (point.azimuth, point.range)
+            )
+        except ValueError:  # there is no point response, or it is too close to the border
+            pass
     return replace(
         row,
         error_db=relative_error_db(image, reference),
@@ -342,20 +314,191 @@ def _measured(row: Row, image: Image, reference: Image) -> Row:
     )
 
 
-def _responses(image: Image, reference: Image) -> tuple[Response | None, Response | None]:
-    """Return the responses at the reference's strongest point, where they can be measured."""
-    if image.grid.points_m is not None:
-        return None, None
-    across, upward = image.grid.sides
-    row, column = np.unravel_index(np.abs(reference.pixels).argmax(), reference.grid.shape)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", validate.ClsasWarning)  # about other targets nearby
-            point = measure_point(image, (across.places_m[column], upward.places_m[row]))
-    except ValueError:  # there is no point response, or it is too close to the border
-        return None, None
-    return _response(point.azimuth), _response(point.range)
+@dataclass(frozen=True)
+class Response:
+    """Response of a point along one axis; see `clsas.measures.quality.Cut`.
+
+    Attributes
+    ----------
+    resolution_m : float
+        Width at -3 dB in metres.
+    pslr_db : float
+        Higher one of the two side lobes next to the main lobe, in dB.
+    islr_db : float
+        Energy of the side lobes relative to that of the main lobe, in dB.
+    """
+
+    resolution_m: float
+    pslr_db: float
+    islr_db: float
 
 
-def _response(cut: Cut) -> Response:
-    return Response(cut.resolution_m, max(cut.pslr_nearest_db), cut.islr_db)
+@dataclass(frozen=True)
+class Row:
+    """Time and errors of an image formed by one method.
+
+    Attributes
+    ----------
+    label : str
+        The tolerance, the given stages ("3 of 2x2"), or "exact". In a study, the tolerance, taps
+        in range and along the aperture, and number of stages ("-50 dB, 8+6 taps, 3 stages").
+    method : str
+        "tolerance", "study", "stages" or "exact".
+    plan : str
+        Subimages of every stage, and the filters.
+    plan_seconds : float
+        Time that planning took; 0 for the exact image.
+    seconds : float
+        Median time of the image, without planning.
+    predicted_seconds : float
+        Time that the plan predicts.
+    error_db, predicted_error_db : float
+        Measured and predicted relative rms error, in dB.
+    azimuth, range : Response or None
+        Response at the strongest point of the exact image; None if it cannot be measured.
+    dark_error_db : float
+        Error in the darkest tenth of the exact image, relative to the level there, in dB; see
+        `clsas.measures.quality`.
+    """
+
+    label: str
+    method: str
+    plan: str
+    plan_seconds: float
+    seconds: float
+    predicted_seconds: float
+    error_db: float
+    predicted_error_db: float
+    azimuth: Response | None = None
+    range: Response | None = None
+    dark_error_db: float = -math.inf
+
+
+@dataclass(frozen=True)
+class Tradeoff:
+    """Measured times and errors of one image by many methods, as returned by `tradeoff`.
+
+    Attributes
+    ----------
+    device, driver : str
+        Device that formed the images, and its driver.
+    channels : int
+        Number of range lines.
+    pixels : (rows, columns)
+        Shape of the image.
+    repeats : int
+        Number of timed runs; `seconds` are their medians.
+    rows : tuple of Row
+        Images to a tolerance, then those of a study, then those by given stages, and the exact
+        image last.
+    dark_level_db : float
+        Level of the darkest tenth of the exact image relative to the whole image, in dB.
+
+    See Also
+    --------
+    tradeoff : Function that returns it, with an example.
+    """
+
+    device: str
+    driver: str
+    channels: int
+    pixels: tuple[int, ...]
+    repeats: int
+    rows: tuple[Row, ...]
+    dark_level_db: float = 0.0
+
+    def __repr__(self) -> str:
+        """Return the sizes, the device, and the spans of times and errors."""
+        seconds = [row.seconds for row in self.rows]
+        errors_db = [row.error_db for row in self.rows]
+        return reprs.summary(
+            self,
+            f"{len(self.rows)} images of {reprs.by(self.pixels)} pixels from "
+            f"{self.channels} channels",
+            f"{reprs.quantity(min(seconds), 's')} to {reprs.quantity(max(seconds), 's')}",
+            f"errors {reprs.span(min(errors_db), max(errors_db), 'dB')}",
+            self.device,
+        )
+
+    def _repr_html_(self) -> str:
+        return self._report().html()
+
+    @property
+    def exact(self) -> Row:
+        """Row of the exact image."""
+        return self.rows[-1]
+
+    @property
+    def front(self) -> tuple[Row, ...]:
+        """Rows that no other row beats in both time and error (Pareto front), fastest first."""
+        best = math.inf
+        front: list[Row] = []
+        for row in sorted(self.rows, key=lambda row: (row.seconds, row.error_db)):
+            if row.error_db < best:
+                best = row.error_db
+                front.append(row)
+        return tuple(front)
+
+    def describe(self) -> str:
+        """Return a table of all rows as text.
+
+        Resolutions are relative to those of the exact image. "In the dark" is the error in the
+        darkest tenth of the image, relative to the level there.
+        """
+        return self._report().text()
+
+    def _report(self) -> Report:
+        rows = []
+        for row in self.rows:
+            cells = [
+                row.label,
+                f"{row.seconds:.3g}",
+                f"{row.predicted_seconds:.3g}",
+                f"{self.exact.seconds / row.seconds:.2g}",
+                f"{row.error_db:.1f}",
+                f"{row.predicted_error_db:.1f}",
+                f"{row.dark_error_db:.1f}",
+            ]
+            for one, exact in ((row.azimuth, self.exact.azimuth), (row.range, self.exact.range)):
+                cells.append(
+                    f"{one.resolution_m / exact.resolution_m:.3f}" if one and exact else "-"
+                )
+            cells += [f"{one.pslr_db:.1f}" if one else "-" for one in (row.azimuth, row.range)]
+            rows.append(cells)
+        return Report([Table(_COLUMNS, rows)])
+
+    def save_csv(self, path: str | os.PathLike) -> None:
+        """Write all rows as CSV. An existing file is replaced in one step.
+
+        Raises
+        ------
+        ValueError
+            If the suffix is not .csv.
+        OSError
+            If the folder does not exist or the file cannot be written.
+        """
+        validate.suffix("path", validate.path("path", path), ".csv")
+        with replacing(path) as temporary, open(temporary, "w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(_HEADER)
+            for row in self.rows:
+                cells = [row.label, row.method, row.plan, row.plan_seconds, row.seconds]
+                cells += [row.predicted_seconds, row.error_db, row.predicted_error_db]
+                cells.append(row.dark_error_db)
+                for response in (row.azimuth, row.range):
+                    cells += [getattr(response, figure, None) for figure in _FIGURES]
+                writer.writerow(cells)
+
+    def save_png(self, path: str | os.PathLike, *, title: str = "") -> None:
+        """Write a picture of time against error as PNG; see `clsas.plot.tradeoff`.
+
+        Raises
+        ------
+        ImportError
+            If matplotlib is not installed.
+        OSError
+            If the folder does not exist or the file cannot be written.
+        """
+        import clsas  # the public face, which imports the room plot only when it is used
+
+        clsas.plot.save_png(clsas.plot.tradeoff(self, title=title), path)

@@ -13,7 +13,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.decibels import in_db
 from clsas.engine.factorized.plan import Plan
 from clsas.measures.quality import PointResponse
-from clsas.measures.tradeoff_result import Tradeoff
+from clsas.measures.tradeoff import Tradeoff
 from clsas.plot.canvas import axis_label, drawable, length_unit, new_figure
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ from exactly import execute, prepare
 import clsas
 from clsas.engine.device.device import Device, open_device
 from clsas.files import scene_files as config
-from clsas.measures.assessment_result import NONE_DB, Assessment, Effect
+from clsas.measures.assess import NONE_DB, Assessment, Effect
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import stored_tables

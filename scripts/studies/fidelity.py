@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 import clsas
-from clsas.measures.limits_heights import phase_per_height
+from clsas.measures.elevation import phase_per_height
 from clsas.selftest import wreck
 
 COLUMNS = (

@@ -23,7 +23,7 @@ from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.forming import form
 from clsas.engine.scene import Scene
-from clsas.measures.shadows import dark_level_db
+from clsas.measures.quality import dark_level_db
 from clsas.selftest import bench, cases, wreck
 from clsas.simulation import seabeds
 from studies.scaling import scaled

@@ -9,7 +9,7 @@ from chapter5 import decibels
 from scipy import signal
 
 import clsas
-from clsas.measures.cuts import measure_cut
+from clsas.measures.quality import measure_cut
 
 # Three beams are combined into one, and sides divided by powers of two. The errors are within 3 %
 # of lambda/121.2, /60.6, /30.3 ... /1.9, whose integer parts are the labels 121, 60, 30, 15, 7, 3

@@ -13,8 +13,7 @@ import chapter5
 
 import clsas
 from clsas.engine.factorized.planner import Request, planned
-from clsas.measures.tradeoff import STUDIED_DEPTHS, STUDIED_TAPS
-from clsas.measures.tradeoff_result import Row, Tradeoff
+from clsas.measures.tradeoff import STUDIED_DEPTHS, STUDIED_TAPS, Row, Tradeoff
 
 TOLERANCES_DB = (-30.0, -40.0, -50.0)
 

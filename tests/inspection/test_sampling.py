@@ -13,7 +13,7 @@ from clsas.inspection.sampling import (
     grating_lobe_m,
     receive_interval_s,
 )
-from clsas.measures.assessment import survey_lines
+from clsas.measures.assess import survey_lines
 
 GRID = Grid.plane(x=(0, 5, 64), y=(40, 45, 64))
 WIDE = Sonar.thesis_wide_beam()

@@ -12,7 +12,7 @@ from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.system import Pulse, Sonar, line_array
 from clsas.engine.data.track import Pointing, Track
 from clsas.files.scene_files import built_in_scene, parse_scene
-from clsas.measures.limits_result import LABELS, Limit
+from clsas.measures.limits import LABELS, Limit
 from clsas.selftest.reference import ideal
 
 WIDE = Sonar.thesis_wide_beam()

@@ -5,7 +5,7 @@ import pytest
 
 import clsas
 from clsas.engine.data.image_error import darkest_pixels
-from clsas.measures.shadows import dark_level_db
+from clsas.measures.quality import dark_level_db
 
 
 def speckle(shape, seed=0):

@@ -7,8 +7,7 @@ import pytest
 
 import clsas
 from clsas.engine.data.grid import Grid
-from clsas.measures.tradeoff import STAGES, summary
-from clsas.measures.tradeoff_result import Response, Row, Tradeoff
+from clsas.measures.tradeoff import STAGES, Response, Row, Tradeoff, summary
 
 # Far enough apart that their side lobes do not meet; the first one is the strongest.
 TARGETS = clsas.PointTargets([[0.02, 40.3, 0], [-0.25, 40.55, 0]], [1.0, 0.6])
@@ -128,7 +127,7 @@ def test_default_stages_leave_a_line_and_a_pixel(lines):
         (TypeError, "stages must be a sequence", {"stages": 3}),
         (TypeError, "beam must be of type BeamWindow", {"beam": 3}),
         (TypeError, "study must be of type bool", {"study": "x"}),
-        (TypeError, "tolerances_db must be real numbers", {"tolerances_db": None}),
+        (TypeError, "tolerances_db must be a sequence", {"tolerances_db": None}),
         (TypeError, "progress must be a function", {"progress": 3}),
     ],
 )

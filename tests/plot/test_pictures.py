@@ -16,7 +16,7 @@ import clsas
 from clsas import plot
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
-from clsas.measures.tradeoff_result import Row, Tradeoff
+from clsas.measures.tradeoff import Row, Tradeoff
 from clsas.plot.canvas import colour_map
 
 matplotlib = pytest.importorskip("matplotlib")

@@ -9,7 +9,7 @@ import pytest
 import clsas
 from clsas.engine.data import reprs
 from clsas.engine.data.reprs import Report, Table
-from clsas.measures.effects import KEYS
+from clsas.measures.assess import KEYS
 
 PULSE = clsas.Pulse(1e6, 1e5, 1e-3)
 SONAR = clsas.Sonar.thesis_wide_beam()

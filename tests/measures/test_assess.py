@@ -18,8 +18,17 @@ from clsas.engine.data.simplify import APART, MOTION, REFRACTION, RELIEF
 from clsas.engine.data.system import line_array
 from clsas.engine.water.refraction import homogeneous
 from clsas.files import scene_files as config
-from clsas.measures.assessment import assess, survey_lines
-from clsas.measures.effects import BEAM, ENDS, KEYS, PATTERN, SINGLE, SWAY, track_errors_m
+from clsas.measures.assess import (
+    BEAM,
+    ENDS,
+    KEYS,
+    PATTERN,
+    SINGLE,
+    SWAY,
+    assess,
+    survey_lines,
+    track_errors_m,
+)
 from clsas.selftest.reference import ideal
 
 CHANNELS, CARRIER, STEP = 96, 300e3, 0.012
