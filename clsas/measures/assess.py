@@ -44,7 +44,7 @@ from clsas.engine.device.device import Device, open_device
 from clsas.engine.factorized.costs import Costs
 from clsas.engine.factorized.errors import half_precision_error
 from clsas.engine.factorized.plan import Plan
-from clsas.engine.factorized.planner import TOLERANCE_DB, checked_tolerance_db
+from clsas.engine.factorized.planner import TOLERANCE, TOLERANCE_DB
 from clsas.engine.forming import form
 from clsas.engine.imaging import plan
 from clsas.engine.scene import Scene
@@ -179,7 +179,7 @@ def assess(
     >>> motion.needed
     True
     """
-    tolerance_db = checked_tolerance_db(tolerance_db)
+    tolerance_db = TOLERANCE.check("tolerance_db", tolerance_db)
     repeats = check_declared(assess, {"repeats": repeats})["repeats"]
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)

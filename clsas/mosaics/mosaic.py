@@ -39,7 +39,7 @@ from clsas.engine.data.threads import uninterrupted, wait
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.engine.data.version import __version__
 from clsas.engine.device.device import Device
-from clsas.engine.exact.decide import BEST_ACCURACY_DB
+from clsas.engine.exact.decide import ACCURACY
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import (
     TOLERANCE_DB,
@@ -288,7 +288,7 @@ def _checked_request(
         raise ArgumentError(second, f"be left out if `{first}` is given")
     tolerance_in_db(tolerance_db, tolerance_wavelengths)
     if accuracy_db is not None:
-        validate.number("accuracy_db", accuracy_db, "dB", least=BEST_ACCURACY_DB, below=0.0)
+        ACCURACY.check("accuracy_db", accuracy_db)
     # Convert to plain numbers, since the inputs are stored as JSON.
     for name, value in request.items():
         if name == "stages":

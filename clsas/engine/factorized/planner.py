@@ -178,17 +178,12 @@ THESIS_STAGES = Other(
 """Declares stages of the thesis's method."""
 
 
-def checked_tolerance_db(tolerance_db: float) -> float:
-    """Return a tolerance in dB; raise TypeError or ValueError if it is outside the limits."""
-    return TOLERANCE.check("tolerance_db", tolerance_db)
-
-
 def tolerance_in_db(
     tolerance_db: float | None, tolerance_wavelengths: float | None
 ) -> float | None:
     """Return the requested tolerance in dB, or None without one, after checking it."""
     if tolerance_db is not None:
-        return checked_tolerance_db(tolerance_db)
+        return TOLERANCE.check("tolerance_db", tolerance_db)
     if tolerance_wavelengths is None:
         return None
     return decibels(TOLERANCE_WAVELENGTHS.check("tolerance_wavelengths", tolerance_wavelengths))
