@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
@@ -25,6 +25,7 @@ from clsas.engine.data.declared import (
     limits_in_words,
 )
 from clsas.files.scene_tables import SceneTables
+from clsas.files.tables import models_in
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "scene-files.md"
 SHOWN = re.compile(r"(<!-- keys: (\S+) -->\n).*?(<!-- end of keys -->)", re.DOTALL)
@@ -39,7 +40,7 @@ def rows(name: str) -> str:
     """Return the declared keys of a table, such as "image.beam", as Markdown."""
     model: Any = SceneTables
     for part in name.split("."):
-        model = table_of(model.model_fields[part].annotation)
+        model = next(models_in(model.model_fields[part].annotation))
     lines = ["| key | unit | default | allowed | meaning |", "|---|---|---|---|---|"]
     for key, what in declared(model).items():
         unit, meaning = getattr(what, "unit", ""), what.help.removesuffix(".")
@@ -48,12 +49,6 @@ def rows(name: str) -> str:
         cells = f"`{key}`", unit, _default(model, key, what), _allowed(what), meaning
         lines.append("| " + " | ".join(cells).replace("|  |", "| |").replace("|  |", "| |") + " |")
     return "\n".join(lines) + "\n"
-
-
-def table_of(annotation: Any) -> type[BaseModel]:
-    """Return the model in a type such as `_Beam | None`."""
-    kinds = [annotation, *get_args(annotation)]
-    return next(each for each in kinds if isinstance(each, type) and issubclass(each, BaseModel))
 
 
 def _default(model: type[BaseModel], key: str, what: Declared) -> str:

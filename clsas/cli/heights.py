@@ -17,7 +17,6 @@ from clsas.files.hdf5 import SUFFIXES
 from clsas.files.height_files import read_heights
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import HeightsTable
-from clsas.processing import numbers
 
 STORE_SUFFIX = ".zarr"
 """Suffix of the stores of mosaics."""
@@ -111,7 +110,7 @@ def heights(
     with progress_bar("measuring heights") as progress:
         found = clsas.heights(first, second, grid, **request, progress=progress)
     clsas.save(output, found)
-    results = numbers.of_heights(found)
+    results = found.figures
     report(
         as_json,
         f"{printable(output)}: {in_words(results)}\n  coherence "
@@ -138,7 +137,7 @@ def _report_store(store: clsas.Store, output: Path, as_json: bool) -> None:
     """Report the valid share of a mosaic of heights, and the patches with defects."""
     records, (rows, columns) = store.records(), store.patch_shape or (0, 0)
     found = store.overview_heights()
-    results = numbers.of_heights(found)
+    results = found.figures
     counts = [1 + max(each) for each in zip(*records, strict=True)]
     flagged = {index: record.flags for index, record in records.items() if record.flags}
     lines = [

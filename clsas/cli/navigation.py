@@ -14,7 +14,6 @@ from clsas.cli.inputs import load, read_beam, read_grid
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import INPUT
 from clsas.cli.wording import command
-from clsas.processing import numbers
 
 
 @command("known-points")
@@ -85,7 +84,7 @@ def navigate(
     with progress_bar("navigating") as progress:
         found = clsas.micronavigate(lines, **how, progress=progress)
     clsas.save(output, found.lines)
-    results = numbers.of_navigation(found)
+    results = found.figures
     shape_m = results["shape_sd_m"]
     shape = "unknown" if np.isnan(shape_m) else f"at most {1e3 * shape_m:.3g} mm"
     report(
@@ -134,7 +133,7 @@ def focus(
     with progress_bar("focusing") as progress:
         found = clsas.autofocus(lines, grid, beam=window, **how, device=device, progress=progress)
     clsas.save(output, found.lines)
-    results = numbers.of_focus(found)
+    results = found.figures
     rms_m = results["correction_rms_m"]
     moved = f"corrected by {1e3 * rms_m:.3g} mm rms" if found.focused else "left as they were"
     steps = "".join(f"\n  {name}: {value:.4g}" for name, value in found.sharpness)

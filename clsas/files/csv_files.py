@@ -18,8 +18,7 @@ from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.data.track import Track, doubts_of_track
 from clsas.engine.data.validate import ArgumentError
-from clsas.files.mistakes import suggestion
-from clsas.files.tables import located
+from clsas.files.tables import located, suggestion
 
 _POSITION = ("x_m", "y_m", "z_m")
 _VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")

@@ -7,12 +7,14 @@ message names the file, the table and the key.
 from __future__ import annotations
 
 import os
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from clsas.engine.data import reading, validate
 from clsas.engine.data.digests import digest
@@ -22,12 +24,21 @@ from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.data.system import Sonar
 from clsas.engine.data.track import Track
 from clsas.engine.data.version import __version__
-from clsas.files.mistakes import explain
 from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS, SceneTables
-from clsas.files.tables import located
+from clsas.files.tables import closest, located, models_in, suggestion
 from clsas.simulation.scenes import Scene
 
 _MOST_MISTAKES = 20  # listed in one message: a plain choice, which fits on a screen
+_BARE_KEY = re.compile(r"[\w-]{1,100}", re.ASCII)
+# Required kind of value for pydantic's types of errors. Other errors keep pydantic's message.
+_MUST_BE = {
+    "bool_type": "true or false",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "list_type": "a list in [...]",
+    "model_type": "a table of keys",
+    "string_type": "a text in quotes",
+}
 _IMAGING = ("grid", "image", "mosaic", "process")  # tables that do not affect range lines
 
 
@@ -122,7 +133,7 @@ def parse_scene(text: bytes, *, name: str, folder: Path) -> SceneFile:
     try:
         model = SceneTables.model_validate(tables)
     except ValidationError as error:
-        mistakes = explain(error, tables, SceneTables)
+        mistakes = _explained(error, tables)
         lines = [f"{name}: {line}" for line in mistakes[:_MOST_MISTAKES]]
         if len(mistakes) > _MOST_MISTAKES:
             lines.append(f"{name}: and {len(mistakes) - _MOST_MISTAKES} more mistakes")
@@ -131,6 +142,61 @@ def parse_scene(text: bytes, *, name: str, folder: Path) -> SceneFile:
         raise ValueError(f"{name}: tables or lists are nested too deeply") from None
     with located(f"{name}:"):
         return SceneFile(name=name, **model.build(folder))
+
+
+def _explained(error: ValidationError, tables: dict[str, Any]) -> list[str]:
+    """Return a line of text for every key of a parsed file that pydantic refuses."""
+    lines: dict[tuple, str] = {}
+    musts: dict[tuple, dict[str, None]] = {}  # dicts that serve as ordered sets
+    mistyped: set[tuple] = set()
+    for problem in error.errors(include_url=False):
+        kind, location = problem["type"], problem["loc"]
+        if kind == "missing":
+            lines[location] = f"missing key {location[-1]!r} in {_table(location[:-1])}"
+            continue
+        # Pydantic's location also contains members of unions, which the file does not have.
+        path: tuple[str | int, ...] = ()
+        inside: Any = tables
+        for part in location:
+            try:
+                inside = inside[part]
+            except (KeyError, IndexError, TypeError):
+                break
+            path = *path, part
+        if kind == "extra_forbidden":
+            *parents, name = *path[:-1], str(path[-1])
+            model: type[BaseModel] = SceneTables
+            for part in parents:
+                if isinstance(part, str):
+                    model = next(models_in(model.model_fields[part].annotation))
+            allowed = list(model.model_fields)
+            mistyped |= {(*parents, guess) for guess in closest(name, allowed)}
+            if parents:
+                unknown = f"key {validate.shown(name)} in {_table(parents)}"
+            else:
+                unknown = f"table [{name if _BARE_KEY.fullmatch(name) else validate.shown(name)}]"
+            lines[path] = f"unknown {unknown}{suggestion(name, allowed)}"
+            continue
+        context = problem.get("ctx", {})
+        if path == ("targets",):
+            must = "one or more tables [[targets]]"
+        elif "actual_length" in context:
+            must = f"a list of {context.get('min_length', context.get('max_length'))}"
+        else:
+            must = _MUST_BE.get(kind, problem["msg"])
+        musts.setdefault(path, {})[must] = None  # pydantic reports one error per member of a union
+        last = max(index for index, part in enumerate(path) if isinstance(part, str))
+        key = f"{path[last]}" + "".join(f"[{index}]" for index in path[last + 1 :])
+        key = f"{_table(path[:last])} {key}" if last else key
+        got = validate.shown(problem["input"])
+        lines[path] = f"{key} must be {' or '.join(musts[path])}, got {got}"
+    return [line for path, line in lines.items() if path not in mistyped]
+
+
+def _table(path: Sequence[str | int]) -> str:
+    """Return the name of a table as in the file; repeated tables are counted from 1."""
+    name = ".".join(str(part) for part in path if isinstance(part, str))
+    return f"[[{name}]] number {path[-1] + 1}" if isinstance(path[-1], int) else f"[{name}]"
 
 
 def simulation_digest(text: bytes, folder: Path) -> str:

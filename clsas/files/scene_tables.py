@@ -1,8 +1,8 @@
 """Tables of scene files: one pydantic model per table, which checks the keys of the table.
 
 Keys that set an argument of the library come from its declaration (`keys_of`). The method `build`
-of a table returns an object of the library, or arguments of a function. Checks of the library then
-apply, and the name of the table is put in front of their messages.
+of a table returns an object of the library, and `options` returns arguments of a function. Checks
+of the library then apply, and the name of the table is put in front of their messages.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ PLAN_KEYS = ("tolerance_db", "tolerance_wavelengths", "stages")
 """Keys of `[image]` for `clsas.plan`, of which one may be given."""
 EXACT_KEYS = ("accuracy_db", "taps", "upsampling")
 """Keys of `[image]` for `clsas.backproject`."""
-STEPS = (
+STEP_NAMES = (
     "inspect", "calibrate", "navigate", "focus", "pair_errors", "image", "heights", "mosaic"
 )  # fmt: skip
-"""Steps of `clsas process`, in the order in which they run."""
+"""Names of the steps of `clsas process`, in the order in which they run."""
 CORRECTIONS = ("calibrate", "navigate", "focus", "pair_errors")
 """Steps that correct the lines."""
 
@@ -290,11 +290,11 @@ class _Pointing(Table):
 
 @keys_of(simulate)
 class _Simulate(Table):
+    where = "[simulate]"
     pointing: _Pointing | None = None
 
-    def build(self) -> dict[str, Any]:
-        with located("[simulate]"):
-            options = self.given()
+    def options(self) -> dict[str, Any]:
+        options = super().options()
         if self.pointing is not None:
             options["pointing"] = self.pointing.build()
         return options
@@ -302,9 +302,7 @@ class _Simulate(Table):
 
 @keys_of(compress, window=str | list[str | float])
 class _Compress(Table):
-    def build(self) -> dict[str, Any]:
-        with located("[compress]"):
-            return self.given()
+    where = "[compress]"
 
 
 class AxisTable(Table):
@@ -340,36 +338,27 @@ class GridTable(Table):
             If keys are missing or exclude each other, a value is outside its limits, or the file
             of heights cannot be read or has another shape.
         """
+        oriented = self.model_fields_set & set(_ORIENTED)
+        along_axes = self.model_fields_set & {*_ALONG_AXES, "z_m"}
         with located("[grid]"):
-            plane = self._plane()
+            if oriented and along_axes:
+                raise ArgumentError(
+                    min(along_axes),
+                    f"be left out with `{min(oriented)}`",
+                    hint="give `x`, `y` and `z_m` for a horizontal plane, or `origin_m`, "
+                    "`row_step_m`, `column_step_m` and `shape` for any",
+                )
+            for name in _ORIENTED if oriented else _ALONG_AXES:
+                if getattr(self, name) is None:
+                    or_else = ", or `origin_m`, `row_step_m`, ... of a slanted plane"
+                    raise ArgumentError(name, "be given" + ("" if oriented else or_else))
+            if self.x is not None and self.y is not None:
+                plane = Grid.plane(self.x.build(), self.y.build(), self.z_m)
+            else:
+                plane = Grid.oriented(*(getattr(self, name) for name in _ORIENTED))
             if self.height_file is None:
                 return plane
             return plane.with_height(read_heights(folder / self.height_file, plane.shape))
-
-    def _plane(self) -> Grid:
-        """Return the plane, without heights."""
-        given = self.model_fields_set
-        oriented = given & set(_ORIENTED)
-        along_axes = given & {*_ALONG_AXES, "z_m"}
-        if oriented and along_axes:
-            raise ArgumentError(
-                min(along_axes),
-                f"be left out with `{min(oriented)}`",
-                hint="give `x`, `y` and `z_m` for a horizontal plane, or `origin_m`, `row_step_m`, "
-                "`column_step_m` and `shape` for any",
-            )
-        for name in _ORIENTED if oriented else _ALONG_AXES:
-            if getattr(self, name) is None:
-                other = "" if oriented else ", or `origin_m`, `row_step_m`, ... of a slanted plane"
-                raise ArgumentError(name, f"be given{other}")
-        if self.x is not None and self.y is not None:
-            return Grid.plane(self.x.build(), self.y.build(), self.z_m)
-        assert self.origin_m is not None  # all four have been checked
-        assert self.row_step_m is not None
-        assert self.column_step_m is not None
-        assert self.shape is not None
-        rows, columns = self.shape
-        return Grid.oriented(self.origin_m, self.row_step_m, self.column_step_m, (rows, columns))
 
 
 class SoundSpeedTable(Table):
@@ -452,11 +441,12 @@ class _Beam(Table):
 @keys_of(ExactImage, *EXACT_KEYS)
 @keys_of(Request, *PLAN_KEYS, stages=list[Annotated[list[int], Field(min_length=2, max_length=2)]])
 class _Image(Table):
+    where = "[image]"
     beam: _Beam | None = None
 
-    def build(self) -> dict[str, Any]:
-        with located("[image]"):
-            options = self.given()
+    def options(self) -> dict[str, Any]:
+        options = super().options()
+        with located(self.where):
             given = [name for name in (*PLAN_KEYS, *EXACT_KEYS) if name in options]
             if len(given) > 1 and given[0] in PLAN_KEYS:
                 got = f"also {', '.join(given[1:])}"
@@ -507,30 +497,26 @@ class MosaicTable(Table):
 
 @keys_of(calibrate_track)
 class _Calibrate(Table):
-    def build(self) -> dict[str, Any]:
-        with located("[process.calibrate]"):
-            return self.given()
+    where = "[process.calibrate]"
 
 
 @keys_of(micronavigate)
 class _Navigate(Table):
-    def build(self) -> dict[str, Any]:
-        with located("[process.navigate]"):
-            return self.given()
+    where = "[process.navigate]"
 
 
 @keys_of(autofocus)
 class _Focus(Table):
-    def build(self) -> dict[str, Any]:
-        with located("[process.focus]"):
-            return self.given()
+    where = "[process.focus]"
 
 
 @keys_of(pair_errors, "known_height_m", "points_m", "known_sd_m", "unknowns")
 class _PairErrors(Table):
-    def build(self) -> dict[str, Any]:
-        with located("[process.pair_errors]"):
-            options = self.given()
+    where = "[process.pair_errors]"
+
+    def options(self) -> dict[str, Any]:
+        options = super().options()
+        with located(self.where):
             names = [name for name in ("known_height_m", "points_m") if name in options]
             if len(names) != 1:
                 got = " and ".join(f"`{name}`" for name in names) or "neither"
@@ -585,7 +571,7 @@ class ProcessTable(Table):
                     options[name] = folder / validate.path(name, options[name])
         for name in _OPTIONAL:
             if (table := getattr(self, name)) is not None:
-                options[name] = table.build(folder) if name == "heights" else table.build()
+                options[name] = table.build(folder) if name == "heights" else table.options()
         if self.steps is None and self.pair_errors is not None and self.heights is None:
             allowed = "be given with `search_m` for [process.pair_errors]"
             raise ArgumentError("[process.heights]", allowed)
@@ -606,15 +592,15 @@ def checked_steps(steps: Sequence[str] | None, options: dict[str, Any]) -> tuple
     if steps is None:
         chosen = {*_USUAL, *(name for name in _OPTIONAL if name in options)}
     else:
-        chosen = set(validate.named("steps", steps, STEPS))
+        chosen = set(validate.named("steps", steps, STEP_NAMES))
     if not chosen:
-        raise ArgumentError("steps", f"name at least one of {STEPS}", "none")
+        raise ArgumentError("steps", f"name at least one of {STEP_NAMES}", "none")
     for name, tables in _REQUIRED.items():
         for table, key in tables.items():
             if name in chosen and table not in options:
                 allowed = f"not include {name!r} without {key} in [process.{table}]"
                 raise ArgumentError("steps", allowed)
-    return tuple(name for name in STEPS if name in chosen)
+    return tuple(name for name in STEP_NAMES if name in chosen)
 
 
 class SceneTables(Table):
@@ -664,7 +650,7 @@ class SceneTables(Table):
         if track is not None:
             place = track.georeference  # its own, if it consists of latitudes and longitudes
         profile = self.sound_speed.build(folder) if self.sound_speed else None
-        simulate = self.simulate.build()
+        simulate = self.simulate.options()
         if profile is not None:
             simulate["sound_speed"] = profile
         return dict(
@@ -675,8 +661,8 @@ class SceneTables(Table):
             georeference=place,
             sound_speed=profile,
             simulate=simulate,
-            compress=self.compress.build(),
-            image=self.image.build(),
+            compress=self.compress.options(),
+            image=self.image.options(),
             mosaic=self.mosaic.build(folder),
             process=self.process.build(folder),
             files={key: folder / file for key, file in paths.items() if file},

@@ -1,11 +1,12 @@
-"""Base of the tables in scene files."""
+"""Base of the tables in scene files, and parts of messages about tables in files."""
 
 from __future__ import annotations
 
+import difflib
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
@@ -36,14 +37,26 @@ _Table = TypeVar("_Table", bound="Table")
 
 
 class Table(BaseModel):
-    """A table that refuses unknown keys and values of other types."""
+    """A table that refuses unknown keys and values of other types.
+
+    Attributes
+    ----------
+    where : str
+        Name of the table in the file, such as "[compress]", for messages.
+    """
 
     model_config = ConfigDict(extra="forbid", strict=True)
+    where: ClassVar[str] = ""
 
     def given(self) -> dict[str, Any]:
         """Return the keys that the file sets, after checking those that are declared."""
         given = {name: getattr(self, name) for name in self.model_fields_set}
         return given | check_declared(type(self), given)
+
+    def options(self) -> dict[str, Any]:
+        """Return the keys that the file sets, for a function of the library."""
+        with located(self.where):
+            return self.given()
 
 
 def keys_of(
@@ -88,6 +101,14 @@ def _default_of(source: Callable[..., Any], name: str) -> Any:
     return None if getattr(declared(source)[name], "default", "") else ...
 
 
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the models in a type such as list[_Target] | None."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from models_in(argument)
+
+
 @contextmanager
 def located(where: str) -> Iterator[None]:
     """Put a file, or a table of it such as "[sonar]", in front of the library's messages."""
@@ -97,3 +118,16 @@ def located(where: str) -> Iterator[None]:
         raise error.within(where) from None
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where} {error}") from None
+
+
+def closest(name: str, allowed: Sequence[str]) -> list[str]:
+    """Return the allowed name that an unknown one probably stands for, if there is one."""
+    without_unit = [other for other in allowed if other.startswith(f"{name}_")]
+    return (without_unit or difflib.get_close_matches(name, allowed))[:1]
+
+
+def suggestion(name: str, allowed: Sequence[str]) -> str:
+    """Return the end of a message about an unknown name: the closest or all allowed names."""
+    if close := closest(name, allowed):
+        return f": did you mean {close[0]!r}?"
+    return f"; allowed are {', '.join(allowed)}"

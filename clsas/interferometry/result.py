@@ -87,6 +87,25 @@ class Heights:
         _check_limits("coherence", self.coherence, most=1.0)
         _check_limits("looks", self.looks)
 
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Valid share, span of heights, median deviation and what limits them, as numbers.
+
+        Span and deviation are None if no height is valid.
+        """
+        known_m = self.height_m[self.mask]
+        is_any = known_m.size > 0
+        return {
+            "pixels": self.mask.size,
+            "valid": float(self.mask.mean()),
+            "height_m": [float(known_m.min()), float(known_m.max())] if is_any else None,
+            "median_sd_m": float(np.median(self.sd_m[self.mask])) if is_any else None,
+            "window_m": self.window_m,
+            "looks": float(np.median(self.looks)),
+            "coherence": float(np.median(self.coherence)),
+            "ambiguity_m": 2 * np.pi * float(np.median(np.abs(self.m_per_rad))),
+        }
+
     def __repr__(self) -> str:
         """Return the shape, the valid share, the span of heights and the median deviation."""
         valid = f"{100 * self.mask.mean():.3g} % valid"

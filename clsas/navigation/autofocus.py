@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -619,12 +619,22 @@ class Autofocus:
     sharpness: tuple[tuple[str, float], ...]
     focused: bool
 
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Size and uncertainty of the correction and the gain in sharpness, as numbers."""
+        return {
+            "focused": self.focused,
+            "correction_rms_m": float(np.sqrt(np.mean(np.sum(self.correction_m**2, axis=1)))),
+            "correction_sd_m": float(np.median(self.correction_sd_m)) if self.focused else None,
+            "sharpness_before": self.sharpness_before,
+            "sharpness_after": self.sharpness_after,
+        }
+
     def __repr__(self) -> str:
         """Return the rms correction and the sharpness before and after."""
-        rms_m = float(np.sqrt(np.mean(np.sum(self.correction_m**2, axis=1))))
         return reprs.summary(
             self,
-            f"correction {reprs.quantity(rms_m, 'm')} rms",
+            f"correction {reprs.quantity(self.figures['correction_rms_m'], 'm')} rms",
             f"sharpness {self.sharpness_before:.3g} to {self.sharpness_after:.3g}",
             None if self.focused else "not focused",
         )

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -742,6 +742,22 @@ class Micronavigation:
         advance_m = np.linalg.norm(np.diff(self.lines.ping_centres_m, axis=0), axis=1)
         sway_m, yaw_rad = (np.sqrt(self.persistence) * each for each in deviations)
         return shape_deviation_m(sway_m, yaw_rad, advance_m)
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Size and uncertainty of the corrections, as numbers."""
+        measured = np.isfinite(self.sway_steps_sd_m)
+        return {
+            "pings": len(self.sway_m),
+            "overlap": int(self.overlap.min()),
+            "coherence": float(np.median(self.coherence)),
+            "sway_rms_m": float(np.std(self.sway_m)),
+            "yaw_rms_rad": float(np.std(self.yaw_rad)),
+            "surge_rms_m": float(np.std(self.surge_m)),
+            "shape_sd_m": float(np.max(self.shape_sd_m)),
+            "sway_step_sd_m": float(np.median(self.sway_steps_sd_m[measured])),
+            "yaw_step_sd_rad": float(np.median(self.yaw_steps_sd_rad[measured])),
+        }
 
     def __repr__(self) -> str:
         """Return the rms corrections and the median coherence."""

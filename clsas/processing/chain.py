@@ -15,33 +15,32 @@ from typing import Annotated, Any
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.atomic import staging, sync_folder
 from clsas.engine.data.declared import Names
+from clsas.engine.data.extras import install_command, is_installed
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.validate import ClsasWarning
+from clsas.engine.data.validate import ArgumentError, ClsasWarning
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.signal.echoes import Echoes
-from clsas.files.hdf5 import save
 from clsas.files.json_types import json_able
 from clsas.files.scene_files import SceneFile, read_scene
-from clsas.files.scene_tables import CORRECTIONS, STEPS, checked_steps
+from clsas.files.scene_tables import CORRECTIONS, STEP_NAMES, checked_steps
 from clsas.files.tables import located
 from clsas.interferometry.checks import check_grid
 from clsas.interferometry.result import Heights
 from clsas.mosaics.store import Store
-from clsas.processing.folders import check_folder, checked_records, folder_of, made
-from clsas.processing.record import StepRecord, file_digest, step_digest, write_records
-from clsas.processing.recording import Recording, loaded
-from clsas.processing.steps import (
-    RUN,
-    TABLES,
-    Job,
-    Outcome,
-    check_banks,
-    check_pictures,
-    is_mosaic,
-    options_of,
-    store_of,
+from clsas.processing.record import (
+    NAME,
+    Recording,
+    StepRecord,
+    checked_folder,
+    file_digest,
+    loaded,
+    made,
+    read_records,
+    step_digest,
+    write_records,
 )
+from clsas.processing.steps import STEPS, Job, Step, both_banks, is_mosaic
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +129,7 @@ def process(
     steps: Annotated[
         Sequence[str] | None,
         Names(
-            STEPS,
+            STEP_NAMES,
             help="Bring only this step up to date, and the steps before it that correct its lines.",
         ),
     ] = None,
@@ -205,180 +204,177 @@ def process(
     validate.progress(progress)
     of_scene = checked_steps(scene.process.get("steps"), scene.process)
     chosen = of_scene if steps is None else checked_steps(steps, scene.process)
-    names = _with_corrections(chosen, of_scene)
+    # Every step but an inspection starts from lines with the scene's corrections before it.
+    last = max((STEP_NAMES.index(name) for name in chosen if name != "inspect"), default=0)
+    before = [name for name in STEP_NAMES[:last] if name in CORRECTIONS and name in of_scene]
+    names = tuple(name for name in STEP_NAMES if name in (*chosen, *before))
+
+    # Mistakes are found before any step, since steps may take hours.
     if {"focus", "pair_errors", "image", "heights", "mosaic"} & set(names):
         (grid,) = scene.need("grid")
         if "image" in names:
             validate.memory("[grid]", 16 * grid.size)  # two images
     of_banks = [name for name in ("pair_errors", "heights") if name in names]
     if of_banks:
-        with _naming(scene, of_banks[0]):
+        with _naming(scene, STEPS[of_banks[0]]):
             check_grid(grid)
     recording = Recording.of(scene, lines)
-    folder = folder_of(scene, output)
-    check_folder(folder, recording)
-    check_pictures()
+    folder = checked_folder(scene, output, recording)
+    if not is_installed("matplotlib"):
+        validate.warn(
+            f"no pictures are written, since they need matplotlib: {install_command('plot')}"
+        )
     with made(folder):
-        records = checked_records(scene, folder, names)
+        records = _checked_records(scene, folder, names)
         if not set(of_banks) <= records.keys():
             uncorrected = recording.read()  # which stays in memory for the first step
             if uncorrected.banks < 2:  # the step itself warns of more than two
-                with _naming(scene, of_banks[0]):  # before other steps, which may take hours
-                    check_banks(uncorrected)
-        chain = _Chain(scene, folder, recording, open_device(device), records)
-        for name in STEPS:
-            if name in names:
-                chain.step(name, None if progress is None else partial(progress, name))
-            elif name in of_scene:
-                chain.leave(name)
-            else:
-                chain.warn_if_outdated(name, "since the scene leaves it out")
-    return Processed(folder, tuple(chain.done), tuple(chain.repeated), chain.lines)
+                with _naming(scene, STEPS[of_banks[0]]):
+                    both_banks(uncorrected)
+        return _run_steps(
+            names, of_scene, scene, folder, recording, records, open_device(device), progress
+        )
 
 
-def _with_corrections(chosen: tuple[str, ...], of_scene: tuple[str, ...]) -> tuple[str, ...]:
-    """Return steps, with those of the scene that correct the lines before them."""
-    # An inspection examines the uncorrected recording.
-    last = max((STEPS.index(name) for name in chosen if name != "inspect"), default=0)
-    before = {name for name in of_scene if name in CORRECTIONS and STEPS.index(name) < last}
-    return tuple(name for name in STEPS if name in {*chosen, *before})
+def _checked_records(
+    scene: SceneFile, folder: Path, names: tuple[str, ...]
+) -> dict[str, StepRecord]:
+    """Return the records of the folder after checking that steps replace only their own files.
+
+    A damaged record is replaced by one without inputs, so that its step runs again and may replace
+    the files that it may have written.
+    """
+    records, is_damaged = read_records(folder, scene)
+    if is_damaged:
+        lost = [step for step in STEPS.values() if step.name not in records]
+        for step in lost:
+            if found := [file for file in step.files if os.path.lexists(folder / file)]:
+                records[step.name] = StepRecord(step.name, "", files=dict.fromkeys(found, ""))
+        again = [step.name for step in lost if step.name in (*records, *names)]
+        validate.warn(f"{folder / NAME} is damaged; these steps are run again: {', '.join(again)}")
+    own = {file for record in records.values() for file in record.files}
+    for name in names:
+        for file in STEPS[name].files:
+            if file not in own and os.path.lexists(folder / file):
+                raise ArgumentError(
+                    "output",
+                    f"not contain {file}, which {name} would replace and clsas did not write",
+                    repr(str(folder)),
+                    "choose another folder, or remove the file",
+                )
+    return records
 
 
-class _Chain:
-    """State of a processing: the present lines, and the records of the steps so far."""
+def _run_steps(
+    names: tuple[str, ...],
+    of_scene: tuple[str, ...],
+    scene: SceneFile,
+    folder: Path,
+    recording: Recording,
+    records: dict[str, StepRecord],
+    device: Device,
+    progress: Callable[[str, int, int], None] | None,
+) -> Processed:
+    """Run the named steps unless they ran before with the same inputs; leave the others alone."""
+    read, lines_digest = recording.read, recording.digest  # with the corrections so far
+    corrections: tuple[str, ...] = ()
+    done: list[StepRecord] = []
+    repeated: list[str] = []
+    for name, step in STEPS.items():
+        record = records.get(name)
+        if name not in (*names, *of_scene):
+            _warn_if_outdated(folder, record, "since the scene leaves it out")
+            continue
+        options = step.options(scene)
+        inputs = step_digest(name, options, recording.digest, lines_digest)
+        is_same = record is not None and record.inputs == inputs
+        if name not in names:
+            if not is_same:
+                _warn_if_outdated(folder, record, "since its lines or options have changed")
+            if name in CORRECTIONS:
+                lines_digest = inputs
+            continue
 
-    def __init__(
-        self,
-        scene: SceneFile,
-        folder: Path,
-        recording: Recording,
-        device: Device,
-        records: dict[str, StepRecord],
-    ) -> None:
-        self.scene, self.folder, self.recording, self.device = scene, folder, recording, device
-        self.records = dict(records)  # of all steps, including those that are left alone
-        self.done: list[StepRecord] = []
-        self.repeated: list[str] = []
-        self.digest = recording.digest
-        self.corrections: tuple[str, ...] = ()
-        self.lines = recording.read
-
-    def step(self, name: str, progress: Callable[[int, int], None] | None) -> None:
-        """Run a step unless it ran before with the same inputs."""
-        options = options_of(name, self.scene)
-        digest = self._digest(name, options)
-        record = self.records.get(name)
         # A mosaic always runs: it has its own records, and forms only the missing patches.
-        kept = record is not None and record.inputs == digest and not is_mosaic(name, self.scene)
         messages: tuple[str, ...] = ()
-        if record is None or not kept or not record.is_intact(self.folder):
-            record = self._run(name, digest, options, progress)
-            self.repeated.append(name)
+        if record is None or not is_same or is_mosaic(name, scene) or not record.is_intact(folder):
+            lines = read()  # raises for a damaged recording, before anything is written
+            with staging(folder) as staged:
+                job = Job(
+                    scene=scene,
+                    folder=staged,
+                    output=folder,
+                    given=recording.read,
+                    lines=lines,
+                    corrections=corrections,
+                    device=device,
+                    progress=None if progress is None else partial(progress, name),
+                    former=record,
+                )
+                new = _run_step(step, job, options, inputs, lines_digest)
+                # After a crash in between, the record names files that are missing or old, so that
+                # the step runs again.
+                for file in set(() if record is None else record.files) - set(new.files):
+                    (folder / file).unlink(missing_ok=True)
+                records[name] = record = new
+                ordered = [records[each] for each in STEPS if each in records]
+                write_records(folder, scene, recording.described, ordered)
+                for file in record.files:
+                    (staged / file).replace(folder / file)
+                sync_folder(folder)
             messages = record.warnings
-        self.done.append(record)
+            repeated.append(name)
+        done.append(record)
         if name in CORRECTIONS:
-            self.digest, self.corrections = digest, (*self.corrections, name)
+            lines_digest, corrections = inputs, (*corrections, name)
             file = record.result_file
-            self.lines = partial(loaded, self.folder / file, record.files[file], RangeLines)
+            read = partial(loaded, folder / file, record.files[file], RangeLines)
         for message in messages:
             validate.warn(f"{name}: {message}")
-
-    def leave(self, name: str) -> None:
-        """Skip a step of the scene, and warn if its files are out of date."""
-        digest, record = self._digest(name, options_of(name, self.scene)), self.records.get(name)
-        if record is not None and record.inputs != digest:
-            self.warn_if_outdated(name, "since its lines or options have changed")
-        if name in CORRECTIONS:
-            self.digest = digest
-
-    def warn_if_outdated(self, name: str, why: str) -> None:
-        """Warn if the folder contains files of a step that no longer belong to the others."""
-        record = self.records.get(name)
-        files = () if record is None else record.files
-        if found := [each for each in files if (self.folder / each).exists()]:
-            validate.warn(
-                f"the results of {name} in {str(self.folder)!r} are out of date, {why}: "
-                f"{', '.join(found)}"
-            )
-
-    def _digest(self, name: str, options: dict[str, Any]) -> str:
-        return step_digest(name, options, self.recording.digest, self.digest)
-
-    def _run(
-        self,
-        name: str,
-        digest: str,
-        options: dict[str, Any],
-        progress: Callable[[int, int], None] | None,
-    ) -> StepRecord:
-        lines = self.lines()  # raises for a damaged recording, before anything is written
-        start = time.perf_counter()
-        store = store_of(name, self.scene)
-        with staging(self.folder) as staged:
-            job = Job(
-                scene=self.scene,
-                folder=staged,
-                store=store or self.folder / f"{name}.zarr",
-                is_store_inside=store is None,
-                given=self.recording.read,
-                lines=lines,
-                corrections=self.corrections,
-                device=self.device,
-                progress=progress,
-                former=self.records.get(name),
-            )
-            outcome, messages = _outcome(name, job)
-            files = list(outcome.files)
-            if outcome.lines is not None:
-                save(staged / f"{name}.h5", outcome.lines)
-                files.append(f"{name}.h5")
-            record = StepRecord(
-                name=name,
-                inputs=digest,
-                lines=self.digest,
-                corrections=self.corrections,
-                options=json_able(options),
-                numbers=json_able(outcome.numbers),
-                files={each: file_digest(staged / each) for each in files},
-                warnings=messages,
-                seconds=time.perf_counter() - start,
-                device=self.device.info.label,
-            )
-            self._keep(record, staged)
-        return record
-
-    def _keep(self, record: StepRecord, staged: Path) -> None:
-        """Replace all files that a step wrote before by the new ones, and record them.
-
-        After a crash in between, the record names files that are missing or old, so that the step
-        runs again.
-        """
-        before = self.records.get(record.name)
-        for name in set(() if before is None else before.files) - set(record.files):
-            (self.folder / name).unlink(missing_ok=True)
-        self.records[record.name] = record
-        ordered = [self.records[name] for name in STEPS if name in self.records]
-        write_records(self.folder, self.scene, self.recording.described, ordered)
-        for name in record.files:
-            (staged / name).replace(self.folder / name)
-        sync_folder(self.folder)
+    return Processed(folder, tuple(done), tuple(repeated), read)
 
 
-def _outcome(name: str, job: Job) -> tuple[Outcome, tuple[str, ...]]:
-    """Return the outcome of a step and its ClsasWarnings."""
+def _run_step(
+    step: Step, job: Job, options: dict[str, Any], inputs: str, lines_digest: str
+) -> StepRecord:
+    """Run a step, and return its record with its ClsasWarnings; other warnings are issued."""
+    start = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", append=True)  # after the caller's filters
-        with _naming(job.scene, name):
-            outcome = RUN[name](job)
+        with _naming(job.scene, step):
+            numbers = step.run(job)
     messages = []
     for each in caught:
         if issubclass(each.category, ClsasWarning):
             messages.append(str(each.message))
         else:
             warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
-    return outcome, tuple(dict.fromkeys(messages))  # images before and after share theirs
+    files = [file for file in step.files if (job.folder / file).exists()]
+    return StepRecord(
+        name=step.name,
+        inputs=inputs,
+        lines=lines_digest,
+        corrections=job.corrections,
+        options=json_able(options),
+        numbers=json_able(numbers),
+        files={file: file_digest(job.folder / file) for file in files},
+        warnings=tuple(dict.fromkeys(messages)),  # images before and after share theirs
+        seconds=time.perf_counter() - start,
+        device=job.device.info.label,
+    )
 
 
-def _naming(scene: SceneFile, name: str) -> AbstractContextManager[None]:
+def _warn_if_outdated(folder: Path, record: StepRecord | None, why: str) -> None:
+    """Warn if the folder contains files of a step that no longer belong to the others."""
+    if record is None:
+        return
+    if found := [file for file in record.files if (folder / file).exists()]:
+        validate.warn(
+            f"the results of {record.name} in {str(folder)!r} are out of date, {why}: "
+            f"{', '.join(found)}"
+        )
+
+
+def _naming(scene: SceneFile, step: Step) -> AbstractContextManager[None]:
     """Put the scene, a step and its table in front of errors."""
-    return located(f"{scene.name or 'scene'}: {name} ({TABLES[name]}):")
+    return located(f"{scene.name or 'scene'}: {step.name} ({step.table}):")

@@ -1,6 +1,7 @@
-"""Record of a processing: inputs, versions and numbers of every step, as JSON beside the image.
+"""Folder of a processing, with its record `process.json`, and the recording that it began with.
 
-The record also identifies the files in the folder that clsas wrote and may replace.
+The record contains inputs, versions and numbers of every step. It also identifies the files in the
+folder that clsas wrote and may replace.
 """
 
 from __future__ import annotations
@@ -9,9 +10,10 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Iterable
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +21,14 @@ import numpy as np
 import scipy
 
 from clsas.engine.data import reading, reprs, validate
-from clsas.engine.data.atomic import replacing
+from clsas.engine.data.atomic import locked, replacing
 from clsas.engine.data.digests import DIGEST, digest, is_intact, with_digest
+from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
+from clsas.engine.signal.compression import compress
+from clsas.engine.signal.echoes import Echoes
+from clsas.files.formats import load
 from clsas.files.json_types import json_able
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import CORRECTIONS
@@ -32,7 +38,124 @@ _FORMAT, _VERSION = "clsas processing", 3
 _MARK = f'"format": "{_FORMAT}"'.encode()
 """Text by which a damaged record can still be told from a file of another program."""
 
-_BLOCK = 1 << 22  # bytes that are read at once: a plain choice
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Lines to begin with, which are read when they are needed.
+
+    Attributes
+    ----------
+    described : dict
+        Description of the lines for the record.
+    digest : str
+        Digest of the contents of the lines and, if they are echoes, of the options of compression.
+    """
+
+    described: dict[str, Any]
+    digest: str
+    _source: Path | RangeLines
+    _compression: dict[str, Any]
+
+    @classmethod
+    def of(
+        cls, scene: SceneFile, given: RangeLines | Echoes | str | os.PathLike | None
+    ) -> Recording:
+        """Return the given recording, or that of the scene."""
+        options = scene.compress
+        if isinstance(given, Echoes):
+            given = compress(given, **options)
+        if isinstance(given, RangeLines):
+            found = digest(given)
+            return cls({"file": None, "digest": found}, found, given, options)
+        path = scene.process.get("lines") if given is None else validate.path("lines", given)
+        where = f"{scene.name}: [process]"
+        if path is None:
+            raise ArgumentError("lines", "be given", hint="the path of the recording", where=where)
+        if given is None and not path.exists():
+            hint = f"{path} does not exist"
+            raise ArgumentError("lines", "be a file", hint=hint, where=where)
+        found = file_digest(path)
+        of_both = step_digest("recording", options, found)
+        return cls({"file": str(path), "digest": found}, of_both, path, options)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields to pickle, without lines that were read: they are read again."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def read(self) -> RangeLines:
+        """Return the lines; echoes are compressed.
+
+        Raises
+        ------
+        ValueError
+            If the file contains anything else, or has changed since its digest was computed.
+        """
+        return self._lines
+
+    @cached_property
+    def _lines(self) -> RangeLines:
+        if isinstance(self._source, RangeLines):
+            return self._source
+        found = loaded(self._source, self.described["digest"], RangeLines, Echoes)
+        return compress(found, **self._compression) if isinstance(found, Echoes) else found
+
+
+def loaded(path: Path, expected: str, *kinds: type) -> Any:
+    """Return the object in a file; raise ValueError if its type or digest is another one."""
+    found = load(path)
+    if not isinstance(found, kinds):
+        names = " or ".join(f"`{kind.__name__}`" for kind in kinds)
+        raise ValueError(f"{path} must contain {names}, got `{type(found).__name__}`")
+    # Compute the digest after reading, so that a change in between is detected.
+    if file_digest(path) != expected:
+        raise ValueError(
+            f"{path} has changed since its digest was recorded: run clsas process again"
+        )
+    return found
+
+
+def checked_folder(
+    scene: SceneFile, output: str | os.PathLike | None, recording: Recording
+) -> Path:
+    """Return the given folder, or that of the scene; raise ValueError if it cannot be used."""
+    if output is not None:
+        folder = validate.path("output", output)
+    elif "output" in scene.process:
+        folder = scene.process["output"]
+    elif Path(scene.name).suffix:
+        folder = Path(scene.name).with_suffix("")
+    else:
+        allowed = "be given, since the scene has no file to name the folder after"
+        raise ArgumentError("output", allowed)
+    source = recording.described["file"]
+    if source is not None and Path(source).parent.resolve() == folder.resolve():
+        raise ArgumentError("output", "not be the folder of the recording", repr(str(folder)))
+    if folder.exists() and not folder.is_dir():
+        raise ArgumentError("output", "be a folder", f"the file {str(folder)!r}")
+    if not folder.parent.is_dir():
+        hint = f"there is no folder {str(folder.parent)!r}"
+        raise ArgumentError("output", "lie in an existing folder", repr(str(folder)), hint)
+    return folder
+
+
+@contextmanager
+def made(folder: Path) -> Iterator[None]:
+    """Lock a folder, or raise BlockingIOError; a folder that is made is removed if still empty."""
+    is_new = False
+    try:
+        with ExitStack() as held:
+            while True:
+                is_new = is_new or not folder.is_dir()
+                folder.mkdir(exist_ok=True)
+                # Another process may remove the folder, which it created, before this one locks it.
+                with suppress(FileNotFoundError):
+                    held.enter_context(locked(folder))
+                    break
+            yield
+    finally:
+        if is_new:
+            with suppress(OSError):  # the folder is not empty
+                folder.rmdir()
 
 
 @dataclass(frozen=True)
@@ -138,9 +261,19 @@ def read_records(folder: Path, scene: SceneFile) -> tuple[dict[str, StepRecord],
         with suppress(TypeError, LookupError):
             tuples = {name: tuple(step[name]) for name in ("corrections", "warnings")}
             record = StepRecord(**{**values, **tuples})
-            if isinstance(record.files, dict) and all(_is_plain(name) for name in record.files):
+            # A name leads to a file in the folder, and not to one elsewhere.
+            if isinstance(record.files, dict) and all(
+                name not in ("", ".", "..") and Path(name).name == name for name in record.files
+            ):
                 found[str(record.name)] = record
     return found, len(found) < len(steps)
+
+
+def _of_folder(scene: SceneFile, folder: Path) -> str:
+    """Return the path of a scene's file relative to the folder, so that both can move together."""
+    if not Path(scene.name).is_file():
+        return scene.name
+    return os.path.relpath(os.path.realpath(scene.name), os.path.realpath(folder))
 
 
 def write_records(
@@ -170,28 +303,7 @@ def step_digest(name: str, options: dict[str, Any], *inputs: str) -> str:
 
 
 def file_digest(path: Path) -> str:
-    """Return a digest of a file's contents.
-
-    Raises
-    ------
-    OSError, ValueError
-        If the file cannot be read, or is not an ordinary file.
-    """
+    """Return a digest of the contents of a file, which must be an ordinary one."""
     reading.check_ordinary(path)
-    sha = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            sha.update(block)
-    return sha.hexdigest()[:16]
-
-
-def _of_folder(scene: SceneFile, folder: Path) -> str:
-    """Return the path of a scene's file relative to the folder, so that both can move together."""
-    if not Path(scene.name).is_file():
-        return scene.name
-    return os.path.relpath(os.path.realpath(scene.name), os.path.realpath(folder))
-
-
-def _is_plain(name: object) -> bool:
-    """Return whether a name is that of a file in the folder, not a path that leads elsewhere."""
-    return isinstance(name, str) and name not in ("", ".", "..") and Path(name).name == name
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]

@@ -14,8 +14,8 @@ from clsas.engine.data.declared import declared
 from clsas.engine.data.system import BARKER_13
 from clsas.files import scene_files as config
 from clsas.files.csv_files import read_track
-from clsas.files.mistakes import models_in
 from clsas.files.scene_tables import PRESETS, SceneTables
+from clsas.files.tables import models_in
 from clsas.inspection.sampling import check_sampling
 from clsas.simulation.scenes import PointTargets, Seabed
 from clsas.simulation.seabeds import rocks

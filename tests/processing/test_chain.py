@@ -14,9 +14,9 @@ from clsas.cli import main
 from clsas.engine.data.atomic import locked
 from clsas.engine.data.digests import with_digest
 from clsas.engine.data.validate import ClsasWarning
-from clsas.files.scene_tables import STEPS
-from clsas.processing import folders
-from clsas.processing import steps as steps_module
+from clsas.files.scene_tables import STEP_NAMES
+from clsas.processing import record as record_module
+from clsas.processing.steps import STEPS
 
 pytest.importorskip("matplotlib")
 
@@ -125,6 +125,35 @@ def test_steps_run_in_their_order_and_improve_the_image(scene):
     assert "calibrate, focus, image" in repr(found)
 
 
+def array_lines():
+    """Return lines of an array whose samples depend on the phase centre alone."""
+    rng = np.random.default_rng(0)
+    spacing_m, (ping, receiver) = 0.0075, np.divmod(np.arange(8 * 24), 24)
+    tx_m, rx_m = np.zeros((2, len(ping), 3))
+    tx_m[:, 0] = 12 * spacing_m * ping
+    rx_m[:, 0] = tx_m[:, 0] + 2 * spacing_m * receiver
+    spectrum = rng.standard_normal((12 * 8 + 24, 400, 2)) @ [1, 1j]
+    spectrum[:, np.abs(np.fft.fftfreq(400)) > 0.25] = 0
+    samples = np.fft.ifft(spectrum)[12 * ping + receiver]
+    return clsas.RangeLines(samples, 20.0, 0.02, tx_m, rx_m, 100e3, 1500.0)
+
+
+def test_navigation_writes_lines_a_table_and_pictures(tmp_path):
+    scene = tmp_path / "scene.toml"
+    scene.write_text("[process]\nsteps = ['navigate']\n")
+    found = clsas.process(scene, lines=array_lines())
+    assert tuple(found["navigate"].files) == STEPS["navigate"].files
+    assert found["navigate"].numbers["pings"] == 8
+    written = np.genfromtxt(found.folder / "navigate.csv", delimiter=",", names=True)
+    np.testing.assert_array_equal(written["ping"], np.arange(8))
+    np.testing.assert_allclose(written["y_m"], found.lines.ping_centres_m[:, 1], atol=1e-9)
+    np.testing.assert_allclose(written["sway_m"], written["y_m"], atol=1e-9)  # of a straight track
+
+
+def test_every_step_has_a_row():
+    assert tuple(STEPS) == STEP_NAMES
+
+
 @pytest.mark.slow
 def test_only_what_changed_runs_again(scene):
     def repeated(**options):
@@ -207,13 +236,13 @@ def test_scene_and_folder_may_move_together(plain, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_killed_step_leaves_nothing_in_the_way(plain, monkeypatch):
     """The files of a step appear together when it is done."""
-    folder, image = plain.with_suffix(""), steps_module.RUN["image"]
+    folder, image = plain.with_suffix(""), STEPS["image"]
 
     def killed(job):
-        image(job)
+        image.run(job)
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(steps_module.RUN, "image", killed)
+    monkeypatch.setitem(STEPS, "image", replace(image, run=killed))
     with pytest.raises(KeyboardInterrupt):
         clsas.process(plain)
     assert not folder.exists()
@@ -221,7 +250,7 @@ def test_a_killed_step_leaves_nothing_in_the_way(plain, monkeypatch):
     clsas.process(plain)
     before = contents(folder)
     plain.write_text(plain.read_text().replace("tolerance_db = -40", "tolerance_db = -30"))
-    monkeypatch.setitem(steps_module.RUN, "image", killed)
+    monkeypatch.setitem(STEPS, "image", replace(image, run=killed))
     with pytest.raises(KeyboardInterrupt):
         clsas.process(plain)
     assert contents(folder) == before
@@ -487,18 +516,18 @@ def test_bad_arguments(scene, tmp_path):
 def test_two_runs_in_one_folder_are_refused(plain, tmp_path, monkeypatch):
     """Otherwise the second would continue from the first one's lines, recorded as its own."""
     other = clsas.load(plain.parent / "lines.h5").weighted(np.full(260, 2.0))
-    image = steps_module.RUN["image"]
+    image = STEPS["image"]
     messages = []
 
     def image_beside(job):
-        monkeypatch.setitem(steps_module.RUN, "image", image)
+        monkeypatch.setitem(STEPS, "image", image)
         with pytest.raises(BlockingIOError, match="another process of clsas is at work") as caught:
             clsas.process(plain, lines=other)
         messages.append(CliRunner().invoke(main, ["process", str(plain)]).output)
         assert caught.value.filename == str(plain.with_suffix(""))
-        return image(job)
+        return image.run(job)
 
-    monkeypatch.setitem(steps_module.RUN, "image", image_beside)
+    monkeypatch.setitem(STEPS, "image", replace(image, run=image_beside))
     folder = clsas.process(plain).folder
     assert messages == [f"Error: another process of clsas is at work in this folder: {folder}\n"]
     assert ".clsas.lock" not in contents(folder)
@@ -519,8 +548,8 @@ def test_a_folder_that_another_first_run_removes_is_made_again(tmp_path, monkeyp
         locks.append(path)
         return locked(path)
 
-    monkeypatch.setattr(folders, "locked", locked_late)
-    with folders.made(folder):
+    monkeypatch.setattr(record_module, "locked", locked_late)
+    with record_module.made(folder):
         assert (folder / ".clsas.lock").exists()
     assert locks == [folder, folder]
     assert not folder.exists()

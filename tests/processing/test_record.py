@@ -9,9 +9,14 @@ import pytest
 import clsas
 from clsas.engine.data.validate import ClsasWarning
 from clsas.files.scene_files import SceneFile
-from clsas.processing import chain
-from clsas.processing.record import StepRecord, file_digest, read_records, write_records
-from clsas.processing.recording import Recording
+from clsas.processing.record import (
+    Recording,
+    StepRecord,
+    file_digest,
+    read_records,
+    write_records,
+)
+from clsas.processing.steps import STEPS
 
 SCENE = SceneFile("scene")
 NUMBERS = {"peak_db": -3.25, "valid": 0.9, "unknowns": ["sway", "heave"], "none": None}
@@ -103,14 +108,14 @@ class TestChain:
         def imaged(job):
             grid = job.scene.grid
             clsas.save(job.folder / "image.h5", clsas.Image(np.ones(grid.shape, complex), grid))
-            return chain.Outcome({"peak_db": -3.25}, ["image.h5"])
+            return {"peak_db": -3.25}
 
         def inspected(job):
             (job.folder / "inspect.txt").write_text("fine")
-            return chain.Outcome({}, ["inspect.txt"])
+            return {}
 
-        monkeypatch.setitem(chain.RUN, "image", imaged)
-        monkeypatch.setitem(chain.RUN, "inspect", inspected)
+        for name, run in (("image", imaged), ("inspect", inspected)):
+            monkeypatch.setitem(STEPS, name, replace(STEPS[name], run=run))
 
     @pytest.fixture
     def scene(self, tmp_path):
