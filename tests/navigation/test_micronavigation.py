@@ -284,7 +284,7 @@ def test_the_command(straight, tmp_path):
     assert np.abs(corrected.rx_m - straight.rx_m).max() < 0.05
     refused = CliRunner().invoke(main, [*arguments, "--range-m", "66:60"])
     assert refused.exit_code == 2
-    assert "NEAR:FAR" in refused.output
+    assert "two ascending numbers in m" in refused.output
 
 
 @pytest.mark.exhaustive
