@@ -17,8 +17,7 @@ from clsas.cli.view import Folder, size_of
 from clsas.cli.wording import command
 from clsas.files.hdf5 import read_geometry
 from clsas.maps import sicd
-from clsas.maps.export_options import SUFFIXES, ExportOptions
-from clsas.maps.exporting import check_name
+from clsas.maps.exporting import SUFFIXES, ExportOptions, check_name
 
 
 class _Target(File):

@@ -37,7 +37,7 @@ from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import Request
 from clsas.files.hdf5 import SUFFIXES
 from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS
-from clsas.maps.export_options import ExportOptions
+from clsas.maps.exporting import ExportOptions
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.plot.canvas import Scale
 

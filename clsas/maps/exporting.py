@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Annotated, Any
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.decibels import DYNAMIC_RANGE, REFERENCE
+from clsas.engine.data.declared import Choice, Flag, Number, check_fields
 from clsas.engine.data.georeference import Georeference
-from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError
@@ -18,16 +19,23 @@ from clsas.engine.data.version import __version__
 from clsas.engine.factorized.plan import Plan
 from clsas.files.sidecars import remove_sidecars
 from clsas.interferometry.result import Heights
-from clsas.maps import geotiff, map_grids, netcdf, sicd, viewer, world_files
-from clsas.maps.export_options import HEIGHT_SUFFIXES, SUFFIXES, ExportOptions
+from clsas.maps import geotiff, netcdf, sicd, viewer, world_files
 from clsas.maps.geotiff import Progress
-from clsas.maps.orientation import Orientation
 from clsas.maps.sources import Source
 from clsas.mosaics.store import Store
 from clsas.plot import heights as heights_picture
 from clsas.plot.canvas import COLOUR_MAP, DYNAMIC_RANGE_DB
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.plot.canvas import save as save_picture
+
+SUFFIXES = (*geotiff.SUFFIXES, *netcdf.SUFFIXES, *sicd.SUFFIXES, *PICTURES)
+"""Suffixes of the files that `clsas.export` writes."""
+
+HEIGHT_SUFFIXES = (*geotiff.SUFFIXES, *netcdf.SUFFIXES, *PICTURES)
+"""Those that it writes for heights."""
+
+_COLOURS = {"dynamic_range_db", "reference", "colour_map"}
+_ORIGIN = {"plan", "lines"}
 
 
 def export(
@@ -196,23 +204,133 @@ def export(
         allowed = f"end in {' or '.join(HEIGHT_SUFFIXES)} for heights"
         raise ArgumentError("path", allowed, validate.shown(str(path)))
     options.check_used(suffix, of_heights=of_heights)
-    if suffix and suffix not in PICTURES:
-        _write_data(path, _finished(opened, georeference), options, progress)
-    elif of_heights or isinstance(opened, Heights):  # a picture
-        shown = _placed_heights(opened, georeference)
-        save_picture(heights_picture(shown, **options.given), path)
-    elif suffix:
-        world_files.write_picture(path, _placed(opened, georeference), options.given)
-    else:
+    if not suffix:
+        assert not isinstance(opened, Heights)  # they have been refused
+        name = "image"
+        if not isinstance(source, Image | Store | Heights):
+            name = validate.printable(validate.path("source", source).resolve().name)
         viewer.write(
             opened,
             path,
-            names=[_name_of(source)],
+            names=[name],
             dynamic_range_db=options.dynamic_range_db,
             colour_map=options.colour_map,
             georeference=georeference,
             progress=progress,
         )
+        return
+    found = Source.of(opened, georeference)
+    found.check_finished()
+    if suffix in PICTURES:
+        _write_picture(path, opened, found, options)
+        return
+    tags = _tags(found, options)
+    if suffix in geotiff.SUFFIXES:
+        geotiff.write(
+            path,
+            found,
+            kind=options.kind or "db",
+            reference=options.reference,
+            dynamic_range_db=options.dynamic_range_db or DYNAMIC_RANGE_DB,
+            colour_map=options.colour_map or COLOUR_MAP,
+            north_up=options.north_up,
+            pixel_m=options.pixel_m,
+            tags={k: v if isinstance(v, str) else f"{v:.12g}" for k, v in tags.items()},
+            progress=progress,
+        )
+    elif suffix in netcdf.SUFFIXES:
+        netcdf.write(path, found, tags)
+    else:
+        sicd.write(path, found, options.lines, options.beam, tags, progress)
+    remove_sidecars(path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Options of `clsas.export`, which describes them. None or False is an option not given.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value has the wrong type or is outside its limits.
+    """
+
+    kind: Annotated[
+        str | None,
+        Choice(
+            geotiff.KINDS,
+            help="Pixels of a GeoTIFF of an image: amplitude in dB, complex numbers, or 8-bit "
+            "levels with colours.",
+            default="db",
+        ),
+    ] = None
+    dynamic_range_db: Annotated[float | None, DYNAMIC_RANGE] = None
+    reference: Annotated[float | None, REFERENCE] = None
+    colour_map: str | None = None
+    north_up: Annotated[
+        bool,
+        Flag("Resample a GeoTIFF so that its rows run east. Without it, its transform is rotated."),
+    ] = False
+    pixel_m: Annotated[
+        float | None,
+        Number(
+            "m", above=0.0, help="Size of the pixels.", default="the distance of those of the input"
+        ),
+    ] = None
+    plan: Plan | None = None
+    lines: RangeLines | None = None
+    beam: BeamWindow | None = None
+    north_arrow: Annotated[bool, Flag("Draw an arrow to the north into a picture.")] = False
+    scale_bar: Annotated[bool, Flag("Draw a scale bar into a picture.")] = False
+
+    def __post_init__(self) -> None:
+        """Check every field, and convert those that are declared."""
+        check_fields(self)
+        if self.colour_map is not None:
+            validate.text("colour_map", self.colour_map)
+        validate.instance("plan", self.plan, Plan, type(None))
+        validate.instance("lines", self.lines, RangeLines, type(None))
+        validate.instance("beam", self.beam, BeamWindow, type(None))
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """Options that are given, by name."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: v for name, v in values.items() if v is not None and v is not False}
+
+    def check_used(self, suffix: str, *, of_heights: bool) -> None:
+        """Raise ValueError if an option has no effect on the format of a suffix; "" is a folder."""
+        what = suffix
+        if of_heights:  # whose numbers are neither levels nor complex
+            what = f"{suffix} of heights"
+            if suffix in PICTURES:
+                used = {"colour_map"}
+            elif suffix in netcdf.SUFFIXES:
+                used = {"lines"}
+            else:
+                used = {"lines", "north_up"}
+        elif not suffix:
+            used = {"dynamic_range_db", "colour_map"}
+            what = "a folder, as `path` is without a suffix"
+        elif suffix in PICTURES:
+            used = _COLOURS | {"north_arrow", "scale_bar"}
+        elif suffix in netcdf.SUFFIXES:
+            used = _ORIGIN
+        elif suffix in sicd.SUFFIXES:
+            used = _ORIGIN | {"beam"}
+        else:
+            kind = self.kind or "db"
+            what = f"{suffix} with `kind={kind!r}`"
+            used = _ORIGIN | {"kind", "north_up"}
+            used |= {"8bit": _COLOURS, "complex": set()}.get(kind, {"reference"})
+        if self.north_up and "north_up" in used:
+            used = used | {"pixel_m"}
+
+        unused = [name for name in self.given if name not in used]
+        if unused:
+            if unused[0] == "pixel_m" and "north_up" in used:
+                what += " without `north_up`"
+            raise ArgumentError(unused[0], f"be left out, since it has no effect on {what}")
 
 
 def check_name(name: str, path: Path) -> None:
@@ -241,89 +359,28 @@ def _opened(source: Image | Store | Heights | str | os.PathLike) -> Image | Stor
     return found
 
 
-def _name_of(source: Image | Store | Heights | str | os.PathLike) -> str:
-    """Return the name of an image for the page of a folder: that of its file, if it has one."""
-    if isinstance(source, Image | Store | Heights):
-        return "image"
-    return validate.printable(validate.path("source", source).resolve().name)
-
-
-def _write_data(
-    path: Path, source: Source, options: ExportOptions, progress: Progress | None
+def _write_picture(
+    path: Path, opened: Image | Store | Heights, source: Source, options: ExportOptions
 ) -> None:
-    """Write a file of pixels by its suffix, and remove files that describe the one it replaces."""
-    suffix = path.suffix.lower()
-    if suffix in geotiff.SUFFIXES:
-        _check_map(source, options)
-    map_grids.warn_of_place(source.grid)
-    if suffix in geotiff.SUFFIXES:
-        _write_geotiff(path, source, options, progress)
-    elif suffix in netcdf.SUFFIXES:
-        netcdf.write(path, source, _tags(source, options))
+    """Write a picture of an image or of heights, with the georeference of the export."""
+    place = source.grid.georeference
+
+    def placed(image: Image) -> Image:
+        if image.georeference == place:
+            return image
+        return replace(image, grid=replace(image.grid, georeference=place))
+
+    shown: Image | Heights
+    if isinstance(opened, Store):
+        shown = opened.overview_heights() if opened.layers else opened.overview()
+        source.check_unchanged()
     else:
-        sicd.write(path, source, options.lines, options.beam, _tags(source, options), progress)
-    remove_sidecars(path)
-
-
-def _write_geotiff(
-    path: Path, source: Source, options: ExportOptions, progress: Progress | None
-) -> None:
-    """Write a GeoTIFF by the options of an export, or by their defaults."""
-    tags = {
-        name: value if isinstance(value, str) else f"{value:.12g}"
-        for name, value in _tags(source, options).items()
-    }
-    completed = geotiff.Options(
-        kind=options.kind or "db",
-        north_up=options.north_up,
-        pixel_m=options.pixel_m,
-        dynamic_range_db=options.dynamic_range_db or DYNAMIC_RANGE_DB,
-        reference=options.reference,
-        colour_map=options.colour_map or COLOUR_MAP,
-    )
-    geotiff.write(path, source, completed, tags, progress)
-
-
-def _check_map(source: Source, options: ExportOptions) -> None:
-    """Raise ValueError for images that a GeoTIFF cannot show."""
-    grid = source.grid
-    if grid.points_m is not None:
-        raise ArgumentError("source", "be on a plane or height map for a GeoTIFF", "points")
-    if grid.georeference is None:
-        raise ArgumentError(
-            "source",
-            "have a georeference for a GeoTIFF, since a map needs a place on Earth",
-            hint="give `georeference`, or form the image by a scene with a table [georeference]",
-        )
-    turned = Orientation.of((grid.shape[0], grid.shape[1]), grid.georeference.affine(grid))
-    if options.kind == "complex" and geotiff.resamples(
-        turned, north_up=options.north_up, pixel_m=options.pixel_m
-    ):
-        _refuse_phase(grid, options.pixel_m)
-    if grid.height_m is not None and options.kind == "8bit":
-        validate.warn(
-            "8-bit levels leave out the heights of the grid; `kind='db'` has them as second band"
-        )
-
-
-def _refuse_phase(grid: Grid, pixel_m: float | None) -> NoReturn:
-    """Raise the error for complex pixels that would be resampled: it says what to do instead."""
-    place = grid.georeference
-    assert place is not None  # the caller has checked it
-    hint = "leave `north_up` out; the transform of the file then states how the image is rotated"
-    if grid.is_planar and not any(step_m[2] for step_m in grid.vectors_m[1:]):
-        onto = place.north_up(grid, pixel_m)
-        names = ("origin_m", "row_step_m", "column_step_m")
-        table = [
-            f"{name} = {each.tolist()}" for name, each in zip(names, onto.vectors_m, strict=True)
-        ]
-        hint = (
-            "form the image on `georeference.north_up(grid, pixel_m)`, and export it without "
-            "`north_up`. In a scene file, this grid is\n  "
-        ) + "\n  ".join(["[grid]", *table, f"shape = {list(onto.shape)}"])
-    raise ArgumentError(
-        "kind", "not be complex with `north_up`, since only power can be resampled", hint=hint
-    )
+        shown = opened
+    if isinstance(shown, Heights):
+        shown = replace(shown, image=placed(shown.image))
+        save_picture(heights_picture(shown, **options.given), path)
+    else:
+        world_files.write_picture(path, placed(shown), options.given)
 
 
 def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
@@ -372,28 +429,3 @@ def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
                 "X_AXIS_HEADING_DEG": place.heading_deg,
             }
     return {name: value for name, value in known.items() if value is not None}
-
-
-def _finished(source: Image | Store | Heights, georeference: Georeference | None) -> Source:
-    """Return the source of what is exported; raise ValueError if a store is not finished."""
-    found = Source.of(source, georeference)
-    found.check_finished()
-    return found
-
-
-def _placed(source: Image | Store, georeference: Georeference | None) -> Image:
-    """Return the image that a picture shows, with the georeference of the export."""
-    found = _finished(source, georeference)
-    shown = source.overview() if isinstance(source, Store) else source
-    if shown.georeference == found.grid.georeference:
-        return shown
-    return replace(shown, grid=replace(shown.grid, georeference=found.grid.georeference))
-
-
-def _placed_heights(source: Image | Store | Heights, georeference: Georeference | None) -> Heights:
-    """Return the heights that a picture shows, with the georeference of the export."""
-    if isinstance(source, Store):
-        _finished(source, georeference).check_unchanged()
-    heights = source.overview_heights() if isinstance(source, Store) else source
-    assert isinstance(heights, Heights)
-    return replace(heights, image=_placed(heights.image, georeference))

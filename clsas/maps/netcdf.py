@@ -12,15 +12,13 @@ import numpy as np
 from clsas.engine.data import validate
 from clsas.engine.data.atomic import replacing
 from clsas.engine.data.extras import needed
-from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
 from clsas.files.xarrays import GRID_MAPPING, grid_dims, to_xarray
-from clsas.maps.bands import bands_of
-from clsas.maps.encoding import Encoding
-from clsas.maps.sources import Source
-from clsas.plot.canvas import DYNAMIC_RANGE_DB
+from clsas.maps.georeferencing import warn_of_place
+from clsas.maps.sources import Source, bands_of
+from clsas.mosaics.pyramid import decibels
 
 if TYPE_CHECKING:
     import xarray
@@ -30,7 +28,9 @@ SUFFIXES = (".nc",)
 
 _REFERENCE = 1.0  # amplitude of 0 dB
 _BYTES = 40  # memory of a pixel: complex number, level, coordinates, and the file in memory
-_EPOCH = "SOURCE_DATE_EPOCH"  # variable of the environment, of reproducible-builds.org
+# Variable of the environment that replaces the time, which makes files reproducible: see
+# reproducible-builds.org.
+_EPOCH = "SOURCE_DATE_EPOCH"
 _ALL = slice(None), slice(None)
 
 
@@ -47,6 +47,7 @@ def write(path: Path, source: Source, tags: dict[str, Any]) -> None:
     OSError
         If the file cannot be written.
     """
+    warn_of_place(source.grid)
     with needed("netCDF files"):
         import h5netcdf  # noqa: F401  xarray's message would not say how to install it
         import xarray  # noqa: F401
@@ -54,7 +55,37 @@ def write(path: Path, source: Source, tags: dict[str, Any]) -> None:
         raise ArgumentError("source", "be on a plane to have heights", "points")
     validate.memory("the pixels as netCDF", _BYTES * source.grid.size)
     data = _of_heights(source) if source.has_heights else _of_image(source)
-    data = _described(data, source.grid, tags)
+    place = source.grid.georeference
+    if place is not None:
+        for name in data.data_vars:
+            data[name].attrs["grid_mapping"] = GRID_MAPPING
+        if source.grid.has_axes and not place.is_north_up:
+            # Programs take x and y for easting and northing if there is a grid mapping. The
+            # distances along and across the track therefore get other names.
+            along = ("along_track", "across_track")
+            data = data.rename_dims(x="column", y="row").rename_vars(x=along[0], y=along[1])
+            for name in along:
+                del data[name].attrs["axis"]
+            data = data.reset_index(list(along), drop=False)
+    now, given = datetime.now(UTC), os.environ.get(_EPOCH)
+    if given is not None:
+        try:
+            now = datetime.fromtimestamp(int(given), UTC)
+        except (ValueError, OverflowError, OSError):
+            allowed = "be a whole number of seconds since 1970"
+            raise ArgumentError(_EPOCH, allowed, validate.shown(given)) from None
+    data = data.assign_attrs(
+        {
+            "Conventions": "CF-1.11",
+            "source": f"clsas {__version__}",
+            "history": f"{now:%Y-%m-%dT%H:%M:%SZ}: written by clsas.export of clsas {__version__}",
+            **{name.lower(): value for name, value in tags.items()},
+        }
+    )
+    for name in data.data_vars:
+        data[name].encoding = {"zlib": True, "complevel": 1, "shuffle": True, "_FillValue": None}
+    for name in data.coords:
+        data[name].encoding = {"_FillValue": None}
     source.check_unchanged()
     # HDF5 does not recover from a full disk, so the file is assembled in memory.
     content = data.to_netcdf(engine="h5netcdf")
@@ -70,8 +101,8 @@ def _of_image(source: Source) -> xarray.Dataset:
     pixels = source.read(*_ALL) if source.image is None else source.image.pixels
     image = Image(pixels, source.grid)
     array = to_xarray(image)
-    level = Encoding("db", _REFERENCE, DYNAMIC_RANGE_DB).encode(np.abs(image.pixels))
-    array = array.copy(data=level)
+    level = decibels(np.abs(image.pixels), _REFERENCE)
+    array = array.copy(data=level.astype(np.float32))
     of_level = {
         "long_name": "Amplitude re 1",
         "reference": _REFERENCE,
@@ -92,49 +123,3 @@ def _of_heights(source: Source) -> xarray.Dataset:
         data[band.name.lower().replace(" ", "_")] = (dims, band.read(*_ALL), words)
     data["height"].attrs |= {"positive": "up", "ancillary_variables": "standard_deviation"}
     return data.assign_attrs(title="Heights from two receiver banks")
-
-
-def _described(data: xarray.Dataset, grid: Grid, tags: dict[str, Any]) -> xarray.Dataset:
-    """Return variables with the map, the origin and the compression of a file."""
-    if grid.georeference is not None:
-        for name in data.data_vars:
-            data[name].attrs["grid_mapping"] = GRID_MAPPING
-        if grid.has_axes and not grid.georeference.is_north_up:
-            data = _with_places_on_map(data)
-    origin: dict[str, Any] = {
-        "Conventions": "CF-1.11",
-        "source": f"clsas {__version__}",
-        "history": f"{_now():%Y-%m-%dT%H:%M:%SZ}: written by clsas.export of clsas {__version__}",
-        **{name.lower(): value for name, value in tags.items()},
-    }
-    compressed = {"zlib": True, "complevel": 1, "shuffle": True}
-    for name in data.data_vars:
-        data[name].encoding = {**compressed, "_FillValue": None}
-    for name in data.coords:
-        data[name].encoding = {"_FillValue": None}
-    return data.assign_attrs(origin)
-
-
-def _now() -> datetime:
-    """Return the time in UTC, or that of SOURCE_DATE_EPOCH, which makes files reproducible."""
-    given = os.environ.get(_EPOCH)
-    if given is None:
-        return datetime.now(UTC)
-    try:
-        return datetime.fromtimestamp(int(given), UTC)
-    except (ValueError, OverflowError, OSError):
-        raise ArgumentError(
-            _EPOCH, "be a whole number of seconds since 1970", validate.shown(given)
-        ) from None
-
-
-def _with_places_on_map(data: xarray.Dataset) -> xarray.Dataset:
-    """Return variables along a track with rows and columns as dimensions.
-
-    Programs take x and y for easting and northing if there is a grid mapping. The distances along
-    and across the track therefore get other names.
-    """
-    renamed = data.rename_dims(x="column", y="row").rename_vars(x="along_track", y="across_track")
-    for name in ("along_track", "across_track"):
-        del renamed[name].attrs["axis"]
-    return renamed.reset_index(["along_track", "across_track"], drop=False)

@@ -24,8 +24,7 @@ from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
 from clsas.engine.data.visibility import sines
 from clsas.engine.signal.spectrum import measure_spectrum, power_spectrum
-from clsas.maps.georeferencing import geographic
-from clsas.maps.orientation import Orientation
+from clsas.maps.georeferencing import Orientation, geographic, warn_of_place
 from clsas.maps.sources import Source
 from clsas.measures.resolution import half_power_width
 
@@ -51,7 +50,7 @@ _HIGHEST_OF_TRACK = 9  # a circle to 1e-4 of its radius
 _DEVIATION = 1e-3
 _BINS = 1024  # of a spectrum; twice as many change its width at half power by 1e-4 at most
 _TIME, _FREQUENCY = 1e-3, 1e-2  # deviations over the duration and over the bandwidth that suffice
-_INTERVAL_S = 1e-3  # between pings, whose times range lines lack
+_INTERVAL_S = 1e-3  # between pings: equal ones, since range lines lack their times
 
 
 def write(
@@ -73,13 +72,17 @@ def write(
     OSError
         If the file cannot be written.
     """
+    warn_of_place(source.grid)
     with needed("SICD files"):
         import pyproj  # noqa: F401  the geometry needs it
         import sarkit.sicd
     lines = _checked(source.grid, lines, sarkit.sicd.IS_SIZE_MAX)
-    radar_m = lines.phase_centres_m.mean(axis=0)
-    raster = Raster.of(source.grid, radar_m)
-    _check_range(lines, raster)
+    raster = Raster.of(source.grid, lines.phase_centres_m.mean(axis=0))
+    distance_m = np.linalg.norm(lines.phase_centres_m - raster.positions_m(raster.centre), axis=1)
+    apart_m = np.linalg.norm(lines.tx_m - lines.rx_m, axis=1)
+    if (apart_m > _SEPARATION * distance_m).any():
+        given = f"transmitters and receivers up to {apart_m.max():.4g} m apart"
+        raise ArgumentError("lines", "be monostatic for SICD", given)
     collection = Collection.of(lines, beam)
     if not collection.band_hz[0] > 0:
         allowed = "have frequencies above 0 Hz with their `carrier_hz` for SICD"
@@ -98,24 +101,6 @@ def write(
             first_byte = layout["ImageSegments"][0]["Data"].get_offset()
             _write_pixels(file, first_byte, source, raster, progress)
         source.check_unchanged()
-
-
-def _write_pixels(
-    file: BinaryIO, first_byte: int, source: Source, raster: Raster, progress: Progress | None
-) -> None:
-    """Write the pixels of an image window by window, row by row of each."""
-    columns_in_all = raster.shape[1]
-    windows = list(source.windows())
-    for done, window in enumerate(windows):
-        if progress is not None:
-            progress(done, len(windows))
-        pixels = raster.orientation.turned(source.read(*window)).astype(">c8", order="C")
-        down, across = raster.orientation.window(*window)
-        for row, line in zip(range(down.start, down.stop), pixels, strict=True):
-            file.seek(first_byte + pixels.itemsize * (row * columns_in_all + across.start))
-            file.write(line.data)
-    if progress is not None:
-        progress(len(windows), len(windows))
 
 
 def _checked(grid: Grid, lines: RangeLines | None, most_bytes: int) -> RangeLines:
@@ -143,7 +128,11 @@ def _checked(grid: Grid, lines: RangeLines | None, most_bytes: int) -> RangeLine
             f"{lines.sound_speed_m_s:g} m/s",
             "export sonar images as a GeoTIFF with `kind='complex'`",
         )
-    _check_lines(lines, grid)
+    if lines.georeference not in (None, grid.georeference):
+        allowed = f"have the georeference of the source ({grid.georeference})"
+        raise ArgumentError("lines", allowed, str(lines.georeference))
+    if not lines.samples.any():
+        raise ArgumentError("lines", "have samples other than 0, from which the band is measured")
     if len(lines.ping_starts) < 2:
         raise ArgumentError("lines", "have at least 2 pings for SICD")
     if grid.georeference.vertical_datum is not None:
@@ -152,128 +141,6 @@ def _checked(grid: Grid, lines: RangeLines | None, most_bytes: int) -> RangeLine
             "WGS 84 ellipsoid, since SICD knows no other"
         )
     return lines
-
-
-def _check_range(lines: RangeLines, raster: Raster) -> None:
-    """Raise ValueError if transmitters and receivers are too far apart to be one antenna."""
-    distance_m = np.linalg.norm(lines.phase_centres_m - raster.positions_m(raster.centre), axis=1)
-    apart_m = np.linalg.norm(lines.tx_m - lines.rx_m, axis=1)
-    if (apart_m > _SEPARATION * distance_m).any():
-        given = f"transmitters and receivers up to {apart_m.max():.4g} m apart"
-        raise ArgumentError("lines", "be monostatic for SICD", given)
-
-
-def _document(sicd: Any, raster: Raster, collection: Collection, tags: dict[str, Any]) -> Any:
-    """Return the XML document of an image."""
-    import lxml.etree
-
-    tree = lxml.etree.ElementTree(
-        lxml.etree.Element(f"{{{_NAMESPACE}}}SICD", nsmap={None: _NAMESPACE})
-    )
-    root = sicd.ElementWrapper(tree.getroot())
-    place, centre_m = raster.georeference, raster.positions_m(raster.centre)
-    range_m = float(np.linalg.norm(collection.lines.phase_centres_m.mean(axis=0) - centre_m))
-    time, axes = _time_and_axes(collection, raster)
-    track = _track_polynomials(collection.lines, place, range_m)
-    root["CollectionInfo"] = {
-        "CollectorName": "unknown",
-        "CoreName": "clsas",
-        "CollectType": "MONOSTATIC",
-        "RadarMode": {"ModeType": "DYNAMIC STRIPMAP"},
-        "Classification": "UNCLASSIFIED",
-        "Parameter": [("CLSAS_TIMES", "placeholders: equal intervals from 1970-01-01")],
-    }
-    root["ImageCreation"] = {"Application": f"clsas {__version__}"}
-    root["ImageData"] = _image_data(raster)
-    corners = raster.corners_on_ground(track, float(time[0, 0]))
-    root["GeoData"] = {
-        "EarthModel": "WGS_84",
-        "SCP": {"ECF": _ecf_m(place, centre_m), "LLH": place.to_geographic(centre_m)},
-        # sarkit 1.8 has no sign for 0 degrees; this is a ten-millionth of a metre.
-        "ImageCorners": np.where(corners == 0, 1e-12, corners),
-    }
-    units = (step_m / np.linalg.norm(step_m) for step_m in raster.vectors_m())
-    row, column = (_axis(axis, unit) for axis, unit in zip(axes, units, strict=True))
-    root["Grid"] = {
-        "ImagePlane": "GROUND" if raster.is_level else "OTHER",
-        "Type": "PLANE",
-        "TimeCOAPoly": time,
-        "Row": row,
-        "Col": column,
-    }
-    root["Timeline"] = {
-        "CollectStart": datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC),
-        "CollectDuration": float(_times_s(collection.lines)[-1]),
-    }
-    root["Position"] = {"ARPPoly": track}
-    lowest_hz, highest_hz = collection.band_hz
-    root["RadarCollection"] = {
-        "TxFrequency": {"Min": lowest_hz, "Max": highest_hz},
-        "TxPolarization": "UNKNOWN",
-        "RcvChannels": {
-            "@size": 1,
-            "ChanParameters": [{"@index": 1, "TxRcvPolarization": "UNKNOWN"}],
-        },
-    }
-    root["ImageFormation"] = _image_formation(collection, tags)
-    root["SCPCOA"] = sicd.compute_scp_coa(tree)
-    return tree
-
-
-def _image_data(raster: Raster) -> dict[str, Any]:
-    """Return the element of the pixels."""
-    rows, columns = raster.shape
-    return {
-        "PixelType": "RE32F_IM32F",
-        "NumRows": rows,
-        "NumCols": columns,
-        "FirstRow": 0,
-        "FirstCol": 0,
-        "FullImage": {"NumRows": rows, "NumCols": columns},
-        "SCPPixel": raster.centre,
-    }
-
-
-def _image_formation(collection: Collection, tags: dict[str, Any]) -> dict[str, Any]:
-    """Return the element of the processing, with the tags as its parameters."""
-    lowest_hz, highest_hz = collection.band_hz
-    return {
-        "RcvChanProc": {"NumChanProc": 1, "ChanIndex": [1]},
-        "TxRcvPolarizationProc": "UNKNOWN",
-        "TStartProc": 0.0,
-        "TEndProc": float(_times_s(collection.lines)[-1]),
-        "TxFrequencyProc": {"MinProc": lowest_hz, "MaxProc": highest_hz},
-        "ImageFormAlgo": "OTHER",
-        "STBeamComp": "NO",
-        "ImageBeamComp": "NO",
-        "AzAutofocus": "NO",
-        "RgAutofocus": "NO",
-        "Processing": [
-            {
-                "Type": "time-domain backprojection",
-                "Applied": True,
-                "Parameter": [(name, str(value)) for name, value in tags.items()],
-            }
-        ],
-    }
-
-
-def _axis(axis: Axis, unit: np.ndarray) -> dict[str, Any]:
-    """Return the element of a raster's rows or columns, which have a direction in ECF."""
-    return {
-        "UVectECF": unit,
-        "SS": axis.step_m,
-        "ImpRespWid": axis.width_m,
-        "Sgn": _SIGN,
-        "ImpRespBW": axis.bandwidth,
-        "KCtr": axis.centre,
-        "DeltaK1": axis.lowest,
-        "DeltaK2": axis.highest,
-        "DeltaKCOAPoly": axis.offset,
-    }
-
-
-# The plane of the pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,12 +200,6 @@ class Raster:
         return np.array(self.shape) // 2
 
     @property
-    def is_level(self) -> bool:
-        """True if the plane is horizontal."""
-        *across, up = np.cross(*self.steps_m)
-        return bool(np.hypot(*across) <= _LEVEL * abs(up))
-
-    @property
     def corners(self) -> NDArray[np.int64]:
         """Rows and columns of the corners, clockwise from pixel [0, 0], int64 [4, 2]."""
         last_row, last_column = (n - 1 for n in self.shape)
@@ -347,25 +208,6 @@ class Raster:
     def positions_m(self, index: NDArray) -> NDArray[np.float64]:
         """Return the positions of rows and columns [..., 2], which may be fractions, [..., 3]."""
         return self.first_m + index @ self.steps_m
-
-    def corners_on_ground(self, track: NDArray[np.float64], time_s: float) -> NDArray[np.float64]:
-        """Return latitude and longitude of the corners at the height of the middle, deg [4, 2].
-
-        A corner above or below it is moved along the normal of the slant plane, on which range and
-        Doppler stay the same to first order.
-        """
-        import sarkit.wgs84
-
-        place, centre_m = self.georeference, self.positions_m(self.centre)
-        places = geographic(place, self.positions_m(self.corners))
-        middle, middle_m = geographic(place, centre_m), _ecf_m(place, centre_m)
-        radar_m = polynomial.polyval(time_s, track)
-        velocity_m_s = polynomial.polyval(time_s, polynomial.polyder(track))
-        normal = np.cross(velocity_m_s, middle_m - radar_m)
-        normal /= normal @ sarkit.wgs84.up(middle)
-        raised_m = (places[:, 2] - middle[2])[:, None]
-        ground_m = sarkit.wgs84.geodetic_to_cartesian(places) - raised_m * normal
-        return sarkit.wgs84.cartesian_to_geodetic(ground_m)[:, :2]
 
     def vectors_m(self) -> NDArray[np.float64]:
         """Return the steps from row to row and from column to column in ECF, [2, 3].
@@ -377,25 +219,6 @@ class Raster:
         ends = np.array([[[0, column], [last_row, column]], [[row, 0], [row, last_column]]])
         first_m, last_m = np.moveaxis(_ecf_m(self.georeference, self.positions_m(ends)), 1, 0)
         return (last_m - first_m) / np.array([[last_row], [last_column]])
-
-
-def _ecf_m(place: Georeference, positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return earth-centred, earth-fixed coordinates of positions [..., 3], metres."""
-    import sarkit.wgs84
-
-    return sarkit.wgs84.geodetic_to_cartesian(geographic(place, positions_m))
-
-
-# What the lines recorded
-
-
-def _check_lines(lines: RangeLines, grid: Grid) -> None:
-    """Raise ValueError if lines lie elsewhere on Earth than an image of them, or are silent."""
-    if lines.georeference not in (None, grid.georeference):
-        allowed = f"have the georeference of the source ({grid.georeference})"
-        raise ArgumentError("lines", allowed, str(lines.georeference))
-    if not lines.samples.any():
-        raise ArgumentError("lines", "have samples other than 0, from which the band is measured")
 
 
 @dataclass(frozen=True, eq=False)
@@ -438,16 +261,6 @@ class Collection:
         lowest_hz, highest_hz = self.cycles_per_m[[0, -1]] * self.lines.sound_speed_m_s / 2
         return float(lowest_hz), float(highest_hz)
 
-    def weights(self, point_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the weight of every channel in a pixel, float64 [channels]."""
-        lines = self.lines
-        range_m = bistatic_range_m(point_m, lines.tx_m, lines.rx_m)
-        reached = (range_m >= lines.first_range_m) & (range_m <= lines.last_range_m)
-        if self.beam is None or self.along is None:
-            return reached.astype(np.float64)
-        sine = sines(point_m[None], lines.phase_centres_m, self.along)[:, 0]
-        return reached * self.beam.weights(sine, wavelength_m(lines))
-
     def contributions(
         self, point_m: NDArray[np.float64], steps_m: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
@@ -467,10 +280,16 @@ class Collection:
         changes_m : float64 [2, n]
             Change of the range from row to row and from column to column.
         """
-        weights = self.weights(point_m)
+        lines = self.lines
+        range_m = bistatic_range_m(point_m, lines.tx_m, lines.rx_m)
+        reached = (range_m >= lines.first_range_m) & (range_m <= lines.last_range_m)
+        weights = reached.astype(np.float64)
+        if self.beam is not None and self.along is not None:
+            sine = sines(point_m[None], lines.phase_centres_m, self.along)[:, 0]
+            weights *= self.beam.weights(sine, wavelength_m(lines))
         channels = np.flatnonzero(weights)
         changes_m = np.zeros((2, len(channels)))
-        for antenna_m in (self.lines.tx_m[channels], self.lines.rx_m[channels]):
+        for antenna_m in (lines.tx_m[channels], lines.rx_m[channels]):
             way_m = point_m - antenna_m
             unit = way_m / np.linalg.norm(way_m, axis=1, keepdims=True)
             changes_m += steps_m @ unit.T / 2
@@ -486,92 +305,111 @@ class Collection:
         return np.stack([cycles.min(axis=(1, 2)), cycles.max(axis=(1, 2))], axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class Axis:
-    """Spatial frequencies along the rows or the columns of a raster.
+def _document(sicd: Any, raster: Raster, collection: Collection, tags: dict[str, Any]) -> Any:
+    """Return the XML document of an image."""
+    import lxml.etree
 
-    Attributes
-    ----------
-    step_m : float
-        Distance of the pixels on Earth, metres.
-    centre : float
-        Spatial frequency of a constant, cycles per metre: the multiple of the sample rate 1/step_m
-        closest to the middle of the band, since pixels keep their phase.
-    offset : float64 [orders + 1, orders + 1]
-        Polynomial of the distances in metres from the scene centre point along rows and columns:
-        the middle of the band less `centre`.
-    lowest, highest : float
-        Lowest and highest frequency of the whole image less `centre`, within half the sample rate.
-    bandwidth : float
-        Extent of the band of the scene centre point, cycles per metre; at most the sample rate.
-    width_m : float
-        Width at half power of the response of a point, metres.
-    """
-
-    step_m: float
-    centre: float
-    offset: NDArray[np.float64]
-    lowest: float
-    highest: float
-    bandwidth: float
-    width_m: float
-
-
-def _times_s(lines: RangeLines) -> NDArray[np.float64]:
-    """Return the time of every channel, in which pings have equal intervals, [channels]."""
-    return lines.ping_numbers * np.float64(_INTERVAL_S)
-
-
-def _track_polynomials(
-    lines: RangeLines, place: Georeference, range_m: float
-) -> NDArray[np.float64]:
-    """Return polynomials of the track's ECF coordinates over time, float64 [orders + 1, 3].
-
-    Raises
-    ------
-    ValueError
-        If polynomials cannot follow the track as seen from a distance, metres.
-    """
-    position_m = _ecf_m(place, lines.ping_centres_m)
-    middle_m = position_m.mean(axis=0)  # removed from sums of squares of 1e6 m
-    time_s = _INTERVAL_S * np.arange(len(position_m))
-    deviation_m = np.inf
-    for order in range(1, min(_HIGHEST_OF_TRACK, len(time_s) - 1) + 1):
-        found = [Polynomial.fit(time_s, each, order) for each in (position_m - middle_m).T]
-        fitted_m = np.stack([each(time_s) for each in found], axis=1) + middle_m
-        deviation_m = float(np.linalg.norm(fitted_m - position_m, axis=1).max())
-        if deviation_m <= _DEVIATION * range_m:
-            coefficients = np.zeros((order + 1, 3))
-            for axis, each in enumerate(found):
-                own = each.convert().coef
-                coefficients[: len(own), axis] = own
-            coefficients[0] += middle_m
-            return coefficients
-    raise ArgumentError(
-        "lines",
-        "come from one pass in the order of recording, since SICD describes the track by "
-        "polynomials",
-        f"a track that deviates from them by {deviation_m:.3g} m at a range of {range_m:.4g} m",
+    tree = lxml.etree.ElementTree(
+        lxml.etree.Element(f"{{{_NAMESPACE}}}SICD", nsmap={None: _NAMESPACE})
     )
+    root = sicd.ElementWrapper(tree.getroot())
+    place, centre_m = raster.georeference, raster.positions_m(raster.centre)
+    range_m = float(np.linalg.norm(collection.lines.phase_centres_m.mean(axis=0) - centre_m))
+    time, axes = _time_and_axes(collection, raster)
+    track = _track_polynomials(collection.lines, place, range_m)
+    root["CollectionInfo"] = {
+        "CollectorName": "unknown",
+        "CoreName": "clsas",
+        "CollectType": "MONOSTATIC",
+        "RadarMode": {"ModeType": "DYNAMIC STRIPMAP"},
+        "Classification": "UNCLASSIFIED",
+        "Parameter": [("CLSAS_TIMES", "placeholders: equal intervals from 1970-01-01")],
+    }
+    root["ImageCreation"] = {"Application": f"clsas {__version__}"}
+    rows, columns = raster.shape
+    root["ImageData"] = {
+        "PixelType": "RE32F_IM32F",
+        "NumRows": rows,
+        "NumCols": columns,
+        "FirstRow": 0,
+        "FirstCol": 0,
+        "FullImage": {"NumRows": rows, "NumCols": columns},
+        "SCPPixel": raster.centre,
+    }
+    corners = _corners_on_ground(raster, track, float(time[0, 0]))
+    root["GeoData"] = {
+        "EarthModel": "WGS_84",
+        "SCP": {"ECF": _ecf_m(place, centre_m), "LLH": place.to_geographic(centre_m)},
+        # sarkit 1.8 has no sign for 0 degrees; this is a ten-millionth of a metre.
+        "ImageCorners": np.where(corners == 0, 1e-12, corners),
+    }
+    *across, up = np.cross(*raster.steps_m)
+    is_level = np.hypot(*across) <= _LEVEL * abs(up)
+    root["Grid"] = {
+        "ImagePlane": "GROUND" if is_level else "OTHER",
+        "Type": "PLANE",
+        "TimeCOAPoly": time,
+        "Row": axes[0],
+        "Col": axes[1],
+    }
+    duration_s = float(_INTERVAL_S * collection.lines.ping_numbers[-1])
+    root["Timeline"] = {
+        "CollectStart": datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC),
+        "CollectDuration": duration_s,
+    }
+    root["Position"] = {"ARPPoly": track}
+    lowest_hz, highest_hz = collection.band_hz
+    root["RadarCollection"] = {
+        "TxFrequency": {"Min": lowest_hz, "Max": highest_hz},
+        "TxPolarization": "UNKNOWN",
+        "RcvChannels": {
+            "@size": 1,
+            "ChanParameters": [{"@index": 1, "TxRcvPolarization": "UNKNOWN"}],
+        },
+    }
+    root["ImageFormation"] = {
+        "RcvChanProc": {"NumChanProc": 1, "ChanIndex": [1]},
+        "TxRcvPolarizationProc": "UNKNOWN",
+        "TStartProc": 0.0,
+        "TEndProc": duration_s,
+        "TxFrequencyProc": {"MinProc": lowest_hz, "MaxProc": highest_hz},
+        "ImageFormAlgo": "OTHER",
+        "STBeamComp": "NO",
+        "ImageBeamComp": "NO",
+        "AzAutofocus": "NO",
+        "RgAutofocus": "NO",
+        "Processing": [
+            {
+                "Type": "time-domain backprojection",
+                "Applied": True,
+                "Parameter": [(name, str(value)) for name, value in tags.items()],
+            }
+        ],
+    }
+    root["SCPCOA"] = sicd.compute_scp_coa(tree)
+    return tree
 
 
 def _time_and_axes(
     collection: Collection, raster: Raster
-) -> tuple[NDArray[np.float64], tuple[Axis, Axis]]:
-    """Return the time at which pixels are observed, and the frequencies along rows and columns.
+) -> tuple[NDArray[np.float64], list[dict[str, Any]]]:
+    """Return the time at which pixels are observed, and the elements of rows and columns.
 
-    The time is a polynomial like `Axis.offset`: the mean over the channels that a pixel receives
-    from.
+    The time is the mean over the channels that a pixel receives from, as a polynomial of the
+    distances in metres from the scene centre point along rows and columns, and so is the middle of
+    the band less its centre. The centre is the multiple of the sample rate 1/step closest to the
+    middle of the band, since pixels keep their phase. Bands are at most as wide as the sample rate.
 
     Raises
     ------
     ValueError
         If no line reaches the middle of the grid, or all see it from one direction.
     """
-    lengths_m = np.linalg.norm(raster.vectors_m(), axis=1)
+    vectors_m = raster.vectors_m()
+    lengths_m = np.linalg.norm(vectors_m, axis=1)
     sides = (np.linspace(0, n - 1, _PIXELS) for n in raster.shape)
     index = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
-    time_of_channels_s = _times_s(collection.lines)
+    time_of_channels_s = _INTERVAL_S * collection.lines.ping_numbers
     times, supports, used = [], [], []
     for where, point_m in zip(index, raster.positions_m(index), strict=True):
         channels, weight, changes_m = collection.contributions(point_m, raster.steps_m)
@@ -610,17 +448,19 @@ def _time_and_axes(
                 hint="those within the beam see it from one direction only",
             )
         axes.append(
-            Axis(
-                step_m=float(step_m),
-                centre=float(centre),
-                offset=offset,
-                lowest=float(first),
-                highest=float(last),
-                bandwidth=float(bandwidth),
-                width_m=width_m,
-            )
+            {
+                "UVectECF": vectors_m[axis] / step_m,
+                "SS": float(step_m),
+                "ImpRespWid": width_m,
+                "Sgn": _SIGN,
+                "ImpRespBW": float(bandwidth),
+                "KCtr": float(centre),
+                "DeltaK1": float(first),
+                "DeltaK2": float(last),
+                "DeltaKCOAPoly": offset,
+            }
         )
-    return time, (axes[0], axes[1])
+    return time, axes
 
 
 def _fitted(
@@ -638,3 +478,83 @@ def _fitted(
             break
     exponents = np.arange(len(found))
     return found / np.multiply.outer(scale_m[0] ** exponents, scale_m[1] ** exponents)
+
+
+def _track_polynomials(
+    lines: RangeLines, place: Georeference, range_m: float
+) -> NDArray[np.float64]:
+    """Return polynomials of the track's ECF coordinates over time, float64 [orders + 1, 3].
+
+    Raises
+    ------
+    ValueError
+        If polynomials cannot follow the track as seen from a distance, metres.
+    """
+    position_m = _ecf_m(place, lines.ping_centres_m)
+    middle_m = position_m.mean(axis=0)  # removed from sums of squares of 1e6 m
+    time_s = _INTERVAL_S * np.arange(len(position_m))
+    deviation_m = np.inf
+    for order in range(1, min(_HIGHEST_OF_TRACK, len(time_s) - 1) + 1):
+        found = [Polynomial.fit(time_s, each, order) for each in (position_m - middle_m).T]
+        fitted_m = np.stack([each(time_s) for each in found], axis=1) + middle_m
+        deviation_m = float(np.linalg.norm(fitted_m - position_m, axis=1).max())
+        if deviation_m <= _DEVIATION * range_m:
+            coefficients = np.zeros((order + 1, 3))
+            for axis, each in enumerate(found):
+                own = each.convert().coef
+                coefficients[: len(own), axis] = own
+            coefficients[0] += middle_m
+            return coefficients
+    raise ArgumentError(
+        "lines",
+        "come from one pass in the order of recording, since SICD describes the track by "
+        "polynomials",
+        f"a track that deviates from them by {deviation_m:.3g} m at a range of {range_m:.4g} m",
+    )
+
+
+def _corners_on_ground(
+    raster: Raster, track: NDArray[np.float64], time_s: float
+) -> NDArray[np.float64]:
+    """Return latitude and longitude of the corners at the height of the middle, deg [4, 2].
+
+    A corner above or below it is moved along the normal of the slant plane, on which range and
+    Doppler stay the same to first order.
+    """
+    import sarkit.wgs84
+
+    place, centre_m = raster.georeference, raster.positions_m(raster.centre)
+    places = geographic(place, raster.positions_m(raster.corners))
+    middle, middle_m = geographic(place, centre_m), _ecf_m(place, centre_m)
+    radar_m = polynomial.polyval(time_s, track)
+    velocity_m_s = polynomial.polyval(time_s, polynomial.polyder(track))
+    normal = np.cross(velocity_m_s, middle_m - radar_m)
+    normal /= normal @ sarkit.wgs84.up(middle)
+    raised_m = (places[:, 2] - middle[2])[:, None]
+    ground_m = sarkit.wgs84.geodetic_to_cartesian(places) - raised_m * normal
+    return sarkit.wgs84.cartesian_to_geodetic(ground_m)[:, :2]
+
+
+def _ecf_m(place: Georeference, positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return earth-centred, earth-fixed coordinates of positions [..., 3], metres."""
+    import sarkit.wgs84
+
+    return sarkit.wgs84.geodetic_to_cartesian(geographic(place, positions_m))
+
+
+def _write_pixels(
+    file: BinaryIO, first_byte: int, source: Source, raster: Raster, progress: Progress | None
+) -> None:
+    """Write the pixels of an image window by window, row by row of each."""
+    columns_in_all = raster.shape[1]
+    windows = list(source.windows())
+    for done, window in enumerate(windows):
+        if progress is not None:
+            progress(done, len(windows))
+        pixels = raster.orientation.turned(source.read(*window)).astype(">c8", order="C")
+        down, across = raster.orientation.window(*window)
+        for row, line in zip(range(down.start, down.stop), pixels, strict=True):
+            file.seek(first_byte + pixels.itemsize * (row * columns_in_all + across.start))
+            file.write(line.data)
+    if progress is not None:
+        progress(len(windows), len(windows))

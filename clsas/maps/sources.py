@@ -1,10 +1,14 @@
-"""Sources of exports: images and heights in memory, and stores of mosaics, read by windows."""
+"""Sources of exports: images and heights in memory, and stores of mosaics, read by windows.
+
+`bands_of` returns what a raster shows of a source, also window by window.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -157,3 +161,66 @@ def windows_of(
                 slice(top, min(top + sides[0], shape[0])),
                 slice(left, min(left + sides[1], shape[1])),
             )
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Numbers of the pixels of a grid, which are read window by window.
+
+    Attributes
+    ----------
+    name : str
+        What the numbers are, such as "Height".
+    unit : str
+        Their unit; "" for numbers without one, and for amplitudes.
+    kind : str
+        Their kind, which says how they are averaged: see `clsas.mosaics.pyramid.block_means`.
+        Complex pixels are "amplitude", too, since overviews show that.
+    read : callable
+        Called as read(rows, columns) with two slices; returns the numbers of a window of the grid.
+    """
+
+    name: str
+    unit: str
+    kind: str
+    read: Callable[[slice, slice], NDArray]
+
+
+def bands_of(source: Source, kind: str) -> tuple[Band, ...]:
+    """Return the bands of a raster that shows a source.
+
+    Parameters
+    ----------
+    source : Source
+        An image on a plane or height map, a mosaic, or heights.
+    kind : str
+        Kind of the pixels of an image: "db", "complex" or "8bit". 8-bit levels stand alone, without
+        the heights of a height map. Heights have no amplitude.
+    """
+    grid = source.grid
+    origin_m, *steps_m = grid.vectors_m
+    place = grid.georeference
+    first_m = (origin_m if place is None else place.to_map(origin_m))[2]
+    down_m, right_m = (step[2] * np.arange(n) for step, n in zip(steps_m, grid.shape, strict=True))
+
+    def height_m(rows: slice, columns: slice) -> NDArray[np.float64]:
+        """Return heights on the vertical axis of the map: those above the plane, and the plane."""
+        if source.has_heights:
+            above_m = source.read_layer("height_m", rows, columns)
+        else:
+            assert grid.height_m is not None  # it is read only if there are heights
+            above_m = grid.height_m[rows, columns]
+        return first_m + np.add.outer(down_m[rows], right_m[columns]) + above_m
+
+    def amplitude(rows: slice, columns: slice) -> NDArray[np.float32]:
+        return np.abs(source.read(rows, columns))
+
+    height = Band("Height", "m", "height_m", height_m)
+    if source.has_heights:
+        return (
+            height,
+            Band("Standard deviation", "m", "sd_m", partial(source.read_layer, "sd_m")),
+            Band("Coherence", "", "coherence", partial(source.read_layer, "coherence")),
+        )
+    pixels = Band("Amplitude", "", "amplitude", source.read if kind == "complex" else amplitude)
+    return (pixels,) if grid.height_m is None or kind == "8bit" else (pixels, height)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from xml.sax.saxutils import escape
 
 import numpy as np
 
 from clsas.engine.data.atomic import replacing
 from clsas.engine.data.image import Image
-from clsas.maps.map_grids import Affine, is_vertical, warn_of_place
+from clsas.maps.georeferencing import Affine, is_vertical, warn_of_place
 from clsas.plot import image_db
 from clsas.plot.canvas import PADDING_IN, PNG_DPI, length_unit, save
 
@@ -52,7 +52,7 @@ def write_picture(path: Path, image: Image, options: dict[str, Any]) -> None:
         temporary.write_text(lines)
     numbers = ", ".join(repr(number) for number in (c, a, b, f, d, e))
     described = (
-        f"<PAMDataset>\n  <SRS>{escape(wkt)}</SRS>\n"
+        f"<PAMDataset>\n  <SRS>{escape(wkt, quote=False)}</SRS>\n"
         f"  <GeoTransform>{numbers}</GeoTransform>\n</PAMDataset>\n"
     )
     with replacing(path.with_name(f"{path.name}.aux.xml")) as temporary:
@@ -66,27 +66,25 @@ def _of_picture(figure: Figure, image: Image) -> Affine:
     figure.set_dpi(PNG_DPI)  # the layout depends on it
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    axes = figure.axes[0]
     # What `save` writes: the figure with its labels, and a margin.
     box = figure.get_tightbbox(canvas.get_renderer()).padded(PADDING_IN)
     left, top = box.x0 * PNG_DPI, box.y0 * PNG_DPI + int(box.height * PNG_DPI)
     dots = np.array([[left, top], [left + 1, top], [left, top - 1]])
-    shown = axes.transData.inverted().transform(dots)
-    origin, right, down = (_on_map(image, *place) for place in shown)
-    (a, d), (b, e) = right - origin, down - origin
-    return float(a), float(b), float(origin[0]), float(d), float(e), float(origin[1])
+    shown = figure.axes[0].transData.inverted().transform(dots)
 
-
-def _on_map(image: Image, across: float, upward: float) -> np.ndarray:
-    """Return easting and northing of a place on the axes of a picture."""
+    # From places on the axes of the picture to columns and rows, and on to the map.
     grid = image.grid
-    assert grid.georeference is not None
+    assert grid.georeference is not None  # the caller has checked it
     sides = grid.sides
     factor, _ = length_unit(max(float(np.abs(side.places_m).max()) for side in sides))
     column, row = (
-        (place / factor - side.places_m[0]) / (side.step_m or 1.0)
-        for place, side in zip((across, upward), sides, strict=True)
+        (places / factor - side.places_m[0]) / (side.step_m or 1.0)
+        for places, side in zip(shown.T, sides, strict=True)
     )
     a, b, c, d, e, f = grid.georeference.affine(grid)
     column, row = column + 0.5, row + 0.5
-    return np.array([a * column + b * row + c, d * column + e * row + f])
+    east, north = a * column + b * row + c, d * column + e * row + f
+    return (
+        *(float(east[1] - east[0]), float(east[2] - east[0]), float(east[0])),
+        *(float(north[1] - north[0]), float(north[2] - north[0]), float(north[0])),
+    )

@@ -44,8 +44,7 @@ from clsas.mosaics.document import (
     stamp_of,
 )
 from clsas.mosaics.levels import LAYERS, LEVELS, SHADOWED, level_shape
-from clsas.mosaics.overview import Reading, reduced, step_of
-from clsas.mosaics.pyramid import coarser
+from clsas.mosaics.pyramid import coarser, reduced, step_of
 
 if TYPE_CHECKING:
     import zarr
@@ -677,7 +676,7 @@ class Store:
             )
 
         rows_at_once, columns_at_once = (factor * side for side in self.document.patch_shape)
-        return reduced(part, Reading(read, factor, (rows_at_once, columns_at_once)), step)
+        return reduced(part, read, factor, (rows_at_once, columns_at_once), step)
 
     def _checked_factor(self, factor: int) -> int:
         """Return the factor of a level; raise ValueError if there is none."""

@@ -18,7 +18,8 @@ from tiers import also
 
 import clsas
 from clsas.engine.data.validate import ClsasWarning
-from clsas.maps import geotiff, geotiff_checks
+from clsas.maps import geotiff
+from clsas.mosaics import pyramid
 
 pyproj = pytest.importorskip("pyproj")
 rasterio = pytest.importorskip("rasterio")
@@ -131,6 +132,27 @@ def test_overviews_are_means_of_power(tmp_path):
             expected = blocks.sum(axis=(1, 3)) / count
             with rasterio.open(tmp_path / "a.tif", overview_level=level) as file:
                 np.testing.assert_allclose(power(file.read(1), kind), expected, rtol=3e-6)
+
+
+def test_overviews_are_the_levels_of_a_mosaic(tmp_path, monkeypatch):
+    """Also where the last pixels of a level cover fewer pixels of the image than others."""
+    monkeypatch.setattr(geotiff, "_TILE", 128)
+    random = np.random.default_rng(5)
+    pixels = (random.normal(size=(299, 263, 2)) @ [1, 1j]).astype(np.complex64)
+    pixels[100:151, :33] = 0
+    height_m = random.normal(size=(299, 263)).astype(np.float32)
+    grid = clsas.Grid.oriented(
+        (5e5, 6.7e6, 0), (0, -1, 0), (1, 0, 0), (299, 263), georeference=UTM_NORTH
+    )
+    clsas.export(clsas.Image(pixels, grid.with_height(height_m)), tmp_path / "a.tif")
+    finest = {"amplitude": np.abs(pixels), "height_m": height_m}
+    levels = pyramid.pyramid(finest, (2, 4), None)
+    for overview, factor in enumerate((2, 4)):
+        with rasterio.open(tmp_path / "a.tif", overview_level=overview) as file:
+            level, height = file.read()
+        amplitude = np.nan_to_num(10 ** (level.astype(float) / 20))
+        np.testing.assert_allclose(amplitude, levels[factor]["amplitude"], rtol=1e-6)
+        np.testing.assert_allclose(height, levels[factor]["height_m"], rtol=1e-6, atol=1e-7)
 
 
 def test_heights_on_the_axis_of_the_map_are_the_second_band(tmp_path):
@@ -308,7 +330,8 @@ def test_a_failed_write_of_gdal_tells_a_full_disk_or_quota(tmp_path, monkeypatch
     """GDAL reports neither, and leaves out tiles that it cannot write when it closes a file."""
     image, _ = scene(UTM_NORTH)
 
-    def write(export, path, *_):
+    def write(raster, *_):
+        path = raster.folder / "first.tif"
         if noticed == "on a write":
             raise rasterio.errors.RasterioIOError(
                 "Write failed. See previous exception for details."
@@ -316,7 +339,7 @@ def test_a_failed_write_of_gdal_tells_a_full_disk_or_quota(tmp_path, monkeypatch
         profile = {"driver": "GTiff", "dtype": "uint8", "count": 1, "sparse_ok": True}
         with warnings.catch_warnings(action="ignore"):  # it has no georeference
             rasterio.open(path, "w", width=99, height=99, **profile).close()
-            geotiff_checks.check_whole(path)
+            geotiff.check_whole(path)
 
     class Disk(io.BytesIO):
         """A file on a disk with 1 MiB of free space, or more."""
@@ -325,7 +348,7 @@ def test_a_failed_write_of_gdal_tells_a_full_disk_or_quota(tmp_path, monkeypatch
             if full and len(contents) > 1 << 20:
                 raise OSError(full, os.strerror(full))
 
-    monkeypatch.setattr(geotiff._Export, "write", write)
+    monkeypatch.setattr(geotiff, "_read", write)
     monkeypatch.setattr("tempfile.TemporaryFile", lambda **_: Disk())
     with pytest.raises(OSError, match="" if full else "GDAL cannot write the file") as caught:
         clsas.export(image, tmp_path / "a.tif")

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from clsas.maps.orientation import Orientation
+from clsas.maps.georeferencing import Orientation
 
 TURNS = list(itertools.product((1, -1), (1, -1), (False, True)))
 

@@ -17,9 +17,9 @@ import clsas
 from clsas.cli import main
 from clsas.engine.data import atomic
 from clsas.engine.data.image import Formed
-from clsas.maps import tiles, viewer
-from clsas.maps.frames import Frame, fitted_degrees
-from clsas.maps.tiles import Pyramid, Quantization, factors_of, shape_of
+from clsas.maps import viewer
+from clsas.maps.viewer import Tiles, factors_of, fitted_degrees, frame_of, shape_of
+from clsas.mosaics.pyramid import BRIGHTEST, NOTHING, eight_bits, pyramid
 
 SHAPE = (700, 1300)
 PLANE = clsas.Grid.plane((-13, 12.98, 1300), (40, 53.98, 700))
@@ -54,10 +54,10 @@ def levels_at(folder, shape, scale, image=0, steps_m=(1.0, 1.0)):
     rows, columns = shape_of(shape, factors_of(shape, steps_m)[scale])
     found = np.zeros((rows, columns), np.uint8)
     names = {path.name for path in (folder / str(image) / str(scale)).iterdir()}
-    for row in range(0, rows, tiles.SIDE):
-        for column in range(0, columns, tiles.SIDE):
-            name = f"{column // tiles.SIDE}_{row // tiles.SIDE}"
-            part = found[row : row + tiles.SIDE, column : column + tiles.SIDE]
+    for row in range(0, rows, viewer.SIDE):
+        for column in range(0, columns, viewer.SIDE):
+            name = f"{column // viewer.SIDE}_{row // viewer.SIDE}"
+            part = found[row : row + viewer.SIDE, column : column + viewer.SIDE]
             text = (folder / str(image) / str(scale) / f"{name}.js").read_text()
             packed = re.fullmatch(rf'clsasTile\("{image}/{scale}/{name}","(.*)"\);\n', text)[1]
             values = np.frombuffer(zlib.decompress(base64.b64decode(packed)), np.uint8)
@@ -78,10 +78,10 @@ def test_tiles_have_every_pixel_to_half_a_step(image, written):
     assert scene["scales"] == [9, 11]  # 2048 is the first power of two that is not below 1300
     found = levels_at(written / "tiles", SHAPE, 11)
     nothing = image.pixels == 0
-    assert np.array_equal(found == tiles.NOTHING, nothing)
-    level_db = (found[~nothing].astype(float) - tiles.BRIGHTEST) * scene["step_db"]
+    assert np.array_equal(found == NOTHING, nothing)
+    level_db = (found[~nothing].astype(float) - BRIGHTEST) * scene["step_db"]
     assert np.abs(level_db - image.db()[~nothing]).max() <= scene["step_db"] / 2 + 1e-4
-    assert found.max() == tiles.BRIGHTEST
+    assert found.max() == BRIGHTEST
 
 
 def test_coarse_tiles_are_means_of_power(image, written):
@@ -93,10 +93,23 @@ def test_coarse_tiles_are_means_of_power(image, written):
         mean = blocks.sum(axis=(1, 3)) / np.maximum((blocks > 0).sum(axis=(1, 3)), 1)
     mean /= largest
     some = mean > 0
-    expected = tiles.BRIGHTEST + 10 * np.log10(mean[some]) / scene_of(written)["step_db"]
+    expected = BRIGHTEST + 10 * np.log10(mean[some]) / scene_of(written)["step_db"]
     assert found.shape == mean.shape
-    assert np.array_equal(found == tiles.NOTHING, ~some)
+    assert np.array_equal(found == NOTHING, ~some)
     assert np.abs(found[some] - expected).max() <= 0.51
+
+
+def test_coarse_tiles_are_the_levels_of_a_mosaic(tmp_path, monkeypatch):
+    """Also where the last pixels of a scale cover fewer pixels of the image than others."""
+    monkeypatch.setattr(viewer, "SIDE", 16)
+    pixels, shape = speckle((39, 45)), (39, 45)
+    largest = float(np.abs(pixels).max())
+    tiles = Tiles(tmp_path, "0", shape, factors_of(shape, (1.0, 1.0)), largest, 0.4)
+    tiles.add(slice(0, 39), slice(0, 45), pixels)
+    levels = pyramid({"amplitude": np.abs(pixels)}, (2, 4), None)
+    for scale, factor in ((6, 1), (5, 2), (4, 4)):
+        expected = eight_bits(levels[factor]["amplitude"], largest, 0.4)
+        np.testing.assert_array_equal(levels_at(tmp_path, shape, scale), expected)
 
 
 @pytest.mark.parametrize("steps_m", [(1.0, 1.0), (1.0, 0.2)])
@@ -105,15 +118,15 @@ def test_tiles_do_not_depend_on_windows(tmp_path, shape, steps_m):
     pixels = speckle(shape)
     rng = np.random.default_rng(1)
     for name, height, width in (("whole", *shape), ("windows", 401, 300)):
-        quantization = Quantization(float(np.abs(pixels).max()) or 1.0)
-        pyramid = Pyramid(shape, quantization, tmp_path / name, "0", factors_of(shape, steps_m))
+        largest = float(np.abs(pixels).max()) or 1.0
+        tiles = Tiles(tmp_path / name, "0", shape, factors_of(shape, steps_m), largest, 0.4)
         windows = [
             (slice(top, min(top + height, shape[0])), slice(left, min(left + width, shape[1])))
             for top in range(0, shape[0], height)
             for left in range(0, shape[1], width)
         ]
         for index in rng.permutation(len(windows)):
-            pyramid.add(*windows[index], pixels[windows[index]])
+            tiles.add(*windows[index], pixels[windows[index]])
     whole, parts = (
         {path.relative_to(tmp_path / name): path.read_bytes() for path in files}
         for name in ("whole", "windows")
@@ -140,10 +153,11 @@ def test_the_longer_side_of_pixels_is_reduced_last(shape, steps_m, expected):
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 3e38 + 3e38j])
-def test_levels_of_any_scale(scale):
+def test_levels_of_any_scale(tmp_path, scale):
     pixels = (np.array([[1, 0.1, 1e-9, 0]]) * scale).astype(np.complex64)
-    levels = Quantization(abs(complex(pixels[0, 0])))
-    assert levels.encode(levels.power(pixels)).tolist() == [[255, 205, 1, 0]]
+    tiles = Tiles(tmp_path, "0", (1, 4), {2: (1, 1)}, abs(complex(pixels[0, 0])), 0.4)
+    tiles.add(slice(0, 1), slice(0, 4), pixels)
+    assert levels_at(tmp_path, (1, 4), 2).tolist() == [[255, 205, 1, 0]]
 
 
 X, Y, Z = np.eye(3)
@@ -168,13 +182,11 @@ X, Y, Z = np.eye(3)
 )
 def test_a_plane_is_seen_from_above_and_never_mirrored(row_step, column_step, right, up):
     grid = clsas.Grid.oriented((1, 2, 3), row_step, column_step, (4, 5))
-    frame = Frame.of(grid)
-    np.testing.assert_allclose([frame.right, frame.up], [right, up], atol=1e-12)
-    described = frame.describe(grid)
-    for axis, name in enumerate(("right", "up")):
-        along = getattr(frame, name)
-        assert described["screen_row_step"][axis] == pytest.approx(row_step @ along)
-        assert described["screen_column_step"][axis] == pytest.approx(column_step @ along)
+    frame = frame_of(grid)
+    np.testing.assert_allclose(frame["axes"], [right, up], atol=1e-12)
+    for axis, along in enumerate(np.array(frame["axes"])):
+        assert frame["screen_row_step"][axis] == pytest.approx(row_step @ along)
+        assert frame["screen_column_step"][axis] == pytest.approx(column_step @ along)
 
 
 @pytest.mark.parametrize(
@@ -195,8 +207,7 @@ def test_a_single_row_or_column_is_as_wide_as_its_pixels(
     tmp_path, row_step, column_step, shape, right, up
 ):
     grid = clsas.Grid.oriented((1, 2, 3), row_step, column_step, shape)
-    frame = Frame.of(grid)
-    np.testing.assert_allclose([frame.right, frame.up], [right, up], atol=1e-12)
+    np.testing.assert_allclose(frame_of(grid)["axes"], [right, up], atol=1e-12)
     viewer.write(clsas.Image(speckle(shape), grid), tmp_path / "web")
     described = scene_of(tmp_path / "web")["frame"]
     steps = [described["row_step"], described["column_step"]]
@@ -268,7 +279,7 @@ class TestFolder:
     def test_that_cannot_be_renamed_is_refused_before_pixels_are_read(
         self, image, tmp_path, monkeypatch
     ):
-        monkeypatch.setattr(viewer, "_largest", None)
+        monkeypatch.setattr(viewer, "largest_amplitude", None)
         (tmp_path / "here" / "below").mkdir(parents=True)
         monkeypatch.chdir(tmp_path / "here")
         for folder in (".", tmp_path / "here", "below/..", "/proc"):
@@ -296,7 +307,7 @@ class TestFolder:
         def fail(*_):
             raise error
 
-        monkeypatch.setattr(Pyramid, "add", fail)
+        monkeypatch.setattr(Tiles, "add", fail)
         for name in ("web", "new"):
             with pytest.raises(type(error)):
                 viewer.write(small, tmp_path / name)
@@ -386,7 +397,7 @@ class TestStore:
         found = levels_at(
             tmp_path / "web" / "tiles", GRID.shape, max(factors_of(GRID.shape, (1.0, 1.0)))
         )
-        expected = tiles.BRIGHTEST + clsas.Image(pixels, GRID).db() / 0.4
+        expected = BRIGHTEST + clsas.Image(pixels, GRID).db() / 0.4
         assert np.abs(found - np.maximum(expected, 1)).max() <= 0.51
         patches = scene_of(tmp_path / "web")["patches"]
         assert [patch[:4] for patch in patches[:3]] == [
