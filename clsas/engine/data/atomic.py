@@ -301,7 +301,9 @@ def _remove_leftovers(folder: Path) -> None:
             descriptor = _open(path)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises if in use
-                _remove(path)
+                # Another process may have removed it, and its maker have taken the name again.
+                if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+                    _remove(path)
             finally:
                 os.close(descriptor)
 

@@ -214,6 +214,22 @@ def test_names_alike_stay(tmp_path):
     assert (tmp_path / ".other-0.part").exists()
 
 
+def test_a_temporary_with_the_name_of_a_leftover_is_not_removed(tmp_path, monkeypatch):
+    """The leftover is removed and its name taken again before its lock is granted."""
+    path = tmp_path / ".clsas-leftover.part"
+    path.write_text("old")
+    lock = fcntl.flock
+
+    def slow(descriptor, how):
+        path.unlink()
+        path.write_text("new")
+        lock(descriptor, how)
+
+    monkeypatch.setattr(fcntl, "flock", slow)
+    atomic._remove_leftovers(tmp_path)
+    assert path.read_text() == "new"
+
+
 def test_a_temporary_taken_for_a_leftover_is_made_anew(tmp_path, monkeypatch):
     """Another writer may remove a file after it was created and before it is locked."""
     flock, calls = fcntl.flock, []
