@@ -182,9 +182,8 @@ for name in clsas.__all__:
         assert re.fullmatch(pattern, message)
     assert said.keys() == {
         *("FileFormatError", "load", "save", "read_airsas", "read_cphd", "read_full_matrix"),
-        *("read_phase_history", "write_cphd", "Mosaic", "Patch", "Store", "mosaic"),
-        "mosaic_heights",
-        *("export", "Processed", "process", "read_sound_speed"),
+        *("read_phase_history", "write_cphd", "Mosaic", "Patch", "mosaic", "mosaic_heights"),
+        *("Processed", "process", "read_sound_speed"),
     }
     assert "'sarkit>=" in said["read_cphd"]
     assert "'zarr>=" in said["mosaic"]
