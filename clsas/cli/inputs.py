@@ -142,15 +142,17 @@ def read_request(
             "--accuracy-db, --taps and --upsampling are for exact images and cannot be combined "
             f"with {option_of(next(iter(planned)))}"
         )
-    if len(exactly) == len(EXACT_KEYS):
-        raise click.UsageError(
-            "--accuracy-db has no effect beside both --taps and --upsampling: leave one of them out"
-        )
     if planned:
         return planned
-    described_exactly = {key: value for key, value in described.image.items() if key in EXACT_KEYS}
     if exact or exactly:
-        return described_exactly | exactly
+        in_scene = {key: described.image[key] for key in EXACT_KEYS if key in described.image}
+        exactly = in_scene | exactly
+        if "accuracy_db" in given and len(exactly) == len(EXACT_KEYS):
+            raise click.UsageError(
+                "--accuracy-db has no effect beside both --taps and --upsampling, or `taps` and "
+                "`upsampling` of the scene: leave one of them out"
+            )
+        return exactly
     return described.request or DEFAULT_REQUEST
 
 

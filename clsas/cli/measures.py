@@ -192,7 +192,8 @@ def bench(
     measures |= dict.fromkeys(cases.HEIGHTS_CASES, benchmark.run_heights)
     if case is not None:
         _one_of(case, measures)
-        if tolerance if case in cases.EXACT_CASES else exactly:
+        other = tolerance if case in cases.EXACT_CASES else exactly
+        if other:
             raise click.UsageError("--accuracy-db is for bp-..., --tolerance-db for other cases")
     for name in [case] if case else measures:
         request = {"repeats": 5} | timed | (exactly if name in cases.EXACT_CASES else tolerance)

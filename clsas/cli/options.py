@@ -29,6 +29,7 @@ from clsas.engine.data.declared import (
     Span,
     declared,
     default_of,
+    limits_in_words,
 )
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
@@ -132,7 +133,10 @@ def _help(what: Declared, default: str, beside: str) -> str:
         text += " X,Y is at z = 0."
     if isinstance(what, Names | Positions | Several):
         text += " Repeat the option for several."
-    return f"{text} [default: {default}]" if default else text
+    notes = [limits_in_words(what)] if isinstance(what, Number | Count | Span | Several) else []
+    notes += [f"default: {default}"] if default else []
+    shown = "; ".join(note for note in notes if note)
+    return f"{text} [{shown}]" if shown else text
 
 
 def _kind(what: Declared, given: Any) -> dict[str, Any]:

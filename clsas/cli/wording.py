@@ -168,13 +168,14 @@ def _evaluated(text: str) -> Any:
         return text
 
 
-def typed(value: Any) -> str:
+def typed(value: object) -> str:
     """Return a value as it is typed: LOW:HIGH, or words without quotes."""
-    if not isinstance(value, tuple):
-        return described(value)
-    if all(isinstance(each, str) for each in value):
-        return ", ".join(value)
-    return ":".join(f"{each:g}" for each in value)
+    if isinstance(value, tuple) and value:
+        if all(isinstance(each, str) for each in value):
+            return ", ".join(value)
+        if all(isinstance(each, int | float) for each in value):
+            return ":".join(f"{each:g}" for each in value)
+    return described(value)
 
 
 def _options(running: click.Context) -> dict[str, str]:
@@ -194,6 +195,8 @@ def _options(running: click.Context) -> dict[str, str]:
         if found is not None:
             options[argument] = _SAID.get(argument, option_name(found))
     if {"x", "scene"} <= params.keys():
-        is_given = running.get_parameter_source("axes__x") is ParameterSource.COMMANDLINE
+        is_given = (
+            running.get_parameter_source(params["x"].name or "x") is ParameterSource.COMMANDLINE
+        )
         options["grid"] = "the grid of --x and --y" if is_given else "[grid]"
     return options

@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from clsas.engine.data import reading, validate
-from clsas.engine.data.declared import check_declared
 from clsas.engine.data.fourier import fourier_series
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.system import Pulse
 from clsas.engine.data.validate import ArgumentError
-from clsas.engine.signal.compression import Window, compress
+from clsas.engine.signal.compression import OVERSAMPLING, WINDOW, Window, compress
 from clsas.engine.signal.echoes import Echoes
 from clsas.files import hdf5
 from clsas.files.hdf5 import FileFormatError
@@ -95,7 +94,8 @@ def read_airsas(
     >>> lines = clsas.read_airsas("scenes/arrow.h5", channels=[1, 2])  # doctest: +SKIP
     """
     path = validate.path("path", path)
-    check_declared(compress, {"window": window, "oversampling": oversampling})
+    WINDOW.check("window", window)
+    OVERSAMPLING.check("oversampling", oversampling)
     with hdf5.opened(path) as file:
         if not is_airsas(file):
             raise FileFormatError(

@@ -24,13 +24,12 @@ from scipy.constants import speed_of_light
 
 from clsas.engine.data import reading, validate
 from clsas.engine.data.atomic import replacing
-from clsas.engine.data.declared import check_declared
 from clsas.engine.data.extras import needed
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.reading import parse_json
 from clsas.engine.data.validate import ArgumentError
-from clsas.engine.signal.compression import Window, compress
+from clsas.engine.signal.compression import OVERSAMPLING, WINDOW, Window
 from clsas.engine.signal.phase_history import from_phase_history
 from clsas.files.hdf5 import FileFormatError
 from clsas.files.positions import checked_positions
@@ -152,7 +151,8 @@ def read_cphd(
     path = validate.path("path", path)
     if channel is not None:
         channel = validate.text("channel", channel)
-    check_declared(compress, {"window": window, "oversampling": oversampling})
+    WINDOW.check("window", window)
+    OVERSAMPLING.check("oversampling", oversampling)
     with _defects(path):
         reading.check_ordinary(path)
     with path.open("rb") as file:

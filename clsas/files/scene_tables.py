@@ -451,6 +451,9 @@ class _Image(Table):
             if len(given) > 1 and given[0] in PLAN_KEYS:
                 got = f"also {', '.join(given[1:])}"
                 raise ArgumentError(given[0], "be the only request", got)
+            if set(EXACT_KEYS) <= set(given):
+                allowed = "be left out with both `taps` and `upsampling`, which determine it"
+                raise ArgumentError("accuracy_db", allowed)
         if self.beam is not None:
             options["beam"] = self.beam.build()
         return options

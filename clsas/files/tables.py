@@ -51,7 +51,8 @@ class Table(BaseModel):
     def given(self) -> dict[str, Any]:
         """Return the keys that the file sets, after checking those that are declared."""
         given = {name: getattr(self, name) for name in self.model_fields_set}
-        return given | check_declared(type(self), given)
+        limited = {name: given[name] for name in declared(type(self)) if name in given}
+        return given | check_declared(type(self), limited)
 
     def options(self) -> dict[str, Any]:
         """Return the keys that the file sets, for a function of the library."""
@@ -73,13 +74,15 @@ def keys_of(
     **types : type
         Types of keys in TOML, where the kind of the declaration does not determine it.
     """
+    known = declared(source)
+    if unknown := {*names, *types} - known.keys():
+        raise LookupError(f"{source.__qualname__} declares no {', '.join(sorted(unknown))}")
 
     def decorate(table: type[_Table]) -> type[_Table]:
-        fields = {
-            name: (Annotated[types.get(name) or _type_of(what), what], _default_of(source, name))
-            for name, what in declared(source).items()
-            if name in (names or declared(source))
-        }
+        fields = {}
+        for name in names or known:
+            kind = types.get(name) or _type_of(known[name])
+            fields[name] = Annotated[kind, known[name]], _default_of(source, name)
         made: type[_Table] = create_model(
             table.__name__, __base__=table, __doc__=table.__doc__, __module__=table.__module__,
             **fields,
@@ -117,7 +120,7 @@ def located(where: str) -> Iterator[None]:
     except ArgumentError as error:
         raise error.within(where) from None
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{where} {error}") from None
+        raise ValueError(f"{where} {error}") from error
 
 
 def closest(name: str, allowed: Sequence[str]) -> list[str]:

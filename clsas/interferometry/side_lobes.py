@@ -21,7 +21,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.signal import fftconvolve
 
 from clsas.engine.data.beam import track_directions
 from clsas.engine.data.geometry import bistatic_range_m
@@ -67,6 +66,8 @@ def from_elsewhere(
         return np.zeros(power.shape, bool)
     beyond = response / own
     beyond[inside] = 0.0
+    from scipy.signal import fftconvolve  # slow to import
+
     received = window.sums(fftconvolve(power, beyond, mode="same"))
     found: NDArray[np.bool_] = received > _MOST_FROM_ELSEWHERE * window.sums(power)
     return found

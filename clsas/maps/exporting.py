@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Set
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
@@ -28,14 +29,7 @@ from clsas.plot.canvas import COLOUR_MAP, DYNAMIC_RANGE_DB
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.plot.canvas import save as save_picture
 
-SUFFIXES = (*geotiff.SUFFIXES, *netcdf.SUFFIXES, *sicd.SUFFIXES, *PICTURES)
-"""Suffixes of the files that `clsas.export` writes."""
-
-HEIGHT_SUFFIXES = (*geotiff.SUFFIXES, *netcdf.SUFFIXES, *PICTURES)
-"""Those that it writes for heights."""
-
-_COLOURS = {"dynamic_range_db", "reference", "colour_map"}
-_ORIGIN = {"plan", "lines"}
+_Opened = Image | Store | Heights
 
 
 def export(
@@ -196,18 +190,22 @@ def export(
     validate.instance("georeference", georeference, Georeference, type(None))
     validate.progress(progress)
     opened = _opened(source)
+    chosen = next((each for each in _FORMATS if suffix in each.suffixes), None)
     # A folder shows the image of a mosaic of heights.
     of_heights = isinstance(opened, Heights) or (
         isinstance(opened, Store) and bool(suffix) and bool(opened.layers)
     )
-    if of_heights and suffix not in HEIGHT_SUFFIXES:
-        allowed = f"end in {' or '.join(HEIGHT_SUFFIXES)} for heights"
+    if of_heights and (chosen is None or chosen.of_heights is None):
+        suffixes = [
+            end for each in _FORMATS if each.of_heights is not None for end in each.suffixes
+        ]
+        allowed = f"end in {' or '.join(suffixes)} for heights"
         raise ArgumentError("path", allowed, validate.shown(str(path)))
-    options.check_used(suffix, of_heights=of_heights)
-    if not suffix:
+    options.check_used(suffix, chosen, of_heights=of_heights)
+    if chosen is None:
         assert not isinstance(opened, Heights)  # they have been refused
         name = "image"
-        if not isinstance(source, Image | Store | Heights):
+        if not isinstance(source, _Opened):
             name = validate.printable(validate.path("source", source).resolve().name)
         viewer.write(
             opened,
@@ -221,28 +219,9 @@ def export(
         return
     found = Source.of(opened, georeference)
     found.check_finished()
-    if suffix in PICTURES:
-        _write_picture(path, opened, found, options)
-        return
-    tags = _tags(found, options)
-    if suffix in geotiff.SUFFIXES:
-        geotiff.write(
-            path,
-            found,
-            kind=options.kind or "db",
-            reference=options.reference,
-            dynamic_range_db=options.dynamic_range_db or DYNAMIC_RANGE_DB,
-            colour_map=options.colour_map or COLOUR_MAP,
-            north_up=options.north_up,
-            pixel_m=options.pixel_m,
-            tags={k: v if isinstance(v, str) else f"{v:.12g}" for k, v in tags.items()},
-            progress=progress,
-        )
-    elif suffix in netcdf.SUFFIXES:
-        netcdf.write(path, found, tags)
-    else:
-        sicd.write(path, found, options.lines, options.beam, tags, progress)
-    remove_sidecars(path)
+    chosen.write(path, opened, found, options, progress)
+    if chosen.suffixes != PICTURES:  # which remove them before they write their own
+        remove_sidecars(path)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,31 +277,18 @@ class ExportOptions:
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         return {name: v for name, v in values.items() if v is not None and v is not False}
 
-    def check_used(self, suffix: str, *, of_heights: bool) -> None:
-        """Raise ValueError if an option has no effect on the format of a suffix; "" is a folder."""
-        what = suffix
-        if of_heights:  # whose numbers are neither levels nor complex
-            what = f"{suffix} of heights"
-            if suffix in PICTURES:
-                used = {"colour_map"}
-            elif suffix in netcdf.SUFFIXES:
-                used = {"lines"}
-            else:
-                used = {"lines", "north_up"}
-        elif not suffix:
-            used = {"dynamic_range_db", "colour_map"}
+    def check_used(self, suffix: str, chosen: _Format | None, *, of_heights: bool) -> None:
+        """Raise ValueError if an option has no effect on a format; None is a folder."""
+        used: Set[str] = {"dynamic_range_db", "colour_map"}
+        if chosen is None:
             what = "a folder, as `path` is without a suffix"
-        elif suffix in PICTURES:
-            used = _COLOURS | {"north_arrow", "scale_bar"}
-        elif suffix in netcdf.SUFFIXES:
-            used = _ORIGIN
-        elif suffix in sicd.SUFFIXES:
-            used = _ORIGIN | {"beam"}
+        elif of_heights:  # whose numbers are neither levels nor complex
+            used, what = chosen.of_heights or set(), f"{suffix} of heights"
         else:
+            used, what = chosen.options, suffix
+        if "kind" in used:
             kind = self.kind or "db"
-            what = f"{suffix} with `kind={kind!r}`"
-            used = _ORIGIN | {"kind", "north_up"}
-            used |= {"8bit": _COLOURS, "complex": set()}.get(kind, {"reference"})
+            used, what = used | _OF_KIND[kind], f"{suffix} with `kind={kind!r}`"
         if self.north_up and "north_up" in used:
             used = used | {"pixel_m"}
 
@@ -345,7 +311,7 @@ def check_name(name: str, path: Path) -> None:
 
 def _opened(source: Image | Store | Heights | str | os.PathLike) -> Image | Store | Heights:
     """Return an image, a store or heights, read from a path if one is given."""
-    if isinstance(source, Image | Store | Heights):
+    if isinstance(source, _Opened):
         return source
     path = validate.path("source", source)
     if path.is_dir():
@@ -359,8 +325,38 @@ def _opened(source: Image | Store | Heights | str | os.PathLike) -> Image | Stor
     return found
 
 
+def _write_geotiff(
+    path: Path, _: _Opened, source: Source, options: ExportOptions, progress: Progress | None
+) -> None:
+    tags = _tags(source, options)
+    geotiff.write(
+        path,
+        source,
+        kind=options.kind or "db",
+        reference=options.reference,
+        dynamic_range_db=options.dynamic_range_db or DYNAMIC_RANGE_DB,
+        colour_map=options.colour_map or COLOUR_MAP,
+        north_up=options.north_up,
+        pixel_m=options.pixel_m,
+        tags={k: v if isinstance(v, str) else f"{v:.12g}" for k, v in tags.items()},
+        progress=progress,
+    )
+
+
+def _write_netcdf(
+    path: Path, _: _Opened, source: Source, options: ExportOptions, __: Progress | None
+) -> None:
+    netcdf.write(path, source, _tags(source, options))
+
+
+def _write_sicd(
+    path: Path, _: _Opened, source: Source, options: ExportOptions, progress: Progress | None
+) -> None:
+    sicd.write(path, source, options.lines, options.beam, _tags(source, options), progress)
+
+
 def _write_picture(
-    path: Path, opened: Image | Store | Heights, source: Source, options: ExportOptions
+    path: Path, opened: _Opened, source: Source, options: ExportOptions, _: Progress | None
 ) -> None:
     """Write a picture of an image or of heights, with the georeference of the export."""
     place = source.grid.georeference
@@ -429,3 +425,48 @@ def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
                 "X_AXIS_HEADING_DEG": place.heading_deg,
             }
     return {name: value for name, value in known.items() if value is not None}
+
+
+class _Format(NamedTuple):
+    """A format of files.
+
+    Attributes
+    ----------
+    suffixes : tuple of str
+    write : callable
+        Writes what is exported, which `Source` reads window by window.
+    options : set of str
+        Options that have an effect on it.
+    of_heights : set of str or None
+        The same for heights; None if it has no heights.
+    """
+
+    suffixes: tuple[str, ...]
+    write: Callable[[Path, _Opened, Source, ExportOptions, Progress | None], None]
+    options: Set[str]
+    of_heights: Set[str] | None
+
+
+_COLOURS = {"dynamic_range_db", "reference", "colour_map"}
+_OF_KIND: dict[str, Set[str]] = {"db": {"reference"}, "complex": set(), "8bit": _COLOURS}
+"""Further options of formats with kinds of pixels, by kind."""
+
+_FORMATS = (
+    _Format(
+        geotiff.SUFFIXES,
+        _write_geotiff,
+        options={"plan", "lines", "kind", "north_up"},
+        of_heights={"lines", "north_up"},
+    ),
+    _Format(netcdf.SUFFIXES, _write_netcdf, options={"plan", "lines"}, of_heights={"lines"}),
+    _Format(sicd.SUFFIXES, _write_sicd, options={"plan", "lines", "beam"}, of_heights=None),
+    _Format(
+        PICTURES,
+        _write_picture,
+        options=_COLOURS | {"north_arrow", "scale_bar"},
+        of_heights={"colour_map"},
+    ),
+)
+
+SUFFIXES = tuple(suffix for each in _FORMATS for suffix in each.suffixes)
+"""Suffixes of the files that `clsas.export` writes."""

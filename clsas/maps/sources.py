@@ -131,8 +131,10 @@ class Source:
 
     def check_finished(self) -> None:
         """Raise ValueError if patches of the store are missing or damaged."""
+        if self.store is None:
+            return
         patches = math.prod(self.counts)
-        if self.store is not None and len(self.records) < patches:
+        if len(self.records) < patches:
             raise ArgumentError(
                 "source",
                 f"be finished, but {len(self.records)} of the {patches} patches of "

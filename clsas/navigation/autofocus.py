@@ -126,8 +126,8 @@ def autofocus(
         At least ten pings, monostatic, bistatic, or of an array. Of several receiver banks, the
         first one is focused, and all of them are corrected.
     grid : Grid
-        Pixels among which responses are searched. Part of the scene is enough if it has a few dozen
-        bright responses.
+        Pixels among which responses are searched. Part of the scene is enough if it has a dozen or
+        so bright responses.
     beam : BeamWindow, optional
         Weights of the channels.
     unknowns : sequence of {"sway", "heave", "surge"}

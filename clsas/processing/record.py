@@ -80,7 +80,7 @@ class Recording:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields to pickle, without lines that were read: they are read again."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def read(self) -> RangeLines:
         """Return the lines; echoes are compressed.

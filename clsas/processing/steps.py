@@ -96,10 +96,7 @@ class Job:
 
     @property
     def title(self) -> str:
-        """Title of pictures, with the steps that corrected the lines.
-
-        The folder may still have lines of steps that the scene now leaves out.
-        """
+        """Title of pictures, with the steps that corrected the lines."""
         if not self.corrections:
             return "Uncorrected recording"
         return f"After {', '.join(self.corrections)}"

@@ -187,7 +187,12 @@ def simulate(
     validate.instance("sonar", sonar, Sonar)
     validate.instance("track", track, Track)
     validate.progress(progress)
-    check_declared(simulate, locals())
+    options = {
+        "spreading": spreading, "motion_in_flight": motion_in_flight,
+        "element_pattern": element_pattern, "phase_centres": phase_centres, "range_m": range_m,
+        "snr_db": snr_db, "seed": seed,
+    }  # fmt: skip
+    check_declared(simulate, options)
     validate.instance("pointing", pointing, Pointing, type(None))
     validate.instance("sound_speed", sound_speed, SoundSpeed, type(None))
     check_size(sonar, track, range_m)

@@ -12,6 +12,7 @@ from stores import LINES, PLANE
 
 import clsas
 from clsas.cli import main
+from clsas.maps.exporting import SUFFIXES
 
 rasterio = pytest.importorskip("rasterio")
 
@@ -91,7 +92,7 @@ def test_options_place_an_image(folder):
         ),
         (("image.h5", "a.tif", "--crs", "EPSG:32632"), 1,
          "--crs (or --origin) must be left out"),
-        (("image.h5", "a.bmp"), 2, "must end in .tif or .tiff or .nc or .nitf or .ntf or .png"),
+        (("image.h5", "a.bmp"), 2, f"must end in {' or '.join(SUFFIXES)}"),
         (("image.h5", "a.nc", "--as", "db"), 1, "--as must be left out"),
         (("image.h5", "a.tif", "--plan", "image.h5"), 1, "image.h5 must be a plan of"),
         (("image.h5", "a.tif", "--plan", "bad.json"), 1, "bad.json must be a plan of"),

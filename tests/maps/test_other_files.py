@@ -38,6 +38,19 @@ def test_netcdf_has_a_history_and_is_reproducible(tmp_path, monkeypatch):
     assert path.read_bytes() == first
 
 
+@pytest.mark.parametrize("shape", [(6,), (6, 1), (3, 2, 1)])
+def test_images_on_points_become_netcdf_and_nothing_else(shape, tmp_path):
+    points_m = np.random.default_rng(1).uniform(0, 1, (*shape, 3))
+    image = clsas.Image(np.ones(shape, np.complex64), clsas.Grid.points(points_m))
+    clsas.export(image, tmp_path / "a.nc")
+    with xarray.open_dataset(tmp_path / "a.nc") as found:
+        assert found["pixels_real"].size == 6
+    for name in ("a.tif", "a.nitf", "a.png"):
+        with pytest.raises(ValueError, match="points|plane|georeference"):
+            clsas.export(image, tmp_path / name)
+        assert not (tmp_path / name).exists()
+
+
 def test_netcdf_says_how_the_image_was_formed(tmp_path):
     track_m = np.outer(np.arange(64), [0.02, 0, 0])
     point = clsas.PointTargets([[0.6, 20, 0]])

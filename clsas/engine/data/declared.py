@@ -215,15 +215,14 @@ def limits_in_words(what: Declared) -> str:
         return limits_in_words(what.each)
     if not isinstance(what, Number | Count | Span):
         return ""
-    limits = {name: getattr(what, name, None) for name in ("least", "above", "below", "most")}
-    # Limits that only keep numbers finite, and that of counts, tell users nothing.
-    worth = {
-        name: f"{limit:.3g}"
-        for name, limit in limits.items()
-        if limit is not None and (limit == 0 or _TINY < abs(limit) < _HUGE)
-    }
-    if isinstance(what, Count) and what.least == 1:
-        del worth["least"]
+    worth = {}
+    for name in ("least", "above", "below", "most"):
+        limit = getattr(what, name, None)
+        # Limits that only keep numbers finite, and the least count, tell users nothing.
+        is_least_count = isinstance(what, Count) and name == "least" and limit == 1
+        if limit is None or is_least_count or not (limit == 0 or _TINY < abs(limit) < _HUGE):
+            continue
+        worth[name] = f"{limit:.0f}" if limit == int(limit) else f"{limit:.3g}"
     if worth.keys() == {"least", "most"}:
         return f"{worth['least']} to {worth['most']}"
     if worth == {"above": "0"}:
@@ -233,16 +232,17 @@ def limits_in_words(what: Declared) -> str:
 
 
 def check_declared(source: Callable[..., Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the given values of the arguments that a class or function declares, checked."""
+    """Return values of arguments that a class or function declares, checked, in their order."""
     checked = {}
-    for name, (kind, what) in _typed(source).items():
-        if name in given:
-            left_out = given[name] is None and type(None) in get_args(kind)
-            checked[name] = None if left_out else what.check(name, given[name])
+    for name, value in given.items():
+        kind, what = _typed(source)[name]
+        left_out = value is None and type(None) in get_args(kind)
+        checked[name] = None if left_out else what.check(name, value)
     return checked
 
 
 def check_fields(instance: object) -> None:
     """Check the fields that a frozen dataclass declares, and replace them by what was checked."""
-    for name, value in check_declared(type(instance), vars(instance)).items():
+    given = {name: getattr(instance, name) for name in declared(type(instance))}
+    for name, value in check_declared(type(instance), given).items():
         object.__setattr__(instance, name, value)

@@ -152,7 +152,7 @@ def test_fields_without_declaration_stay_as_they_are():
 
 
 def test_parameters_of_functions_are_checked_where_given():
-    assert check_declared(function, {"taps": np.int8(3), "shape": None, "free": 1}) == {
+    assert check_declared(function, {"taps": np.int8(3), "shape": None}) == {
         "taps": 3,
         "shape": None,
     }
