@@ -474,7 +474,7 @@ def test_a_track_file_that_is_no_text(tmp_path):
         ),
         (
             "[image]\naccuracy_db = -60\ntaps = 4\nupsampling = 2",
-            "[image] accuracy_db must be left",
+            "accuracy_db must be left",
         ),
         ("[compress]\nwindow = 'foo'", "[compress] window must be 'none' or a window of SciPy"),
         ("[compress]\nwindow = []", "[compress] window must be 'none' or a window of SciPy"),

@@ -46,7 +46,7 @@ def test_images_on_points_become_netcdf_and_nothing_else(shape, tmp_path):
     with xarray.open_dataset(tmp_path / "a.nc") as found:
         assert found["pixels_real"].size == 6
     for name in ("a.tif", "a.nitf", "a.png"):
-        with pytest.raises(ValueError, match="points|plane|georeference"):
+        with pytest.raises(ValueError, match=r"points|plane|georeference"):
             clsas.export(image, tmp_path / name)
         assert not (tmp_path / name).exists()
 
