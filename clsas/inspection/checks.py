@@ -15,7 +15,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
-from scipy.signal.windows import hann
 
 from clsas.engine.data import decibels
 from clsas.engine.data.beam import BeamWindow
@@ -248,6 +247,8 @@ def _constant_share(samples: NDArray, frequency: float) -> float:
     beside it counts. The share is 0 unless the frequency stands out like a spectral line.
     """
     count = len(samples)
+    from scipy.signal.windows import hann  # slow to import
+
     window = hann(count, sym=False)
     offsets = np.arange(-_BESIDE, _BESIDE + 1)
     turns = np.exp(-2j * np.pi * np.outer(frequency + offsets / count, np.arange(count))) * window
