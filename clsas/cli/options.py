@@ -133,9 +133,11 @@ def _help(what: Declared, default: str, beside: str) -> str:
         text += " X,Y is at z = 0."
     if isinstance(what, Names | Positions | Several):
         text += " Repeat the option for several."
-    notes = [limits_in_words(what)] if isinstance(what, Number | Count | Span | Several) else []
-    notes += [f"default: {default}"] if default else []
-    shown = "; ".join(note for note in notes if note)
+    # Click itself lists words to choose from.
+    limits = (
+        "" if isinstance(_kind(what, None).get("type"), click.Choice) else limits_in_words(what)
+    )
+    shown = "; ".join(note for note in (limits, default and f"default: {default}") if note)
     return f"{text} [{shown}]" if shown else text
 
 

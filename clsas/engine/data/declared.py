@@ -213,6 +213,8 @@ def limits_in_words(what: Declared) -> str:
     """Return limits in words, such as "0 to 1"; "" if there are none worth a word."""
     if isinstance(what, Several):
         return limits_in_words(what.each)
+    if isinstance(what, Choice | Names):
+        return ", ".join(map(str, what.allowed))
     if not isinstance(what, Number | Count | Span):
         return ""
     worth = {}
