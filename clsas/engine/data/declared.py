@@ -225,6 +225,8 @@ def limits_in_words(what: Declared) -> str:
         if limit is None or is_least_count or not (limit == 0 or _TINY < abs(limit) < _HUGE):
             continue
         worth[name] = f"{limit:.0f}" if limit == int(limit) else f"{limit:.3g}"
+    if 0 < (getattr(what, "least", None) or 0) <= _TINY:
+        worth = {"above": "0"} | worth
     if worth.keys() == {"least", "most"}:
         return f"{worth['least']} to {worth['most']}"
     if worth == {"above": "0"}:

@@ -208,9 +208,8 @@ def compress(
 
 def _checked_window(name: str, window: Window) -> Window:
     """Return a window if SciPy has it; a list, as TOML has them, becomes a tuple."""
-    window = tuple(window) if isinstance(window, list) else window
     band_window(window, 1.0)
-    return window
+    return tuple(window) if isinstance(window, list) else window
 
 
 WINDOW = Other(_checked_window, help="Window over the band, such as hamming or taylor.")
@@ -239,6 +238,7 @@ def band_window(
         return np.ones_like
     from scipy.signal import get_window  # slow to import
 
+    window = tuple(window) if isinstance(window, list) else window
     count = 4097
     try:
         if not isinstance(window, (str, tuple)):  # SciPy would accept True as a number

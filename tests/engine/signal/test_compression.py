@@ -155,7 +155,7 @@ def test_side_lobes():
     assert hamming == pytest.approx(-42.7, abs=0.5)
     taylor = side_lobe_db(compress(echoes, window="taylor", oversampling=16))
     assert taylor == pytest.approx(-30, abs=0.6)
-    kaiser = side_lobe_db(compress(echoes, window=("kaiser", 8.0), oversampling=16))
+    kaiser = side_lobe_db(compress(echoes, window=["kaiser", 8.0], oversampling=16))
     assert kaiser < -45
 
 
