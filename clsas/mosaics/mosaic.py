@@ -42,9 +42,9 @@ from clsas.engine.device.device import Device
 from clsas.engine.exact.decide import ACCURACY
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import (
+    THESIS_STAGES,
     TOLERANCE_DB,
     Request,
-    checked_pairs,
     planned,
     tolerance_in_db,
 )
@@ -292,7 +292,7 @@ def _checked_request(
     # Convert to plain numbers, since the inputs are stored as JSON.
     for name, value in request.items():
         if name == "stages":
-            request[name] = checked_pairs(value)
+            request[name] = THESIS_STAGES.check(name, value)
         elif not isinstance(value, (int, float)):
             request[name] = float(value)
     return request or {"tolerance_db": TOLERANCE_DB}

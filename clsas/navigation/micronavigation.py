@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -48,6 +48,8 @@ SURGE_SD = Number(
     "m", least=1e-9, most=1e3, help="Standard deviation of the surge in the navigation data."
 )
 """Declare the accuracy of the navigation that is corrected."""
+STEP = Number("m", above=0.0, help="Largest displacement between pings.")
+"""Declares the largest displacement, at most the length of a window."""
 CORRELATION = Number(
     "pings",
     least=0.5,
@@ -124,9 +126,7 @@ def micronavigate(
     unknowns: Annotated[
         Sequence[str], Names(UNKNOWNS, help="Displacements between pings to solve for.")
     ] = UNKNOWNS,
-    most_step_m: Annotated[
-        float, Number("m", above=0.0, help="Largest displacement between pings.")
-    ] = 0.1,
+    most_step_m: Annotated[float, STEP] = 0.1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Micronavigation:
     """Return the track of an array, corrected by echoes that consecutive pings have in common.
@@ -262,7 +262,7 @@ def micronavigate(
     correlation_pings = CORRELATION.check("correlation_pings", pings)
     accuracy = _checked_deviations(array.pings, sway_sd_m, yaw_sd_deg, surge_sd_m)
     longest_m = float(np.diff(swath.edges_m).max())
-    most_step_m = validate.number("most_step_m", most_step_m, "m", above=0.0, most=longest_m)
+    most_step_m = replace(STEP, most=longest_m).check("most_step_m", most_step_m)
     correlator = Correlator(array_lines, swath)
     _check_sizes(array_lines, array, swath, mean_wavelength_m(correlator.readout))
     dead = int((~correlator.live).sum())

@@ -28,6 +28,8 @@ _PER_CHANNEL = (
 GOLDEN = (np.sqrt(5) - 1) / 2
 """Golden ratio minus 1. Modulo 1, its multiples fill [0, 1) evenly, but never in regular steps."""
 
+TAPER = Number("m", above=0.0, help="Fade the lines over this range at either end.")
+"""Declares the length of tapers, of which a line has room for two."""
 STATISTICS = ("mean", "median")
 """Estimates of the background that all pings have in common."""
 
@@ -390,9 +392,7 @@ class RangeLines:
 
     def tapered_ends(
         self,
-        length_m: Annotated[
-            float, Number("m", above=0.0, help="Fade the lines over this range at either end.")
-        ],
+        length_m: Annotated[float, TAPER],
     ) -> RangeLines:
         """Return the lines with both ends faded to zero.
 
@@ -411,7 +411,7 @@ class RangeLines:
             If the length is not a number, or is outside its limits.
         """
         half_m = (self.length - 1) * self.range_step_m / 2
-        length_m = validate.number("length_m", length_m, "m", above=0.0, most=half_m)
+        length_m = replace(TAPER, most=half_m).check("length_m", length_m)
         from_end_m = np.arange(self.length) * self.range_step_m
         from_end_m = np.minimum(from_end_m, from_end_m[::-1])
         taper = np.sin(np.pi / 2 * np.minimum(from_end_m / length_m, 1)) ** 2

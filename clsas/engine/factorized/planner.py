@@ -165,9 +165,19 @@ class Request:
         object.__setattr__(self, name, value)
 
 
-def _checked_stages(name: str, stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return (QR, QI) of every stage."""
-    return checked_pairs(stages)
+def _checked_stages(_: str, stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return (QR, QI) of every stage; raise TypeError or ValueError if one is not allowed."""
+    meaning = "a sequence of (QR, QI)"
+    pairs = [
+        validate.entries("stages", stage, meaning)
+        for stage in validate.entries("stages", stages, meaning)
+    ]
+    if any(len(pair) != 2 for pair in pairs):
+        raise ArgumentTypeError("stages", f"be {meaning}", validate.shown(stages))
+    return [
+        (validate.count("QR of stages", beams), validate.count("QI of stages", divisions))
+        for beams, divisions in pairs
+    ]
 
 
 THESIS_STAGES = Other(
@@ -208,26 +218,11 @@ TOLERANCE_WAVELENGTHS = Number(
 """Declares tolerances in wavelengths."""
 
 
-def checked_pairs(stages: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return (QR, QI) of every stage; raise TypeError or ValueError if one is not allowed."""
-    meaning = "a sequence of (QR, QI)"
-    pairs = [
-        validate.entries("stages", stage, meaning)
-        for stage in validate.entries("stages", stages, meaning)
-    ]
-    if any(len(pair) != 2 for pair in pairs):
-        raise ArgumentTypeError("stages", f"be {meaning}", validate.shown(stages))
-    return [
-        (validate.count("QR of stages", beams), validate.count("QI of stages", divisions))
-        for beams, divisions in pairs
-    ]
-
-
 def _stages_within(
     stages: Sequence[tuple[int, int]], lines: RangeLines, grid: Grid
 ) -> list[tuple[int, int]]:
     """Return (QR, QI) of every stage; raise ValueError if lines or grid do not allow them."""
-    pairs = checked_pairs(stages)
+    pairs: list[tuple[int, int]] = THESIS_STAGES.check("stages", stages)
     if not pairs:
         return pairs
     if not grid.is_planar:
