@@ -179,10 +179,8 @@ def plan(
         depth=depth,
         full_model=full_model,
     )
-    device = open_device(device)
-    scene = request.scene()
-    scene.warn("tolerance_db", request.tolerance_db)
-    return planned(scene, request, device)[0]
+    _, found, _ = planned(request, open_device(device))
+    return found
 
 
 def factorize(
@@ -542,9 +540,7 @@ class Imager:
             scene = scene_of_plan(lines, grid, plan)
         elif tolerance_db is not None:
             request = Request(lines, grid, tolerance_db=tolerance_db, beam=beam)
-            scene = request.scene()
-            scene.warn("tolerance_db", request.tolerance_db)
-            plan, track = planned(scene, request, self.device)
+            scene, plan, track = planned(request, self.device)
             method, warned = plan, not scene.is_reached
         else:
             assert accuracy_db is not None

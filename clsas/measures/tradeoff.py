@@ -247,10 +247,7 @@ def _candidates(
         methods.append((label, "stages", partial(ask, stages=pairs)))
     for label, method, asked_for in methods:
         start = time.perf_counter()
-        asked = asked_for()
-        scene = asked.scene()
-        scene.warn("tolerance_db", asked.tolerance_db, doubts=False)
-        chosen, _ = planned(scene, asked, device)
+        _, chosen, _ = planned(asked_for(), device, doubts=False)
         plan_seconds = time.perf_counter() - start
         if method == "study" and chosen.is_exact:
             continue
@@ -258,8 +255,7 @@ def _candidates(
         yield row, partial(factorize, lines, grid, chosen, device=device)
 
     accuracy_db = min([ACCURACY_DB, *tolerances])
-    asked = ask(stages=[])
-    chosen, _ = planned(asked.scene(), asked, device)
+    _, chosen, _ = planned(ask(stages=[]), device, doubts=False)
     row = replace(_planned_row("exact", "exact", chosen, 0.0), predicted_error_db=accuracy_db)
     yield row, partial(form_exactly, lines, grid, accuracy_db=accuracy_db, beam=beam, device=device)
 

@@ -822,9 +822,7 @@ def _formed(
     before = time.perf_counter()
     available = min(memory_bytes - patch_bytes, device.info.memory_bytes // 2)
     asked = Request(lines, grid, **request, beam=beam, memory_bytes=available)
-    scene = asked.scene()
-    scene.warn("tolerance_db", asked.tolerance_db, doubts=False)
-    chosen, track = planned(scene, asked, device)
+    scene, chosen, track = planned(asked, device, doubts=False)
     # The beam's directions would be most of a record.
     beam = None if chosen.beam is None else replace(chosen.beam, along=None)
     how = {

@@ -57,7 +57,7 @@ def with_sides(
     # A search for such trees that finds one, however slow it is.
     object.__setattr__(request, "choices", Choices(stages=(len(sides),)))
     with mock.patch.object(candidates, "search", return_value=Division(sides, *taps)):
-        return planned(request.scene(), request, scene.device)[0]
+        return planned(request, scene.device)[1]
 
 
 def factors(plan: clsas.Plan) -> str:

@@ -42,7 +42,7 @@ def main() -> None:
         best, plans = found[depth], {}
         for name, some in (("best", {"taps": taps, "depth": depth}), ("chosen", {})):
             request = Request(lines, grid, tolerance_db=tolerance_db, **some)
-            plans[name] = planned(request.scene(), request, device)[0].method
+            plans[name] = planned(request, device)[1].method
         kept, chosen = plans["best"], plans["chosen"]
         is_chosen = chosen.sides and taps == (chosen.align.taps, chosen.aperture.filter.taps)
         seconds = {

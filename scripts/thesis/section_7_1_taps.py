@@ -50,7 +50,7 @@ def interpolated(system: System, taps: int, tolerance_db: float, device: Device)
     request = Request(system.lines, system.grid, tolerance_db=tolerance_db, beam=system.beam)
     # `clsas.plan` offers 4, 6 and 8 taps only.
     object.__setattr__(request, "choices", Choices(aperture_taps=(taps,)))
-    return planned(request.scene(), request, device)[0]
+    return planned(request, device)[1]
 
 
 def plans_of_nearest_beams(system: System, device: Device) -> dict[str, clsas.Plan]:

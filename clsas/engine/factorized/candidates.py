@@ -100,8 +100,9 @@ class Conditions:
 
     Attributes
     ----------
-    tolerance_db : float or None
-        None if stages were given.
+    allowed_db : float or None
+        Error that a factorization may have: what the errors of the lines themselves leave of the
+        tolerance. None if stages were given.
     exact : ExactPrediction
     device : Device
     costs : Costs
@@ -109,7 +110,7 @@ class Conditions:
         Device memory that may be used.
     """
 
-    tolerance_db: float | None
+    allowed_db: float | None
     exact: ExactPrediction
     device: Device
     costs: Costs
@@ -172,9 +173,9 @@ class _Trial:
 
 
 def fastest_plan(
-    roots: SampledRoots, conditions: Conditions, seconds: float, choices: Choices
+    roots: SampledRoots, conditions: Conditions, to_beat_s: float, choices: Choices
 ) -> Outcome:
-    """Return the fastest plan within a tolerance, if it takes less than `seconds`.
+    """Return the fastest plan within a tolerance, if it takes less than `to_beat_s`.
 
     `roots` are the sample points, without a size of roots, within the limits of the beam that
     matter.
@@ -197,9 +198,9 @@ def fastest_plan(
             trial = candidates.with_fewer_stages(trial, division)
             continue
         found, spacing = candidates.predicted(trial, division, filters)
-        if found.predicted_seconds >= seconds:
+        if found.predicted_seconds >= to_beat_s:
             break
-        if found.predicted_error_db > candidates.tolerance_db:
+        if found.predicted_error_db > candidates.allowed_db:
             trial = candidates.more_accurate(trial, spacing, found)
         elif found.memory_bytes > conditions.memory_bytes:
             least_bytes = min(least_bytes, found.memory_bytes)
@@ -216,15 +217,15 @@ class _Candidates:
     """Candidates for a plan of one scene, which share what was found for earlier ones."""
 
     def __init__(self, roots: SampledRoots, conditions: Conditions) -> None:
-        assert conditions.tolerance_db is not None  # with given stages there is nothing to search
+        assert conditions.allowed_db is not None  # with given stages there is nothing to search
         self.roots, self.conditions = roots, conditions
-        self.tolerance_db = conditions.tolerance_db
-        self.allowed = power(self.tolerance_db)
+        self.allowed_db = conditions.allowed_db
+        self.allowed = power(self.allowed_db)
         has_beam = roots.sampled.scene.beam is not None
         # Error power of the edges of the beam, and the least that is reserved for everything but
         # filters and roots.
         self.beam_edges = EDGES_SHARE * self.allowed if has_beam else 0.0
-        terms = kernels.phase_terms_within(self.tolerance_db, kernels.FACTORIZED_PHASE_SHARE)
+        terms = kernels.phase_terms_within(self.allowed_db, kernels.FACTORIZED_PHASE_SHARE)
         of_phases = kernels.phase_error(terms) ** 2
         self.reserved = self.beam_edges + _RESERVED_SHARE * self.allowed + of_phases
         self.margin_db = margin_db(roots)
@@ -431,7 +432,7 @@ def predicted_plan(
     rounded_bands = 2 * aperture.filter.taps if aperture.dimensions == 2 else 0
     errors, phase_terms, half_precision = with_arithmetic(
         roots,
-        conditions.tolerance_db,
+        conditions.allowed_db,
         lines,
         [stage.summed for stage in channels],
         rounded_bands,
@@ -518,11 +519,11 @@ def _plan(
         errors=errors,
     )
     return Plan(
-        tolerance_db=conditions.tolerance_db,
+        tolerance_db=None,  # the planner completes the plan that it chooses
         method=method,
         prediction=prediction,
         beam=scene.beam,
-        lines_digest="",  # the planner completes the plan that it chooses
+        lines_digest="",
         grid_digest="",
     )
 

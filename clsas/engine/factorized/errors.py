@@ -3,7 +3,7 @@
 A candidate is a tree of subimages with filters between its stages. `errors_of_tree` finds what the
 tree itself causes, `with_range_filters` and `with_arithmetic` add the terms of the filters in range
 and of number formats, and choose the cheapest upsampling, polynomials and precision that the
-tolerance leaves room for. The planner adds what the lines themselves cause.
+tolerance leaves room for. `ErrorBudget` lists all terms, and says where each is found.
 """
 
 from __future__ import annotations
@@ -91,8 +91,10 @@ def margin_db(roots: SampledRoots) -> float:
     power: they then depend on the positions of these channels between virtual ones, and relative to
     a step of the beam. They also scatter more if the lines' power lies at few frequencies.
     """
-    scene, power = roots.sampled.scene, roots.sampled.channel_power
-    channels = power.sum() ** 2 / (power @ power) * roots.visible_share(roots.small)
+    scene, of_channels = roots.sampled.scene, roots.sampled.channel_power
+    channels = (
+        of_channels.sum() ** 2 / (of_channels @ of_channels) * roots.visible_share(roots.small)
+    )
     few = _FEW_CHANNELS[scene.beam is not None and scene.beam.jumps]
     return MARGIN_DB + in_db(scene.spectrum.scatter * (1 + few / max(channels, 1.0)))
 
@@ -786,7 +788,7 @@ def uncompensated(
 
 def with_arithmetic(
     roots: SampledRoots,
-    tolerance_db: float | None,
+    allowed_db: float | None,
     lines: UpsampledLines,
     summed: Sequence[float],
     bands: int,
@@ -800,7 +802,8 @@ def with_arithmetic(
     Parameters
     ----------
     roots : SampledRoots
-    tolerance_db : float or None
+    allowed_db : float or None
+        See `Conditions`.
     lines : UpsampledLines
     summed : sequence of float
         Number of channels that a virtual one sums, stage by stage.
@@ -810,15 +813,15 @@ def with_arithmetic(
         False if device, lines or leaves rule out half precision.
     """
     errors = lines.errors
-    if tolerance_db is None:
+    if allowed_db is None:
         terms = kernels.phase_terms_within(errors.total_db, kernels.FACTORIZED_PHASE_SHARE)
         return errors, terms, False
-    terms = kernels.phase_terms_within(tolerance_db, kernels.FACTORIZED_PHASE_SHARE)
+    terms = kernels.phase_terms_within(allowed_db, kernels.FACTORIZED_PHASE_SHARE)
     errors = replace(errors, phases=kernels.phase_error(terms) ** 2)
     if not can_halve:
         return errors, terms, False
     rounding = _half_rounding(roots, summed, bands)
-    if rounding > _ROUNDING_SHARE * power(tolerance_db):
+    if rounding > _ROUNDING_SHARE * power(allowed_db):
         return errors, terms, False
     return replace(errors, half_precision=rounding), terms, True
 

@@ -618,29 +618,32 @@ class ErrorBudget:
     Attributes
     ----------
     exact
-        The interpolation and arithmetic of exact backprojection.
-    range_filters, aperture_filters
-        Interpolation in range and along the aperture, in all stages together.
-    upsampling
-        Filters that upsample the lines.
+        The interpolation and arithmetic of exact backprojection (`predict_exact`).
+    range_filters, upsampling
+        Interpolation in range in all stages together, and the filters that upsample the lines
+        (`with_range_filters`).
+    aperture_filters, spacing, leaves
+        Interpolation along the aperture in all stages together; uneven spacing of virtual channels,
+        with changes of the beam's weights between them; expansion of ranges and weights in the
+        leaves (`errors_of_tree`).
     roots
-        Projection of channels onto the mean track, and rounding in the roots.
-    spacing
-        Uneven spacing of virtual channels, and changes of the beam's weights between them.
-    leaves
-        Expansion of ranges and weights in the leaves.
+        Projection of channels onto the mean track, and rounding in the roots (`root_error`).
     beam_edges
-        Edges of the beam, which are neglected because their weights are small.
-    phases
-        Polynomials for sine and cosine.
-    half_precision
-        Rounding of the lines between stages.
+        Edges of the beam, which are neglected because their weights are small (`trimmed`).
+    phases, half_precision
+        Polynomials for sine and cosine, and rounding of the lines between stages
+        (`with_arithmetic`).
     nearest_beams
-        Plain sums of neighbours, as in THESIS.
+        Plain sums of neighbours, as in THESIS (`nearest_errors`).
     line_ends, aliasing
         Ambiguities of the lines themselves: see `clsas.engine.signal.ambiguity`.
     left_out
         Neglected effects: see `clsas.engine.data.simplify`.
+
+    Notes
+    -----
+    Candidates are compared by all but the last three, with a margin (`margin_db`). `_completed` in
+    the planner adds these to the plan that is chosen.
     """
 
     exact: float = 0.0

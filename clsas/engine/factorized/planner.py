@@ -155,11 +155,6 @@ class Request:
         if self.costs is not None:
             validate.instance("costs", self.costs, Costs)
 
-    def scene(self) -> Scene:
-        """Return the scene, without effects whose errors lie far below the tolerance."""
-        allowed_db = None if self.full_model else self.tolerance_db
-        return Scene.of(self.lines, self.grid, self.beam, allowed_db)
-
     def _set(self, name: str, value: object) -> None:
         """Replace an argument by its checked value."""
         object.__setattr__(self, name, value)
@@ -262,15 +257,19 @@ def _choices(taps: tuple[int, int] | None, depth: int | None) -> Choices | None:
 # The plan
 
 
-def planned(scene: Scene, request: Request, device: Device) -> tuple[Plan, MeanTrack | None]:
-    """Return the plan of a scene, and the mean track if it is a factorization.
+def planned(
+    request: Request, device: Device, *, doubts: bool = True
+) -> tuple[Scene, Plan, MeanTrack | None]:
+    """Return the scene of a request, its plan, and the mean track if that is a factorization.
+
+    Effects whose errors lie far below the tolerance are left out of the scene.
 
     Parameters
     ----------
-    scene : Scene
-        That of the request.
     request : Request
     device : Device
+    doubts : bool
+        Whether to warn of input that cannot be right.
 
     Raises
     ------
@@ -280,8 +279,12 @@ def planned(scene: Scene, request: Request, device: Device) -> tuple[Plan, MeanT
     Warns
     -----
     ClsasWarning
-        If no line adds anything to the image, or the costs of the device cannot be read or stored.
+        For the reasons of `Scene.warn`, if no line adds anything to the image, or if the costs of
+        the device cannot be read or stored.
     """
+    effects_db = None if request.full_model else request.tolerance_db
+    scene = Scene.of(request.lines, request.grid, request.beam, effects_db)
+    scene.warn("tolerance_db", request.tolerance_db, doubts=doubts)
     exact_db, factorized_db = _left_to_methods_db(request.tolerance_db, scene)
     sampled = SampledScene.of(scene, power(request.tolerance_db or 0.0))
     roots = None
@@ -301,7 +304,7 @@ def planned(scene: Scene, request: Request, device: Device) -> tuple[Plan, MeanT
     else:  # an image of zeros needs no search, nor memory
         found, track = exact_plan(scene, conditions, UNREACHED), None
         scene.warn_unreached()
-    return _completed(found, request, scene, costs), track
+    return scene, _completed(found, request, scene, costs), track
 
 
 def _left_to_methods_db(tolerance_db: float | None, scene: Scene) -> tuple[float, float | None]:
@@ -416,7 +419,7 @@ def _completed(found: Plan, request: Request, scene: Scene, costs: KnownCosts) -
 
 
 def _fastest_of_shapes(
-    roots: SampledRoots | None, conditions: Conditions, seconds: float, choices: Choices
+    roots: SampledRoots | None, conditions: Conditions, to_beat_s: float, choices: Choices
 ) -> Outcome:
     """Return the fastest plan with a mean track of any shape: see `fastest_plan`.
 
@@ -427,16 +430,17 @@ def _fastest_of_shapes(
         return Outcome(obstacle=_NO_EXTENT)
     sampled, limits = roots.sampled, roots.limits
     others = shapes_after(sampled.shape)
-    best = _fastest_unless_hindered(sampled, limits, conditions, seconds, choices)
+    best = _fastest_unless_hindered(sampled, limits, conditions, to_beat_s, choices)
     if sampled.shape == "track" and not best.obstacle and not best.is_off_track:
         others = ()
     for shape in others:
         # Another search must pay for itself.
-        to_beat = seconds if best.plan is None else _WORTH * best.plan.predicted_seconds
-        other = sampled.with_shape(shape) if to_beat > _SEARCH_S else None
+        if best.plan is not None:
+            to_beat_s = _WORTH * best.plan.predicted_seconds
+        other = sampled.with_shape(shape) if to_beat_s > _SEARCH_S else None
         if other is None:
             continue
-        found = _fastest_unless_hindered(other, limits, conditions, to_beat - _SEARCH_S, choices)
+        found = _fastest_unless_hindered(other, limits, conditions, to_beat_s - _SEARCH_S, choices)
         if found.plan is not None:
             best = found
         elif best.plan is None:
@@ -452,16 +456,16 @@ def _fastest_unless_hindered(
     sampled: SampledScene,
     limits: tuple[float, float] | None,
     conditions: Conditions,
-    seconds: float,
+    to_beat_s: float,
     choices: Choices,
 ) -> Outcome:
     """Return the fastest plan with one mean track, unless the beam hinders any."""
     hindrance = obstacle(sampled)
     if hindrance:
         return Outcome(obstacle=hindrance)
-    assert conditions.tolerance_db is not None
-    limits = trimmed(sampled, limits, EDGES_SHARE * power(conditions.tolerance_db))
-    return fastest_plan(SampledRoots.of(sampled, limits), conditions, seconds, choices)
+    assert conditions.allowed_db is not None
+    limits = trimmed(sampled, limits, EDGES_SHARE * power(conditions.allowed_db))
+    return fastest_plan(SampledRoots.of(sampled, limits), conditions, to_beat_s, choices)
 
 
 # Plans of given stages: nearest beams, as in chapter 4 of the thesis

@@ -107,7 +107,7 @@ class FactorizedImager:
         pixels = aligned(np.empty, self.scene.grid.shape, np.complex64)
 
         # The device upsamples the lines while the host finds the geometry.
-        uploaded = upload(
+        uploaded = start_upsampling(
             lines, factorization, device, largest, half_precision=factorization.half_precision
         )
         geometry = self.geometry
@@ -188,7 +188,7 @@ class FactorizedImager:
         self._kept_sectors = found
 
 
-def upload(
+def start_upsampling(
     lines: RangeLines,
     factorization: Factorization,
     device: Device,
@@ -256,9 +256,9 @@ def in_enough_precision(
     Parameters
     ----------
     uploaded : DeviceLines
-        The result of `upload`, for the same lines.
+        The result of `start_upsampling`, for the same lines.
     lines, geometry, device, largest
-        See `upload`.
+        See `start_upsampling`.
 
     Warns
     -----
@@ -271,7 +271,7 @@ def in_enough_precision(
     if rms == 0 or _LEAST_HALF <= rms <= _LARGEST_HALF:
         return uploaded
     device.finish()  # kernels may still write to the buffer that is given up
-    single = upload(lines, geometry.factorization, device, largest, half_precision=False)
+    single = start_upsampling(lines, geometry.factorization, device, largest, half_precision=False)
     validate.warn(
         "the lines are kept in single precision, not in half as planned, and need up to twice the "
         "memory: echoes from the grid are too weak compared with the largest sample, "

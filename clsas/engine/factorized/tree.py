@@ -3,6 +3,10 @@
 Factorized backprojection is fast because subimages form a tree, along which subapertures merge from
 stage to stage (McCorkle and Rofheart 1996; Yegulalp 1999; Ulander, Hellsten and Stenström 2003).
 
+A *root* is one of the largest subimages, a *leaf* one of the smallest. All subimages of one size
+are a *level* of the tree, whose lines one *stage* forms. The host prepares roots in *sectors*, and
+the device forms them in *batches*, several to a sector.
+
 `geometry_of` finds what all subimages share: the mean track and its channels. The roots of the tree
 are then prepared in sectors. `sector_of` places the virtual channels of their subimages and finds
 the channels that each combines. `references` computes by how much the raw channels are shifted and
