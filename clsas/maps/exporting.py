@@ -120,9 +120,9 @@ def export(
         If an argument has the wrong type, is outside its limits or has no effect on the format; if
         a GeoTIFF has no georeference, its coordinate reference system is unknown, or its grid is
         vertical or consists of points; if complex pixels would have to be resampled; if heights are
-        to become SICD or a folder; if a mosaic is damaged, not finished, or changes meanwhile; or
-        if the environment variable SOURCE_DATE_EPOCH, which replaces the time in the history of
-        netCDF, is no time.
+        to become SICD or a folder; if a mosaic is damaged, changes meanwhile, or is not finished
+        and not to become a folder; or if the environment variable SOURCE_DATE_EPOCH, which replaces
+        the time in the history of netCDF, is no time.
     FileFormatError
         If the file at `source` does not contain an image or heights.
     ImportError

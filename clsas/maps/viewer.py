@@ -3,6 +3,8 @@
 `write` reads the pixels twice: for the largest amplitude, and for tiles of 8-bit levels at every
 power of two of the pixel size. The page in `clsas/maps/page` draws and colours the tiles; what it
 needs to know beside them, such as how the plane lies on the screen and on Earth, is in `scene.js`.
+The levels of a store are not read: those that mix patches exist only once all patches are finished,
+and a viewer shows unfinished mosaics too.
 
 A page that was opened from a disk may not read files, and may not look into pictures that it shows.
 It may run scripts, so that every tile is a script that hands its levels to the page: compressed by
@@ -163,7 +165,7 @@ def write(
     reference = reference or 1.0
     known = next((grid for grid in grids if grid.georeference is not None), grids[0])
     sides_m = tuple(float(np.linalg.norm(step)) for step in steps_of(known))
-    factors = factors_of(readers[0].shape, (sides_m[0], sides_m[1]))
+    factors = factors_of_scales(readers[0].shape, (sides_m[0], sides_m[1]))
     step_db = max(STEP_DB, range_db / (BRIGHTEST - 1))
     formed = [None if reader.image is None else reader.image.formed for reader in readers]
     scene = {
@@ -293,7 +295,9 @@ def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return vector / np.linalg.norm(vector)
 
 
-def factors_of(shape: tuple[int, int], steps_m: tuple[float, float]) -> dict[int, tuple[int, int]]:
+def factors_of_scales(
+    shape: tuple[int, int], steps_m: tuple[float, float]
+) -> dict[int, tuple[int, int]]:
     """Return pixels of the image along the rows and columns of a tile's pixel, by scale.
 
     Scales are ascending, and the finest has the number of its level in Deep Zoom: the base 2
@@ -446,7 +450,7 @@ class Tiles:
         shape : (rows, columns)
             Shape of the image.
         factors : dict
-            Scales and their factors, as `factors_of` returns them.
+            Scales and their factors, as `factors_of_scales` returns them.
         reference : float
             Amplitude of the brightest level.
         step_db : float

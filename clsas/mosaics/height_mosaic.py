@@ -54,7 +54,7 @@ from clsas.mosaics.mosaic import Mosaic, beam_of_mosaic, inputs_of, warn_of_wind
 from clsas.mosaics.patches import Layout, PatchWindow, aligned_shape, with_margin
 from clsas.mosaics.relief_shadows import mask_shadows, of_shadows
 from clsas.mosaics.store import Store
-from clsas.mosaics.survey import Source, Survey, SurveyVisibility, largest_gap_m, open_survey
+from clsas.mosaics.survey import PatchSource, Survey, SurveyVisibility, largest_gap_m, open_survey
 
 _SIDE = 1024  # pixels along a patch by default, which then takes about 0.6 GiB
 _TRIAL = 512  # largest side of the part of the grid that decides on the windows; arbitrary
@@ -363,7 +363,7 @@ def measure_patch(
     margin: tuple[int, int],
     store: Store,
     window: PatchWindow,
-    _: Source,
+    _: PatchSource,
 ) -> tuple[Record, None]:
     """Measure a patch of a grid with a margin, and write it to the store.
 

@@ -61,7 +61,7 @@ from clsas.mosaics.survey import (
     POLL_S,
     GrowingSurvey,
     Growth,
-    Source,
+    PatchSource,
     Survey,
     SurveyVisibility,
     beam_json,
@@ -217,8 +217,8 @@ def mosaic(
     if client is not None:
         _check_client(client, source, store, device)
     growth = None if follow_s is None else Growth.checked(source, follow_s)
-    opened = None if store is None else Store.at(validate.path("store", store))
-    given, place = beam, None if opened is None else opened.path
+    stored = None if store is None else Store.at(validate.path("store", store))
+    given, place = beam, None if stored is None else stored.path
     beam = beam_of_mosaic(beam, source, place, grows=growth is not None)
     devices = () if client is not None else open_devices(device)
 
@@ -243,28 +243,28 @@ def mosaic(
         else:
             growth = replace(growth, at_end=warn)
 
-    inputs = {} if opened is None else inputs_of(survey, grid, request, beam)
-    stored = None if opened is None else opened.patch_shape
+    inputs = {} if stored is None else inputs_of(survey, grid, request, beam)
+    if patch_shape is None and stored is not None:
+        patch_shape = stored.patch_shape
     if patch_shape is None:
-        patch_shape = stored or _choose_patch_shape(visibility, grid, memory_bytes)
+        patch_shape = _choose_patch_shape(visibility, grid, memory_bytes)
     finished: dict[PatchIndex, Record] = {}
-    if opened is not None:
-        opened.begin(inputs, grid, patch_shape)
-        # Patches to which channels contribute that were added since are formed again.
+    if stored is not None:
+        stored.begin(inputs, grid, patch_shape)
         layout = Layout(grid, patch_shape)
         finished = {
             index: record
-            for index, record in opened.undamaged_records().items()
-            if not visibility.any_channel_from(record.survey_channels, layout.window(index).grid)
+            for index, record in stored.undamaged_records().items()
+            if not _is_outdated(record, layout, index, visibility)
         }
     return Mosaic(
         grid,
         patch_shape,
         finished,
-        _form=partial(form_patch, request, memory_bytes, opened),
-        _complete=None if opened is None else opened.complete_levels,
+        _form=partial(form_patch, request, memory_bytes, stored),
+        _complete=None if stored is None else stored.complete_levels,
         _visibility=visibility,
-        _store=opened,
+        _store=stored,
         _inputs=inputs,
         _devices=devices,
         _client=client,
@@ -458,7 +458,7 @@ class Mosaic:
     grid: Grid
     patch_shape: tuple[int, int]
     finished: dict[PatchIndex, Record]
-    _form: Callable[[PatchWindow, Source], tuple[Record, Image | None]]
+    _form: Callable[[PatchWindow, PatchSource], tuple[Record, Image | None]]
     _complete: Callable[[], object] | None  # called once all patches are finished
     _visibility: SurveyVisibility  # the survey when the mosaic was requested
     _store: Store | None
@@ -515,9 +515,8 @@ class Mosaic:
         survey = GrowingSurvey(self._visibility, self._growth, self._store, self._inputs)
         layout, finished = self._layout, self.finished
         todo = dict.fromkeys(index for index in layout.indices() if index not in finished)
-        # For every patch, the number of channels in the survey when it was last formed or checked.
-        known = {index: record.survey_channels for index, record in finished.items()}
-        checked = survey.channels  # when all patches were last checked
+        records = dict(finished)  # of all patches that were formed, with or without a store
+        checked = survey.channels  # number of channels when all patches were last checked
         executor: Executor
         if self._client is not None:  # a cluster returns only records
             executor, most_running = self._client.get_executor(pure=False), _MOST_ON_CLUSTER
@@ -536,7 +535,6 @@ class Mosaic:
                     with uninterrupted():
                         future = executor.submit(self._form, layout.window(index), source)
                         running[future] = index
-                    known[index] = survey.channels
                 if not running and not todo and survey.has_ended:
                     if self._complete is not None:
                         self._complete()
@@ -548,23 +546,23 @@ class Mosaic:
                     with uninterrupted():
                         index = running.pop(future)
                         record, image = future.result()
+                    records[index] = record
                     if self._store is not None:
                         finished[index] = record
                     yield self._patch(index, record, image)
 
-                # Form patches again if channels that were added later contribute to them. A patch
-                # that is running is checked when it is finished.
-                news = survey.update()
-                busy = set(running.values())
-                for index in known if survey.channels > checked else latest:
-                    if known[index] >= survey.channels or index in busy or index in todo:
-                        continue
-                    if survey.visibility.any_channel_from(known[index], layout.window(index).grid):
-                        todo[index] = None
-                        news = True
-                    known[index] = survey.channels
+                # A patch that is running is checked when it is finished.
+                has_news = survey.update()
+                waiting = todo.keys() | set(running.values())
+                outdated = [
+                    index
+                    for index in (records if survey.channels > checked else latest)
+                    if index not in waiting
+                    and _is_outdated(records[index], layout, index, survey.visibility)
+                ]
                 checked = survey.channels
-                if news:
+                if has_news or outdated:
+                    todo |= dict.fromkeys(outdated)
                     ready = survey.ready(layout, todo)
         finally:
             # If the caller stops early, patches that have been started are still completed.
@@ -653,6 +651,16 @@ class Mosaic:
         return Patch(row, column, rows, columns, grid, record, formed, self._store)
 
 
+def _is_outdated(
+    record: Record, layout: Layout, index: PatchIndex, visibility: SurveyVisibility
+) -> bool:
+    """Return whether channels that were added to the survey change the image of a patch."""
+    before = record.survey_channels
+    return before < visibility.survey.channels and visibility.differs_since(
+        before, record.channels, layout.window(index).grid
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Patch:
     """A finished patch of a mosaic.
@@ -711,7 +719,7 @@ def form_patch(
     memory_bytes: int,
     store: Store | None,
     window: PatchWindow,
-    source: Source,
+    source: PatchSource,
 ) -> tuple[Record, Image | None]:
     """Form one patch and write it to the store.
 
@@ -746,7 +754,7 @@ def _image(
     """Return the image of one patch and the record of how it was formed."""
     start = time.perf_counter()
     survey, visible = visibility.survey, visibility.channels(grid)
-    known: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "survey_channels": survey.channels,
         "device": device.info.label,
         "driver": device.info.driver,
@@ -755,12 +763,12 @@ def _image(
 
     def empty() -> tuple[Record, Image]:
         pixels: NDArray[np.complex64] = np.zeros(grid.shape, np.complex64)
-        return Record(**known, seconds=time.perf_counter() - start), Image(pixels, grid)
+        return Record(**fields, seconds=time.perf_counter() - start), Image(pixels, grid)
 
     if not visible.any():
         return empty()
     lines, missing = survey.read(visible, *visibility.ranges_m(grid))
-    known |= {
+    fields |= {
         "missing_channels": int(np.count_nonzero(missing)),
         "gap_m": largest_gap_m(lines, missing),
         "read_seconds": time.perf_counter() - start,
@@ -780,11 +788,11 @@ def _image(
         # The beam was normalised by the number of channels of this patch instead of all channels.
         scale = np.float32(survey.channels / lines.channels)
         image = replace(image, pixels=scale * image.pixels) if scale != 1 else image
-    known |= how | {
+    fields |= how | {
         "has_pixels": holds_any(image.pixels),
         "seconds": time.perf_counter() - start,
     }
-    return Record(**known), image
+    return Record(**fields), image
 
 
 def _formed(

@@ -407,11 +407,15 @@ class SurveyVisibility:
     @property
     def settled(self) -> int:
         """Number of leading channels whose direction later channels cannot change."""
-        if self.beam is None:
-            return 0  # later channels may receive from any patch
-        if self.beam.along is not None:
-            return self.survey.channels
+        # Without a beam, later channels may receive from any patch.
+        return 0 if self.beam is None else self._settled_of(self.survey.channels)
+
+    def _settled_of(self, channels: int) -> int:
+        """Return how many leading channels of `channels` later ones cannot turn."""
+        if self.beam is None or self.beam.along is not None:
+            return channels
         pings = self.survey.geometry.ping_starts
+        pings = pings[pings < channels]
         later = (self.beam.track_pings or MOST_TRACK_PINGS) // 2 + 1
         return int(pings[-later]) if len(pings) > 2 * later else 0
 
@@ -450,6 +454,22 @@ class SurveyVisibility:
         """Return whether any channel from number `first` on may contribute to a grid."""
         return first < self.survey.channels and bool(self.channels(grid)[first:].any())
 
+    def differs_since(self, channels: int, contributing: int, grid: Grid) -> bool:
+        """Return whether other channels contribute to a grid, or with other weights, than before.
+
+        Parameters
+        ----------
+        channels : int
+            Number of channels that the survey had.
+        contributing : int
+            Number of channels that then contributed to the grid.
+        grid : Grid
+        """
+        found = self.channels(grid)
+        if found[self._settled_of(channels) :].any():
+            return True
+        return bool(np.count_nonzero(found) != contributing)  # a beam may have turned away
+
     def has_passed(self, grid: Grid, settled: int) -> bool:
         """Return whether the beam of the latest settled channel has passed a grid completely."""
         if self.beam is None or self.along is None or self.any_channel_from(settled, grid):
@@ -481,8 +501,9 @@ def bounding_box(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return centre_m + up * (low + high) / 2, np.concatenate([half_m, [up * (high - low) / 2]])
 
 
-Source = SurveyVisibility | tuple[StampedFiles, str | None]
-"""A survey and a beam in this process, or files and JSON by which worker processes open them."""
+PatchSource = SurveyVisibility | tuple[StampedFiles, str | None]
+"""What a patch is formed from: a survey and its beam in this process, or the files and the beam as
+JSON, by which a worker process opens them."""
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,11 @@ import dataclasses
 import sys
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from exactly import prepare
 
 import clsas

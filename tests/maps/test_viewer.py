@@ -18,7 +18,7 @@ from clsas.cli import main
 from clsas.engine.data import atomic
 from clsas.engine.data.image import Formed
 from clsas.maps import viewer
-from clsas.maps.viewer import Tiles, factors_of, fitted_degrees, frame_of, shape_of
+from clsas.maps.viewer import Tiles, factors_of_scales, fitted_degrees, frame_of, shape_of
 from clsas.mosaics.pyramid import BRIGHTEST, NOTHING, eight_bits, pyramid
 
 SHAPE = (700, 1300)
@@ -51,7 +51,7 @@ def scene_of(folder):
 
 def levels_at(folder, shape, scale, image=0, steps_m=(1.0, 1.0)):
     """All levels at one scale of a pyramid, assembled from its tiles."""
-    rows, columns = shape_of(shape, factors_of(shape, steps_m)[scale])
+    rows, columns = shape_of(shape, factors_of_scales(shape, steps_m)[scale])
     found = np.zeros((rows, columns), np.uint8)
     names = {path.name for path in (folder / str(image) / str(scale)).iterdir()}
     for row in range(0, rows, viewer.SIDE):
@@ -104,7 +104,7 @@ def test_coarse_tiles_are_the_levels_of_a_mosaic(tmp_path, monkeypatch):
     monkeypatch.setattr(viewer, "SIDE", 16)
     pixels, shape = speckle((39, 45)), (39, 45)
     largest = float(np.abs(pixels).max())
-    tiles = Tiles(tmp_path, "0", shape, factors_of(shape, (1.0, 1.0)), largest, 0.4)
+    tiles = Tiles(tmp_path, "0", shape, factors_of_scales(shape, (1.0, 1.0)), largest, 0.4)
     tiles.add(slice(0, 39), slice(0, 45), pixels)
     levels = pyramid({"amplitude": np.abs(pixels)}, (2, 4), None)
     for scale, factor in ((6, 1), (5, 2), (4, 4)):
@@ -119,7 +119,7 @@ def test_tiles_do_not_depend_on_windows(tmp_path, shape, steps_m):
     rng = np.random.default_rng(1)
     for name, height, width in (("whole", *shape), ("windows", 401, 300)):
         largest = float(np.abs(pixels).max()) or 1.0
-        tiles = Tiles(tmp_path / name, "0", shape, factors_of(shape, steps_m), largest, 0.4)
+        tiles = Tiles(tmp_path / name, "0", shape, factors_of_scales(shape, steps_m), largest, 0.4)
         windows = [
             (slice(top, min(top + height, shape[0])), slice(left, min(left + width, shape[1])))
             for top in range(0, shape[0], height)
@@ -149,7 +149,7 @@ def test_tiles_do_not_depend_on_windows(tmp_path, shape, steps_m):
     ],
 )
 def test_the_longer_side_of_pixels_is_reduced_last(shape, steps_m, expected):
-    assert factors_of(shape, steps_m) == expected
+    assert factors_of_scales(shape, steps_m) == expected
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 3e38 + 3e38j])
@@ -395,7 +395,7 @@ class TestStore:
         monkeypatch.undo()
         pixels = opened.read()
         found = levels_at(
-            tmp_path / "web" / "tiles", GRID.shape, max(factors_of(GRID.shape, (1.0, 1.0)))
+            tmp_path / "web" / "tiles", GRID.shape, max(factors_of_scales(GRID.shape, (1.0, 1.0)))
         )
         expected = BRIGHTEST + clsas.Image(pixels, GRID).db() / 0.4
         assert np.abs(found - np.maximum(expected, 1)).max() <= 0.51

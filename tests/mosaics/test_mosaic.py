@@ -276,6 +276,21 @@ class TestTheWindowOfTheTracksDirection:
         found = clsas.mosaic(folder, GRID, tmp_path / "a.zarr", **request).image()
         assert relative_error_db(found, image) < -60
 
+    def test_directions_that_later_pings_change(self, folder, tmp_path):
+        """The second file turns away: it adds no echoes, but turns the beam of the last pings."""
+        x_m, y_m = np.minimum(np.arange(60), 39), np.maximum(np.arange(60) - 39, 0)
+        track_m = 0.1 * np.stack([x_m - 20, -y_m, 0 * x_m], axis=1)
+        lines = lines_over(GRID, track_m, carrier_hz=100e3, step_m=0.03)
+        request = dict(self.REQUEST) | {"beam": BeamWindow(8.0, "hann", track_pings=21)}
+        for part in range(3):
+            (folder / f"{part}.h5").unlink()
+        clsas.save(folder / "0.h5", lines.select(slice(0, 40)))
+        clsas.mosaic(folder, GRID, tmp_path / "grown.zarr", **request).image()
+        clsas.save(folder / "1.h5", lines.select(slice(40, 60)))
+        grown = clsas.mosaic(folder, GRID, tmp_path / "grown.zarr", **request).image()
+        at_once = clsas.mosaic(folder, GRID, tmp_path / "at_once.zarr", **request).image()
+        assert relative_error_db(grown, at_once) < -60
+
     def test_long_or_straight_tracks_are_the_same(self, folder, tmp_path):
         lines = dataclasses.replace(self.LINES, tx_m=along_x(60, 0.1), rx_m=along_x(60, 0.1))
         clsas.save(folder / "0.h5", lines.select(slice(0, 20)))
