@@ -40,7 +40,8 @@ class SceneImager:
     warned : bool
         True if the user need not be warned that no line adds anything to the image.
     keep : bool
-        Whether references of exact images are kept for the next one.
+        Whether the geometry of a factorization, or references of exact images, are kept for the
+        next image.
     decision : Decision, optional
         How an exact image is formed, if that is known.
 
@@ -71,7 +72,7 @@ class SceneImager:
             self._exact = ExactImager(scene, self.decision, device, keep=keep)
         else:
             assert isinstance(plan, Plan)
-            self._factorized = FactorizedImager(scene, plan, device, track)
+            self._factorized = FactorizedImager(scene, plan, device, track, keep=keep)
 
     def form(self, lines: RangeLines, progress: Progress | None = None) -> Image:
         """Return the image of lines of the scene's geometry.

@@ -66,8 +66,8 @@ _GROUPS_PER_UNIT = 3  # work-groups per compute unit, at least, so that all end 
 class FactorizedImager:
     """Imager that forms factorized images of any samples of a scene.
 
-    What does not depend on samples is computed for the first image. It is kept for the next ones,
-    except for sectors, or groups of points off a plane, that need much memory.
+    What does not depend on samples is computed for the first image. It may be kept for the next
+    ones, except for sectors, or groups of points off a plane, that need much memory.
 
     Parameters
     ----------
@@ -77,13 +77,22 @@ class FactorizedImager:
     device : Device
     track : MeanTrack, optional
         The mean track, of the shape that the factorization has, if planning has found it.
+    keep : bool
+        Whether sectors and groups are kept for the next image.
     """
 
     def __init__(
-        self, scene: Scene, plan: Plan, device: Device, track: MeanTrack | None = None
+        self,
+        scene: Scene,
+        plan: Plan,
+        device: Device,
+        track: MeanTrack | None = None,
+        *,
+        keep: bool = True,
     ) -> None:
         self.scene, self.plan, self.device = scene, plan, device.for_stages()
         self._track = track
+        self._most_kept_bytes = _MOST_KEPT_BYTES if keep else 0
         self._kept_sectors: list[Sector] | None = None
         self._kept_groups: LeafGroups | None = None
 
@@ -164,7 +173,7 @@ class FactorizedImager:
         if geometry.surface.is_plane:
             return PlaneLeaves(uploaded, geometry, device, work, pixels, allowed_db)
         groups = self._kept_groups or leaf_groups(geometry, device.info.width)
-        if groups.nbytes <= _MOST_KEPT_BYTES:
+        if groups.nbytes <= self._most_kept_bytes:
             self._kept_groups = groups
         return SurfaceLeaves(uploaded, geometry, device, work, pixels, allowed_db, groups)
 
@@ -183,7 +192,7 @@ class FactorizedImager:
             first, count = first + count, min(2 * count, most)
             if found is not None:
                 found.append(sector)
-                if sum(each.nbytes for each in found) > _MOST_KEPT_BYTES:
+                if sum(each.nbytes for each in found) > self._most_kept_bytes:
                     found = None
         self._kept_sectors = found
 
