@@ -30,7 +30,7 @@ from clsas.interferometry.result import Heights
 from clsas.mosaics.store import Store
 from clsas.processing.record import (
     NAME,
-    Recording,
+    RecordingFile,
     StepRecord,
     checked_folder,
     file_digest,
@@ -143,7 +143,7 @@ def process(
     of clsas, its numbers, warnings and files. A step is not run again if it ran before with the
     same inputs, options and version, and its files have not changed. The files of a step appear
     together once it is done, and replace all files that it wrote before. Mosaics of images and of
-    heights continue a store instead.
+    heights continue a store instead. `clsas.export` makes maps of the results.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def process(
     if of_banks:
         with _naming(scene, STEPS[of_banks[0]]):
             check_grid(grid)
-    recording = Recording.of(scene, lines)
+    recording = RecordingFile.of(scene, lines)
     folder = checked_folder(scene, output, recording)
     if not is_installed("matplotlib"):
         validate.warn(
@@ -270,7 +270,7 @@ def _run_steps(
     of_scene: tuple[str, ...],
     scene: SceneFile,
     folder: Path,
-    recording: Recording,
+    recording: RecordingFile,
     records: dict[str, StepRecord],
     device: Device,
     progress: Callable[[str, int, int], None] | None,
@@ -302,7 +302,7 @@ def _run_steps(
             with staging(folder) as staged:
                 job = Job(
                     scene=scene,
-                    folder=staged,
+                    staged=staged,
                     output=folder,
                     given=recording.read,
                     lines=lines,
@@ -349,7 +349,7 @@ def _run_step(
             messages.append(str(each.message))
         else:
             warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
-    files = [file for file in step.files if (job.folder / file).exists()]
+    files = [file for file in step.files if (job.staged / file).exists()]
     return StepRecord(
         name=step.name,
         inputs=inputs,
@@ -357,7 +357,7 @@ def _run_step(
         corrections=job.corrections,
         options=json_able(options),
         numbers=json_able(numbers),
-        files={file: file_digest(job.folder / file) for file in files},
+        files={file: file_digest(job.staged / file) for file in files},
         warnings=tuple(dict.fromkeys(messages)),  # images before and after share theirs
         seconds=time.perf_counter() - start,
         device=job.device.info.label,

@@ -40,7 +40,7 @@ _MARK = f'"format": "{_FORMAT}"'.encode()
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class RecordingFile:
     """Lines to begin with, which are read when they are needed.
 
     Attributes
@@ -59,7 +59,7 @@ class Recording:
     @classmethod
     def of(
         cls, scene: SceneFile, given: RangeLines | Echoes | str | os.PathLike | None
-    ) -> Recording:
+    ) -> RecordingFile:
         """Return the given recording, or that of the scene."""
         options = scene.compress
         if isinstance(given, Echoes):
@@ -115,7 +115,7 @@ def loaded(path: Path, expected: str, *kinds: type) -> Any:
 
 
 def checked_folder(
-    scene: SceneFile, output: str | os.PathLike | None, recording: Recording
+    scene: SceneFile, output: str | os.PathLike | None, recording: RecordingFile
 ) -> Path:
     """Return the given folder, or that of the scene; raise ValueError if it cannot be used."""
     if output is not None:
@@ -170,8 +170,8 @@ class StepRecord:
     inputs : str
         Digest of the inputs, the options and the version of clsas.
     lines : str
-        Digest of the lines that the step began with: that of the recording, or of the last step
-        before it that corrected the lines.
+        State of the lines that the step began with: the digest of the recording, or the `inputs` of
+        the last step before it that corrected the lines.
     corrections : tuple of str
         Steps that had corrected these lines.
     options : dict

@@ -1,6 +1,7 @@
 """Steps of a processing. Each takes lines, writes its files and returns the numbers that it found.
 
-The table `STEPS` at the end says what each step is.
+The table `STEPS` at the end says what each step is. Which of them a scene file runs, and what they
+need there, is said by `checked_steps` in `clsas/files/scene_tables.py`.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ class Job:
     Attributes
     ----------
     scene : SceneFile
-    folder : Path
+    staged : Path
         Folder for the step's files, from which they are moved once the step is done.
     output : Path
         Folder of the processing.
@@ -74,7 +75,7 @@ class Job:
     """
 
     scene: SceneFile
-    folder: Path
+    staged: Path
     output: Path
     given: Callable[[], RangeLines]
     lines: RangeLines
@@ -111,7 +112,7 @@ class Job:
     def draw(self, name: str, draw: Callable[[], Any]) -> None:
         """Write a picture, if matplotlib is installed."""
         if is_installed("matplotlib"):
-            plot.save(draw(), self.folder / name)
+            plot.save(draw(), self.staged / name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +174,7 @@ def request_of(scene: SceneFile) -> dict[str, Any]:
     return scene.request or {"tolerance_db": TOLERANCE_DB}
 
 
-def inspected(job: Job) -> dict[str, Any]:
+def inspect_step(job: Job) -> dict[str, Any]:
     """Inspect the recording, and write the table of findings."""
     scene = job.scene
     found = inspect(
@@ -182,22 +183,22 @@ def inspected(job: Job) -> dict[str, Any]:
     )  # fmt: skip
     for finding in found.findings:
         validate.warn(f"{finding.name}: {finding.message}")
-    with replacing(job.folder / "inspect.txt") as temporary:
+    with replacing(job.staged / "inspect.txt") as temporary:
         temporary.write_text(found.describe() + "\n")
     job.draw("inspect.png", lambda: plot.inspection(found, scene.grid))
     findings = [{"name": each.name, "message": each.message} for each in found.findings]
     return {"geometry": found.geometry, "pings": found.pings, "findings": findings}
 
 
-def calibrated(job: Job) -> dict[str, Any]:
+def calibrate_step(job: Job) -> dict[str, Any]:
     """Find time offset, sound speed and lever arm from known points."""
     options = own_options("calibrate", job.scene)
     found = calibrate_track(job.lines, options.pop("points_m"), **options, progress=job.progress)
-    save(job.folder / "calibrate.h5", found.lines)
+    save(job.staged / "calibrate.h5", found.lines)
     return found.figures
 
 
-def navigated(job: Job) -> dict[str, Any]:
+def navigate_step(job: Job) -> dict[str, Any]:
     """Correct the track with displaced phase centres (micronavigation)."""
     options = own_options("navigate", job.scene)
     found = micronavigate(job.lines, **options, progress=job.progress)
@@ -206,16 +207,16 @@ def navigated(job: Job) -> dict[str, Any]:
     )  # fmt: skip
     columns = {name: getattr(found, name) for name in corrections}
     _write_track(
-        job.folder / "navigate.csv", found.lines, {"heading_rad": found.track.yaw_rad} | columns
+        job.staged / "navigate.csv", found.lines, {"heading_rad": found.track.yaw_rad} | columns
     )
     job.draw("navigate-track.png", lambda: plot.corrections(found))
     range_m = options.get("range_m")
     job.draw("navigate-coherence.png", lambda: plot.coherence(found, range_m=range_m))
-    save(job.folder / "navigate.h5", found.lines)
+    save(job.staged / "navigate.h5", found.lines)
     return found.figures
 
 
-def focused(job: Job) -> dict[str, Any]:
+def focus_step(job: Job) -> dict[str, Any]:
     """Correct the track with the bright responses of an image (autofocus)."""
     found = autofocus(
         job.lines, job.grid, beam=job.beam, **own_options("focus", job.scene), device=job.device,
@@ -226,10 +227,10 @@ def focused(job: Job) -> dict[str, Any]:
         f"correction_{name}_m": found.correction_m[starts, axis] for axis, name in enumerate("xyz")
     }
     columns["correction_sd_m"] = found.correction_sd_m[starts]
-    _write_track(job.folder / "focus.csv", found.lines, columns)
+    _write_track(job.staged / "focus.csv", found.lines, columns)
     job.draw("focus-track.png", lambda: plot.corrections(found))
     job.draw("focus-sharpness.png", lambda: plot.sharpness(found))
-    save(job.folder / "focus.h5", found.lines)
+    save(job.staged / "focus.h5", found.lines)
     return found.figures
 
 
@@ -248,12 +249,12 @@ def _write_track(path: Path, lines: RangeLines, corrections: dict[str, NDArray])
         np.savetxt(temporary, rows, "%.9g", ",", header=",".join(columns), comments="")
 
 
-def paired(job: Job) -> dict[str, Any]:
+def pair_errors_step(job: Job) -> dict[str, Any]:
     """Find phase, delay and roll of the second receiver bank from heights of the first two."""
     first, second = both_banks(job.lines)
     options, of_heights = (own_options(each, job.scene) for each in ("pair_errors", "heights"))
     if is_mosaic("heights", job.scene):
-        with staging(job.folder) as temporary:
+        with staging(job.staged) as temporary:
             found = _height_mosaic(job, temporary / "heights.zarr").sampled_heights()
     else:
         found = _heights(job)
@@ -262,22 +263,22 @@ def paired(job: Job) -> dict[str, Any]:
     errors = pair_errors(first, second, found, beam=job.beam, **options, device=job.device)
     number = first_two_banks(job.lines.bank_numbers)[1]
     corrected = with_bank(job.lines, number, errors.corrected(first, second))
-    save(job.folder / "pair_errors.h5", corrected)
+    save(job.staged / "pair_errors.h5", corrected)
     return errors.figures
 
 
-def imaged(job: Job) -> dict[str, Any]:
+def image_step(job: Job) -> dict[str, Any]:
     """Form the image and, if the lines were corrected, also the image without corrections."""
     if not job.corrections:
         image, error_db = _formed(job, job.lines, 0, 1)
     else:
         before, _ = _formed(job, job.given(), 0, 2)
         image, error_db = _formed(job, job.lines, 1, 2)
-    save(job.folder / "image.h5", image)
+    save(job.staged / "image.h5", image)
     job.draw("image.png", lambda: plot.image_db(image, title=job.title))
     numbers = _figures(image) | {"predicted_error_db": error_db}
     if job.corrections:
-        save(job.folder / "before.h5", before)
+        save(job.staged / "before.h5", before)
         job.draw("before-and-after.png", lambda: plot.before_and_after(before, image))
         numbers["before"] = _figures(before)
     return numbers
@@ -314,7 +315,7 @@ def _figures(image: Image) -> dict[str, Any]:
     }
 
 
-def measured(job: Job) -> dict[str, Any]:
+def heights_step(job: Job) -> dict[str, Any]:
     """Measure the heights of the seabed from the first two receiver banks."""
     described = {}
     if is_mosaic("heights", job.scene):
@@ -323,7 +324,7 @@ def measured(job: Job) -> dict[str, Any]:
         described = {"store": str(path), "inputs": stored_digest(path.resolve())}
     else:
         found = _heights(job)
-        save(job.folder / "heights.h5", found)
+        save(job.staged / "heights.h5", found)
     if found.mask.any():
         job.draw("heights.png", lambda: plot.heights(found, title=job.title))
     return found.figures | described
@@ -353,7 +354,7 @@ def both_banks(lines: RangeLines) -> tuple[RangeLines, RangeLines]:
     return lines.bank(first), lines.bank(second)
 
 
-def joined(job: Job) -> dict[str, Any]:
+def mosaic_step(job: Job) -> dict[str, Any]:
     """Form a mosaic in a Zarr store. Finished patches with the same inputs are kept."""
     request, grid = request_of(job.scene), job.grid
     if ignored := {"taps", "upsampling"} & set(request):
@@ -416,32 +417,32 @@ STEPS = {
     step.name: step
     for step in (
         Step(
-            "inspect", inspected, "[grid]", ("inspect.txt", "inspect.png"),
+            "inspect", inspect_step, "[grid]", ("inspect.txt", "inspect.png"),
             uses=("grid", "beam", "element_length_m"),
         ),
-        Step("calibrate", calibrated, "[process.calibrate]", ("calibrate.h5",)),
+        Step("calibrate", calibrate_step, "[process.calibrate]", ("calibrate.h5",)),
         Step(
-            "navigate", navigated, "[process.navigate]",
+            "navigate", navigate_step, "[process.navigate]",
             ("navigate.csv", "navigate-track.png", "navigate-coherence.png", "navigate.h5"),
         ),
         Step(
-            "focus", focused, "[process.focus]",
+            "focus", focus_step, "[process.focus]",
             ("focus.csv", "focus-track.png", "focus-sharpness.png", "focus.h5"),
             uses=("grid", "beam"),
         ),
         Step(
-            "pair_errors", paired, "[process.pair_errors]", ("pair_errors.h5",),
+            "pair_errors", pair_errors_step, "[process.pair_errors]", ("pair_errors.h5",),
             uses=("grid", "beam", "heights"),
         ),
         Step(
-            "image", imaged, "[image]",
+            "image", image_step, "[image]",
             ("image.h5", "image.png", "before.h5", "before-and-after.png"), uses=_IMAGING,
         ),
         Step(
-            "heights", measured, "[process.heights]", ("heights.h5", "heights.png"),
+            "heights", heights_step, "[process.heights]", ("heights.h5", "heights.png"),
             uses=("grid", "beam"),
         ),
-        Step("mosaic", joined, "[mosaic]", (), uses=_IMAGING),
+        Step("mosaic", mosaic_step, "[mosaic]", (), uses=_IMAGING),
     )
 }  # fmt: skip
 """Steps by name, in the order in which they run."""

@@ -10,7 +10,7 @@ import clsas
 from clsas.engine.data.validate import ClsasWarning
 from clsas.files.scene_files import SceneFile
 from clsas.processing.record import (
-    Recording,
+    RecordingFile,
     StepRecord,
     file_digest,
     read_records,
@@ -96,7 +96,7 @@ LINES = clsas.RangeLines(
     ids=lambda changes: next(iter(changes)),
 )
 def test_lines_in_memory_differ_by_every_field(changes):
-    found = {Recording.of(SCENE, each).digest for each in (LINES, replace(LINES, **changes))}
+    found = {RecordingFile.of(SCENE, each).digest for each in (LINES, replace(LINES, **changes))}
     assert len(found) == 2
 
 
@@ -107,11 +107,11 @@ class TestChain:
     def quick(self, monkeypatch):
         def imaged(job):
             grid = job.scene.grid
-            clsas.save(job.folder / "image.h5", clsas.Image(np.ones(grid.shape, complex), grid))
+            clsas.save(job.staged / "image.h5", clsas.Image(np.ones(grid.shape, complex), grid))
             return {"peak_db": -3.25}
 
         def inspected(job):
-            (job.folder / "inspect.txt").write_text("fine")
+            (job.staged / "inspect.txt").write_text("fine")
             return {}
 
         for name, run in (("image", imaged), ("inspect", inspected)):
