@@ -450,8 +450,8 @@ class _Passes:
                 self._settle(self.later_m)
                 if np.abs(found_m).max() <= _LEAST_SURGE * self.array.spacing_m:
                     break
-        _, array = self._corrected()
-        self.levers_m = self._levers_of(array)
+        _, array, self.overlaps = self._corrected()
+        self.levers_m = _levers_m(array, self.overlaps)
         self.surge_m = np.where(self.coherent, self.surge_m, 0.0)
         self._report(0.0)
 
@@ -472,9 +472,9 @@ class _Passes:
 
     def _pass(self, most_m: float, half_width: float, *, first: bool) -> list[Displacement]:
         """Return the remaining displacements between all pings."""
-        corrected, array = self._corrected()
+        corrected, array, overlaps = self._corrected()
         steps = []
-        for ping, pairs in enumerate(self.overlaps):
+        for ping, pairs in enumerate(overlaps):
             geometry = PairGeometry.of(corrected, array, pairs, self.swath)
             found = self.correlator.correlate(geometry, most_m, half_width)
             steps.append(displacement(found, first=first, yaw=self.yaw))
@@ -486,8 +486,8 @@ class _Passes:
 
         Both are 0 between pings that are not coherent.
         """
-        corrected, array = self._corrected()
-        found = np.zeros((len(self.overlaps), 2))
+        corrected, array, overlaps = self._corrected()
+        found = np.zeros((len(overlaps), 2))
         for ping in np.flatnonzero(self.coherent).tolist():
             pairs = overlap(corrected, array, ping, self.correlator.live)
             if not pairs.pairs:
@@ -504,21 +504,21 @@ class _Passes:
             self._done(ping + 1)
         return found[:, 0], found[:, 1]
 
-    def _corrected(self) -> tuple[RangeLines, Array]:
+    def _corrected(self) -> tuple[RangeLines, Array, list[Overlap]]:
         """Return the lines corrected by everything found so far, and their array.
 
-        The channels are paired anew for the corrected advances.
+        The third result is the pairs of channels, paired anew for the corrected advances.
         """
         surge_m = np.concatenate([[0.0], np.cumsum(self.surge_m)])
         none = np.zeros(self.array.pings)
         advanced = moved(self.lines, self.array, none, none, surge_m)
         array = Array.of(advanced)
-        self.overlaps = self._paired(advanced, array)
+        overlaps = self._paired(advanced, array)
         exact = np.zeros((2, 2))
-        steps = zip(self.moved, self._levers_of(array), strict=True)
+        steps = zip(self.moved, _levers_m(array, overlaps), strict=True)
         states = integrated([Step.over(each, exact, lever) for each, lever in steps], self.accuracy)
         corrected = moved(advanced, array, states[:, 0], states[:, 1], none)
-        return corrected, Array.of(corrected)
+        return corrected, Array.of(corrected), overlaps
 
     def _paired(self, lines: RangeLines, array: Array) -> list[Overlap]:
         """Return the overlaps of all pings; refuse those with too few channels."""
@@ -537,15 +537,6 @@ class _Passes:
             )
         return found
 
-    def _levers_of(self, array: Array) -> list[tuple[float, float]]:
-        """Return the distances from the middles of two arrays forward to that of their overlap."""
-        pivots_m = np.stack([each.pivot_m for each in self.overlaps])
-        first_m, second_m = (
-            np.einsum("pi,pi->p", pivots_m - array.reference_m[pings], array.forward[pings])
-            for pings in (slice(None, -1), slice(1, None))
-        )
-        return list(zip(first_m.tolist(), second_m.tolist(), strict=True))
-
     def _done(self, number: int) -> None:
         """Report that a pass has finished `number` pairs of pings.
 
@@ -563,6 +554,16 @@ class _Passes:
         if self.progress is not None and steps > self.reported:
             self.reported = steps
             self.progress(steps, _PROGRESS)
+
+
+def _levers_m(array: Array, overlaps: Sequence[Overlap]) -> list[tuple[float, float]]:
+    """Return the distances from the middles of two arrays forward to that of their overlap."""
+    pivots_m = np.stack([each.pivot_m for each in overlaps])
+    first_m, second_m = (
+        np.einsum("pi,pi->p", pivots_m - array.reference_m[pings], array.forward[pings])
+        for pings in (slice(None, -1), slice(1, None))
+    )
+    return list(zip(first_m.tolist(), second_m.tolist(), strict=True))
 
 
 def _check_coherence(found: _Passes) -> None:
