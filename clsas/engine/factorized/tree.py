@@ -457,7 +457,8 @@ def visible_stretches(
     -------
     begin, end : float64 [...]
         First and last aperture coordinate. Where a box is visible from an end of the track, that
-        one is infinite; where a box is invisible, both are -inf.
+        one is infinite, because virtual channels lie beyond the ends too. Where a box is invisible,
+        both are -inf.
     """
     shape = centres_m.shape[:-1]
     if limits is None or along is None:

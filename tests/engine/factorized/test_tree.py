@@ -231,7 +231,6 @@ def test_channels_are_as_many_as_planned(wide, wide_plan):
     assert 0.75 <= pixels / wide_plan.stages[-1].operations <= 1.35
 
 
-@pytest.mark.slow
 def test_both_ends_of_the_track_are_alike(wide):
     sector = sector_of(wide, 0, len(wide.roots))
     need = sector.needs[-1]
