@@ -202,7 +202,12 @@ class ExactImager:
         return found
 
     def _keep(self, key: tuple[str, int, int, int, int], arrays: dict[str, NDArray]) -> None:
-        """Keep arrays for the next image, unless all that is kept would take too much memory."""
+        """Keep arrays for the next image, unless all that is kept would take too much memory.
+
+        Nobody may change them any more.
+        """
+        for array in arrays.values():
+            array.flags.writeable = False
         size = sum(array.nbytes for array in arrays.values())
         if size <= self._free_bytes:
             self._kept[key] = arrays
