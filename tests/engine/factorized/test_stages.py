@@ -198,6 +198,10 @@ def test_whatever_the_track_and_the_grid(case, tolerance_db):
     check(case, tolerance_db, None)
 
 
+def test_receivers_that_move_during_flight_off_a_plane():
+    check(hills_while_moving, -65, None)
+
+
 @pytest.mark.parametrize(
     "case", [straight, low_frequency, near, swaying, moving_array], ids=name_of
 )
