@@ -24,7 +24,7 @@ _GROUPS = {
     "Recordings": {
         "simulate": ("lines", "Simulate the echoes that a scene file describes."),
         "compress": ("lines", "Compress echoes into range lines."),
-        "convert": ("lines", "Convert a recording to HDF5 or CPHD."),
+        "convert": ("lines", "Convert a recording to another format."),
         "inspect": ("inspection", "Show what a recording contains, and what is wrong with it."),
         "known-points": (
             "navigation",

@@ -19,10 +19,7 @@ from clsas.engine.factorized.planner import (
     WORST_TOLERANCE_DB,
     tolerance_in_db,
 )
-from clsas.files.cphd import START as CPHD
-from clsas.files.matlab import is_matlab
-
-_HDF5 = b"\x89HDF"
+from clsas.files.formats import format_of
 
 
 @command()
@@ -57,9 +54,7 @@ def assess(
     Example:  clsas assess scene.toml --tolerance-db -40
               clsas assess lines.h5 --scene scene.toml --repeats 5
     """
-    with file.open("rb") as opened:
-        start = opened.read(128)
-    is_lines = start.startswith((_HDF5, CPHD)) or is_matlab(start)
+    is_lines = format_of(file) is not None
     if not is_lines:
         if scene is not None:
             raise click.UsageError(

@@ -14,8 +14,7 @@ from clsas.cli.inputs import check_levels, load, load_lines, read_scene, warn_of
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import HDF5, INPUT, Output
 from clsas.cli.wording import command
-from clsas.files.cphd import SUFFIXES as CPHD
-from clsas.files.formats import SUFFIXES
+from clsas.files.formats import FORMATS, SUFFIXES
 from clsas.measures.density import noise_penalty_db
 from clsas.simulation.simulator import check_size
 
@@ -145,7 +144,7 @@ def convert(
     compensate_density: bool,
     as_json: bool,
 ) -> None:
-    """Convert a recording to HDF5 or CPHD.
+    """Convert a recording to another format.
 
     FILE is an HDF5 file of clsas or AirSAS, a CPHD file, or a MATLAB file with a radar's phase
     history or a full matrix capture. The suffix of OUTPUT decides what is written: HDF5 (.h5) or
@@ -156,9 +155,12 @@ def convert(
     Example:  clsas convert lines.h5 lines.cphd
     """
     start = time.perf_counter()
-    of_lines = of_bank or without_still_pings or background or high_pass or taper
+    of_lines = bool(of_bank or without_still_pings or background or high_pass or taper)
     obj: Any
-    if of_lines or compensate_density or output.suffix.lower() in CPHD:
+    of_lines |= any(
+        each.has_only_lines and output.suffix.lower() in each.suffixes for each in FORMATS
+    )
+    if of_lines or compensate_density:
         obj = load_lines(recording, **of_bank)
     else:
         obj = clsas.load(recording)

@@ -67,9 +67,9 @@ def show(
     """Draw an image, heights, lines, a plan or a recording.
 
     FILE is any file that clsas writes or reads: an image, an interferogram, heights, range lines or
-    echoes in HDF5; a recording as CPHD, AirSAS or MATLAB; a plan that `clsas plan --json --filters`
-    printed; or the Zarr store of a mosaic, which is read patch by patch and may be larger than
-    memory. Its contents decide, not its name.
+    echoes; a recording of any format; a plan that `clsas plan --json --filters` printed; or the
+    Zarr store of a mosaic, which is read patch by patch and may be larger than memory. Its contents
+    decide, not its name.
 
     \b
     Example:  clsas show image.h5 --near 0,42.5 --extent-m 0.2 --db 40

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import h5py
 
@@ -17,9 +21,6 @@ from clsas.files.phase_histories import FIELDS as PHASE_HISTORY
 from clsas.files.phase_histories import phase_history_lines
 from clsas.files.positions import checked
 
-SUFFIXES = (*hdf5.SUFFIXES, *cphd.SUFFIXES)
-"""Suffixes of files that `save` writes."""
-
 
 def load(path: str | os.PathLike) -> Saved:
     """Return the object in a file that `save` wrote, or the range lines of another recording.
@@ -31,8 +32,8 @@ def load(path: str | os.PathLike) -> Saved:
     Parameters
     ----------
     path : path-like
-        The file: HDF5 from clsas or AirSAS, CPHD, or a MATLAB file with a phase history or a full
-        matrix capture.
+        The file, of one of the `FORMATS`: HDF5 from clsas or AirSAS, CPHD, or a MATLAB file with a
+        phase history or a full matrix capture.
 
     Returns
     -------
@@ -64,38 +65,11 @@ def load(path: str | os.PathLike) -> Saved:
     (201, 101)
     """
     path = validate.path("path", path)
-    try:
-        reading.check_ordinary(path)
-    except ValueError as error:
-        raise FileFormatError(str(error)) from None
-    with path.open("rb") as file:
-        start = file.read(128)
-    if not start:
-        raise FileFormatError(f"{path} is empty")
-    if start.startswith(cphd.START):
-        return cphd.read_cphd(path)
-    if matlab.is_matlab(start):
-        variables = matlab.read_matlab(path)
-        for fields, lines_of in (
-            (PHASE_HISTORY, phase_history_lines),
-            (FULL_MATRIX, full_matrix_lines),
-        ):
-            if found := matlab.groups(variables, *fields):
-                return lines_of(path, matlab.only(path, found, *fields))
-        raise FileFormatError(
-            f"{path} must contain one structure with the fields {', '.join(PHASE_HISTORY)} or "
-            f"{', '.join(FULL_MATRIX)}"
-        )
-    if h5py.is_hdf5(path):
-        with hdf5.opened(path) as content:
-            foreign = "format" not in content.attrs and is_airsas(content)
-        if foreign:
-            return read_airsas(path)
-        saved = hdf5.load(path)
-        return checked(path, saved) if isinstance(saved, RangeLines) else saved
-    raise FileFormatError(
-        f"{path} is neither an HDF5 file, nor CPHD, nor a MATLAB file of version 5 to 7"
-    )
+    found = format_of(path)
+    if found is None:
+        names = ", ".join(each.name for each in FORMATS)
+        raise FileFormatError(f"{path} is of none of the formats that clsas reads: {names}")
+    return found.read(path)
 
 
 def save(path: str | os.PathLike, obj: Saved) -> None:
@@ -134,9 +108,98 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     takes as much memory again as the object.
     """
     path = validate.path("path", path)
-    if path.suffix.lower() in cphd.SUFFIXES:
-        validate.instance("obj", obj, RangeLines)
-        assert isinstance(obj, RangeLines)  # for type checkers
-        cphd.write_cphd(path, obj)
-    else:
-        hdf5.save(path, obj)
+    validate.suffix("path", path, *SUFFIXES)
+    for each in FORMATS:
+        if path.suffix.lower() in each.suffixes:
+            if each.has_only_lines:
+                validate.instance("obj", obj, RangeLines)
+            assert each.write is not None
+            each.write(path, obj)
+            return
+    hdf5.save(path, obj)
+
+
+def format_of(path: Path) -> Format | None:
+    """Return the format of a file by its contents, or None if it is none of the `FORMATS`.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is empty, a device, a pipe or a socket.
+    OSError
+        If the file does not exist or cannot be read.
+    """
+    try:
+        reading.check_ordinary(path)
+    except ValueError as error:
+        raise FileFormatError(str(error)) from None
+    with path.open("rb") as file:
+        start = file.read(128)
+    if not start:
+        raise FileFormatError(f"{path} is empty")
+    return next((each for each in FORMATS if each.is_of(path, start)), None)
+
+
+def _read_hdf5(path: Path) -> Saved:
+    with hdf5.opened(path) as content:
+        foreign = "format" not in content.attrs and is_airsas(content)
+    if foreign:
+        return read_airsas(path)
+    saved = hdf5.load(path)
+    return checked(path, saved) if isinstance(saved, RangeLines) else saved
+
+
+def _read_matlab(path: Path) -> RangeLines:
+    variables = matlab.read_matlab(path)
+    for fields, lines_of in (
+        (PHASE_HISTORY, phase_history_lines),
+        (FULL_MATRIX, full_matrix_lines),
+    ):
+        if found := matlab.groups(variables, *fields):
+            return lines_of(path, matlab.only(path, found, *fields))
+    raise FileFormatError(
+        f"{path} must contain one structure with the fields {', '.join(PHASE_HISTORY)} or "
+        f"{', '.join(FULL_MATRIX)}"
+    )
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of files.
+
+    Attributes
+    ----------
+    name : str
+        Name in messages, help texts and the documentation.
+    is_of : callable
+        Called as is_of(path, its first 128 bytes); returns whether a file is of this format.
+    read : callable
+        Called with the path; returns the object.
+    suffixes : tuple of str
+        Suffixes of files that `save` writes in this format.
+    write : callable or None
+        Called as write(path, object).
+    has_only_lines : bool
+        True if `write` takes nothing but range lines.
+    """
+
+    name: str
+    is_of: Callable[[Path, bytes], bool]
+    read: Callable[[Path], Saved]
+    suffixes: tuple[str, ...] = ()
+    write: Callable[[Path, Any], None] | None = None
+    has_only_lines: bool = False
+
+
+FORMATS = (
+    Format(
+        "CPHD", lambda _, start: start.startswith(cphd.START), cphd.read_cphd,
+        cphd.SUFFIXES, cphd.write_cphd, has_only_lines=True,
+    ),
+    Format("MATLAB 5 to 7", lambda _, start: matlab.is_matlab(start), _read_matlab),
+    Format("HDF5", lambda path, _: h5py.is_hdf5(path), _read_hdf5, hdf5.SUFFIXES, hdf5.save),
+)  # fmt: skip
+"""Formats that `load` reads and `save` writes. A file is of the first that recognizes it."""
+
+SUFFIXES = tuple(suffix for each in FORMATS[::-1] for suffix in each.suffixes)
+"""Suffixes of files that `save` writes."""

@@ -554,7 +554,7 @@ FIXED = ["--taps", "4", "--upsampling", "2"]
         (
             ["quality", "image.h5", "--reference", "scene.toml"],
             1,
-            "scene.toml is neither an HDF5 file, nor",
+            "scene.toml is of none of the formats",
         ),
         (["quality", "scene.toml"], 2, "IMAGE.H5 is missing, scene.toml is a scene: clsas quality"),
         (

@@ -256,7 +256,7 @@ def test_a_mosaic_is_read_patch_by_patch(store, monkeypatch):
         (["short.json"], 1, "must be a plan of `clsas plan --json --filters`: it lacks 'digest'"),
         (["scene.toml"], 1, "scene.toml is a scene"),
         (["grid.h5"], 1, "must hold an image, range lines or echoes, got only a grid"),
-        (["text.h5"], 1, "text.h5 is neither an HDF5 file, nor CPHD"),
+        (["text.h5"], 1, "text.h5 is of none of the formats that clsas reads"),
         (["."], 1, "is not a mosaic of clsas"),
     ],
 )
