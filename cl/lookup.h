@@ -11,7 +11,7 @@
  *
  * Build options
  *   PERMUTE  vectors from which lanes pick, 1 or 2 (2 with AVX-512), or 0.
- *   TAPS     samples per interpolation: 2, 4, 6 or 8.
+ *   TAPS     samples per interpolation, an even number.
  *   WINDOWS  windows for the blocks of a work-item: 1, 2 or 4. Without HAS_PICK there are none, and it counts as 1.
  */
 

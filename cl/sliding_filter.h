@@ -12,6 +12,9 @@
 
 #if defined(__clang__) && WIDTH >= 8
 #define SLIDING
+#if TAPS > 8
+#error "TAPS must be at most 8"
+#endif
 
 /* The WIDTH samples from number t on of the 2 WIDTH in two vectors. */
 #if AVX == 256

@@ -11,11 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.signal import interpolation
-from clsas.engine.signal.interpolation import PHASES, Gain, Interpolator
+from clsas.engine.signal.interpolation import PHASES, TAPS, Gain, Interpolator
 from clsas.engine.signal.spectrum import Spectrum
 
 ALIGN_TAPS = APERTURE_TAPS = (4, 6, 8)
-_FINAL_TAPS = (2, 4, 6, 8)
 UPSAMPLING_SHARE = 0.03
 """Share of an image's error power that upsampling filters may add."""
 LONGEST_UPSAMPLING_SHARE = 0.2
@@ -48,8 +47,9 @@ def choose(
 ) -> FilterRates | None:
     """Return the lowest rates at which the joint error of all interpolations is at most `most_db`.
 
-    There are two interpolations in each stage, three on a sheet, and one at the end. The result is
-    None if no rate suffices.
+    There are two interpolations in each stage, three on a sheet, and one at the end. All may err as
+    much. The one at the end reads the same samples as those in range before it, so that it never
+    needs more taps. The result is None if no rate suffices.
     """
     each_db = most_db - 10 * math.log10(stages + interpolations(stages, dimensions) + 1)
     upsampling = _least_rate(align_taps, each_db, spectrum, "scatter_db")
@@ -58,7 +58,7 @@ def choose(
         return None
     final_taps = next(
         taps
-        for taps in _FINAL_TAPS
+        for taps in TAPS
         if (_least_rate(taps, each_db, spectrum, "scatter_db") or math.inf) <= upsampling
     )
     return FilterRates(align_taps, upsampling, aperture_taps, oversampling, final_taps, dimensions)

@@ -46,6 +46,7 @@ from clsas.engine.factorized.virtual_channels import InterpolatedAperture, Neare
 from clsas.engine.signal.interpolation import (
     MOST_UPSAMPLING,
     PHASES,
+    STAGE_TAPS,
     TAPS,
     UPSAMPLING_TAPS,
     Interpolator,
@@ -425,8 +426,8 @@ class Factorization:
         if self.limits is not None:
             sine = partial(validate.number, least=-_WIDEST_SINE, most=_WIDEST_SINE)
             _check(self, limits=partial(_each, length=2, meaning="ascending sines", check=sine))
-        _check_filter("align", self.align)
-        _check_filter("final", self.final)
+        _check_filter("align", self.align, STAGE_TAPS)
+        _check_filter("final", self.final, TAPS)
         _check_resampling(self.resampling, self.upsampler)
         _check_aperture(self.aperture, levels)
 
@@ -773,10 +774,10 @@ def _each(
     return tuple(check(f"{name}[{number}]", each) for number, each in enumerate(given))
 
 
-def _check_filter(name: str, given: Interpolator) -> None:
+def _check_filter(name: str, given: Interpolator, taps: tuple[int, ...]) -> None:
     """Raise TypeError or ValueError unless kernels can evaluate a filter."""
     validate.instance(name, given, Interpolator)
-    pairs = validate.one_of(f"{name}.taps", given.taps, TAPS) // 2
+    pairs = validate.one_of(f"{name}.taps", given.taps, taps) // 2
     validate.number(f"{name}.upsampling", given.upsampling, least=1.0, most=MOST_UPSAMPLING)
     _check_coefficients(name, given.coefficients, [(pairs, 2, pairs)])
     validate.number(f"{name}.error_db", given.error_db, "dB")
@@ -824,7 +825,7 @@ def _check_aperture(given: InterpolatedAperture | NearestBeams, levels: int) -> 
     if isinstance(given, NearestBeams):
         of_stages("aperture.factors", given.factors, check=_whole)
         return
-    _check_filter("aperture.filter", given.filter)
+    _check_filter("aperture.filter", given.filter, STAGE_TAPS)
     dense = partial(validate.number, least=1.0, most=100.0)
     of_stages("aperture.oversampling", given.oversampling, check=dense)
     validate.number("aperture.beam_cycles", given.beam_cycles, "cycles", least=0.0, most=1e3)

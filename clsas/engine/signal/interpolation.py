@@ -24,6 +24,12 @@ from clsas.engine.signal.spectrum import Spectrum, measure_spectrum
 _Complex = TypeVar("_Complex", np.complex64, np.complex128)
 
 TAPS = (2, 4, 6, 8)
+"""Taps of filters that look up single samples: those of exact images, and of leaves. Kernels take
+any even number (`cl/lookup.h`); each needs its time in `COST`."""
+
+STAGE_TAPS = (2, 4, 6, 8)
+"""Taps of filters that slide along lines, for which stages have kernels (`cl/sliding_filter.h`)."""
+
 UPSAMPLINGS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0)
 MOST_UPSAMPLING = 64.0
 
@@ -55,7 +61,7 @@ class Interpolator:
     Attributes
     ----------
     taps : int
-        Samples per evaluation: 2, 4, 6 or 8.
+        Samples per evaluation, one of `TAPS` or `STAGE_TAPS`.
     upsampling : float
         Factor by which lines are upsampled by FFT before the filter is applied.
     coefficients : float64 [taps/2, 2, taps/2]
