@@ -828,7 +828,7 @@ def _formed(
         return imager.form(lines), how
 
     before = time.perf_counter()
-    available = min(memory_bytes - patch_bytes, device.info.memory_bytes // 2)
+    available = min(memory_bytes - patch_bytes, device.info.usable_bytes)
     asked = Request(lines, grid, **request, beam=beam, memory_bytes=available)
     scene, chosen, track = planned(asked, device, doubts=False)
     # The beam's directions would be most of a record.

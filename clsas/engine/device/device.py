@@ -115,6 +115,11 @@ class DeviceInfo:
         return self.kind == "gpu" or self.permute
 
     @property
+    def usable_bytes(self) -> int:
+        """Memory that an image may use: half, as other programs and drivers need some, too."""
+        return self.memory_bytes // 2
+
+    @property
     def label(self) -> str:
         """Platform and name in one string, with which the names that users give are compared."""
         return f"{self.platform}: {self.name}"

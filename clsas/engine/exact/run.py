@@ -49,6 +49,8 @@ from clsas.engine.signal.interpolation import Resampling
 # Channels of a block. The number bounds float32 partial sums, and their lines stay in the cache of
 # a CPU.
 _CHANNELS_AT_ONCE = 512
+# Blocks and bands that the memory of a device has room for, of which two each are there at a time.
+_BLOCKS_IN_MEMORY, _BANDS_IN_MEMORY = 8, 4
 _PART_BYTES = 64 << 20  # device memory for one set of parts, a job of some tenths of a second
 _SINE_ROUNDING = 1e-5  # upper bound on the device's rounding error of a sine
 _MOST_KEPT_BYTES = 256 << 20  # of references that are kept: more than 20 million of 12 bytes each
@@ -544,7 +546,7 @@ def blocks_of(
     line_bytes = 8 * pitch
     part_bytes = _CHANNELS_AT_ONCE * (16 + 4 * terms) + 12 * part_pixels
     most = device.info.max_buffer_bytes
-    room = min(most, device.info.memory_bytes // 8)
+    room = min(most, device.info.memory_bytes // _BLOCKS_IN_MEMORY)
     if line_bytes > most:
         raise ArgumentError(
             "lines",
@@ -567,7 +569,7 @@ def band_parts(device: Device, part_pixels: int, across: int, normalise: bool) -
 
     The pixels of a band, and its sums of weights, are on the device together.
     """
-    most = min(device.info.max_buffer_bytes, device.info.memory_bytes // 4)
+    most = min(device.info.max_buffer_bytes, device.info.memory_bytes // _BANDS_IN_MEMORY)
     return max(most // (8 * (1 + normalise) * part_pixels) // across, 1) * across
 
 

@@ -268,7 +268,7 @@ def _built(device: Device, side: int) -> tuple[_Images, float]:
         predict_exact(scene, _TOLERANCE_DB, device),
         device.for_stages(),
         _PLANNED_WITH,
-        device.info.memory_bytes // 2,
+        device.info.usable_bytes,
     )
     found = fastest_plan(SampledRoots.of(sampled, None), conditions, math.inf, _CHOICES).plan
     assert found is not None  # the scene is made so

@@ -297,7 +297,7 @@ def planned(
         exact,
         device.for_stages(),
         costs.costs,
-        request.memory_bytes or device.info.memory_bytes // 2,
+        request.memory_bytes or device.info.usable_bytes,
     )
     if scene.is_reached:
         found, track = _chosen(request, scene, roots, conditions)
