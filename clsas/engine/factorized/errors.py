@@ -56,10 +56,9 @@ from clsas.engine.factorized.virtual_channels import (
     strip_channels,
 )
 from clsas.engine.signal import interpolation
+from clsas.engine.signal.ambiguity import MARGIN_DB
 from clsas.engine.signal.interpolation import PHASES, Interpolator, Resampling, Upsampler
 
-MARGIN_DB = 1.0
-"""Margin of predicted errors, for the scatter of measured ones."""
 HALF_ROUNDING = 4e-8
 """Power of the error that rounding lines to half precision once adds: 2^-11/sqrt(6) rms."""
 

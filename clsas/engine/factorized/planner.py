@@ -42,7 +42,7 @@ from clsas.engine.factorized.costs import (
     predict_exact,
     worthwhile,
 )
-from clsas.engine.factorized.errors import MARGIN_DB, leaf_error, nearest_errors
+from clsas.engine.factorized.errors import leaf_error, nearest_errors
 from clsas.engine.factorized.filters import ALIGN_TAPS
 from clsas.engine.factorized.plan import UNREACHED, ErrorBudget, Plan
 from clsas.engine.factorized.sampled import SampledRoots, SampledScene, Side, points_at_m
@@ -51,6 +51,7 @@ from clsas.engine.factorized.track import MeanTrack, shapes_after
 from clsas.engine.factorized.virtual_channels import NearestBeams
 from clsas.engine.scene import Scene
 from clsas.engine.signal import interpolation
+from clsas.engine.signal.ambiguity import MARGIN_DB
 
 BEST_TOLERANCE_DB = -75.0
 """Tightest tolerance that may be requested: the rounding error of a factorized image in float32."""

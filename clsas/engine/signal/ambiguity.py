@@ -35,6 +35,8 @@ from clsas.engine.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum, represen
 
 BEST_DB = -85.0
 """Smallest relative rms error of an image that single precision allows."""
+MARGIN_DB = 1.0
+"""Margin of predicted errors, for the scatter of measured ones."""
 
 # Margin by which a request may be out of reach without a warning: images at `BEST_DB` err by 3 dB
 # less.
@@ -386,12 +388,11 @@ def _beam_weights(
 
 # Chance in images with few resolution cells.
 
-_PIXELS = 256  # pixels sampled; with more independent pixels, the scatter is below `_SPARE_DB`
+_PIXELS = 256  # pixels sampled; with more independent pixels, the scatter is below `MARGIN_DB`
 _NOISE_CHANNELS = 256  # channels sampled in addition to the loudest; a beam passes some of them
 # Terms sampled of the sums over channels and frequencies; twice as many change nothing.
 _TERMS = 256
 _KEPT = 0.995  # share of images that must meet their accuracy
-_SPARE_DB = 1.0  # by which the errors of most images stay below their predictions
 _LEAST_WEIGHT = 1e-3  # mean weight of channels down to which normalising beams amplify pixels
 
 
@@ -412,7 +413,7 @@ def scatter(independent: float) -> float:
     of 2 N and 2 N degrees of freedom.
     """
     quantile = scipy.special.fdtri(2 * independent, 2 * independent, _KEPT)
-    return max(float(quantile) / power(_SPARE_DB), 1.0)
+    return max(float(quantile) / power(MARGIN_DB), 1.0)
 
 
 def independent_pixels(

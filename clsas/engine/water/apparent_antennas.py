@@ -12,7 +12,9 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
+from clsas.engine.data.decibels import in_db
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.simplify import SHARE
 from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.interpolation import Readout
@@ -27,7 +29,6 @@ _BEYOND = 0.1  # of the distances of sample pixels, by which those of others may
 # samples changes from a curved to a linear offset within them, it is not band-limited there.
 _READ = 32
 _RESAMPLED_DB = -80.0  # largest error of the interpolation of samples
-_MARGIN_DB = 13.0  # by which interpolation is better than the image: its share is a twentieth
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +112,7 @@ class Change:
         coefficients = np.stack(
             [chebyshev.chebfit(x, y, degree) for x, y in zip(scaled, offset, strict=True)], axis=1
         )
-        accuracy_db = _RESAMPLED_DB if allowed_db is None else allowed_db - _MARGIN_DB
+        accuracy_db = _RESAMPLED_DB if allowed_db is None else allowed_db + in_db(SHARE)
         accuracy_db = min(accuracy_db, _RESAMPLED_DB)
         path_m = sum(np.hypot(middle_m, each - level) for each in apparent.T)[kinds]
         tx_z, rx_z = apparent[kinds].T
