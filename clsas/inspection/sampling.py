@@ -17,6 +17,7 @@ from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, banks_of
 from clsas.engine.data.lines import wavelength_m as carrier_wavelength_m
+from clsas.engine.data.sound_speed import USUAL_M_S
 from clsas.engine.data.system import Sonar
 from clsas.engine.data.track import Track, channels
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
@@ -246,7 +247,7 @@ def measure_spacing(
 
 
 def receive_interval_s(
-    near_m: float, far_m: float, duration_s: float, sound_speed_m_s: float = 1500.0
+    near_m: float, far_m: float, duration_s: float, sound_speed_m_s: float = USUAL_M_S
 ) -> tuple[float, float]:
     """Return the times at which the first echo starts and the last one ends; [22], [23]."""
     near = validate.number("near_m", near_m, "m", least=0.0)

@@ -793,8 +793,7 @@ def survey_lines(
     near_m, far_m = range_m.min(axis=0), range_m.max(axis=0)
     if sound_speed is not None:
         validate.instance("sound_speed", sound_speed, SoundSpeed)
-        near_m = near_m * (sonar.sound_speed_m_s / sound_speed.speed_m_s.max())
-        far_m = far_m * (sonar.sound_speed_m_s / sound_speed.speed_m_s.min())
+        near_m, far_m = sound_speed.bounds_m(near_m, far_m, sonar.sound_speed_m_s)
     first_m = near_m - _MARGIN * step_m
     extent = float((far_m - first_m).max() / step_m)
     validate.memory("oversampling", 8 * len(first_m) * extent)

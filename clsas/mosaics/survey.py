@@ -431,8 +431,7 @@ class SurveyVisibility:
             extent_m += 1.1 * speed * (middle_m + radius_m)
         near_m, far_m = middle_m - extent_m, middle_m + extent_m
         if (profile := geometry.sound_speed) is not None:
-            near_m = near_m * (geometry.sound_speed_m_s / profile.speed_m_s.max())
-            far_m = far_m * (geometry.sound_speed_m_s / profile.speed_m_s.min())
+            near_m, far_m = profile.bounds_m(near_m, far_m, geometry.sound_speed_m_s)
         return near_m, far_m
 
     def channels(self, grid: Grid) -> NDArray[np.bool_]:

@@ -28,7 +28,9 @@ from clsas.engine.water.rays import rays, shadow
 # Points of a block from which on a table is faster. It takes as long as some thousand rays.
 _WORTH_A_TABLE = 4096
 _OF_SIGHT = Accuracy(2e-9, 1e-5)  # of sightlines
-_FLIGHT_STEPS = 4  # each multiplies the error of a moving receiver's delay by v/c
+# Each multiplies the error of a moving receiver's delay by v/c. The imagers, which simulated lines
+# test, have a number of their own.
+_FLIGHT_STEPS = 4
 _TINY_M = 1e-300  # distance that stands for 0, which callers refuse
 
 MOST_FOCUS = 10 ** (10 / 20)

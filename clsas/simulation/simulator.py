@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.declared import Count, Flag, Number, Span, check_declared
 from clsas.engine.data.lines import RangeLines
-from clsas.engine.data.sound_speed import SoundSpeed, check_reaches
+from clsas.engine.data.sound_speed import USUAL_M_S, SoundSpeed, check_reaches
 from clsas.engine.data.system import PASSBAND, Sonar
 from clsas.engine.data.track import Channels, Pointing, Track, channels
 from clsas.engine.data.validate import ArgumentError
@@ -268,7 +268,7 @@ def simulate_lines(
     bandwidth_hz: float,
     window: Window = "none",
     oversampling: float = 2.0,
-    sound_speed_m_s: float = 1500.0,
+    sound_speed_m_s: float = USUAL_M_S,
     first_range_m: ArrayLike | None = None,
     length: int | None = None,
     rx_velocity_m_s: ArrayLike | None = None,

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.validate import ArgumentError
 
+USUAL_M_S = 1500.0
+"""Sound speed if none is given, which is about that of the sea."""
 SLOWEST_M_S, FASTEST_M_S = 1300.0, 1800.0
 """Slowest and fastest sound in water: fresh water near freezing has 1402 m/s, hot brines of the
 Red Sea more than 1700 m/s."""
@@ -238,6 +240,21 @@ class SoundSpeed:
         z = validate.array("z_m", z_m, np.float64, None)
         check_reaches(self, z)
         return np.interp(self.surface_z_m - z, self.depth_m, self.speed_m_s)
+
+    def bounds_m(
+        self, near_m: NDArray[np.float64], far_m: NDArray[np.float64], sound_speed_m_s: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return bounds of ranges by delays in this water, metres.
+
+        Parameters
+        ----------
+        near_m, far_m : float64 array
+            Bounds of the ranges in homogeneous water, metres.
+        sound_speed_m_s : float
+            Sound speed by which delays become ranges, metres per second.
+        """
+        fastest, slowest = self.speed_m_s.max(), self.speed_m_s.min()
+        return near_m * (sound_speed_m_s / fastest), far_m * (sound_speed_m_s / slowest)
 
     def mean_m_s(self, one_z_m: float, other_z_m: float) -> float:
         """Return the mean sound speed between two heights, metres per second.

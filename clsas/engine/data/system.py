@@ -15,6 +15,7 @@ from clsas.engine.data import reprs, validate
 from clsas.engine.data.declared import Number, check_fields
 from clsas.engine.data.fourier import fourier_integral
 from clsas.engine.data.lines import bank_members, banks_of, checked_bank_numbers
+from clsas.engine.data.sound_speed import USUAL_M_S
 from clsas.engine.data.validate import ArgumentError
 
 BARKER_13 = (1, 1, 1, 1, 1, -1, -1, 1, 1, -1, 1, -1, 1)
@@ -257,7 +258,7 @@ class Sonar:
     rx_m: NDArray[np.float64]
     tx_m: NDArray[np.float64] = (0.0, 0.0, 0.0)  # type: ignore[assignment]
     sample_rate_hz: float = None  # type: ignore[assignment]
-    sound_speed_m_s: Annotated[float, Number("m/s", above=0.0, help="Speed of sound.")] = 1500.0
+    sound_speed_m_s: Annotated[float, Number("m/s", above=0.0, help="Speed of sound.")] = USUAL_M_S
     tx_length_m: Annotated[
         float | None,
         Number("m", above=0.0, help="Length of the transmitter along x.", default="no directivity"),
