@@ -12,7 +12,6 @@ import click
 import clsas
 from clsas.cli import options
 from clsas.cli.inputs import (
-    DEFAULT_REQUEST,
     check_levels,
     load_lines,
     read_beam,
@@ -24,7 +23,7 @@ from clsas.cli.outputs import printable, progress_bar, report, say, warn
 from clsas.cli.parameters import HDF5
 from clsas.cli.wording import command
 from clsas.engine.device.device import KernelTimes, open_device
-from clsas.engine.factorized.planner import WORST_TOLERANCE_DB
+from clsas.engine.factorized.planner import DEFAULT_REQUEST, WORST_TOLERANCE_DB
 from clsas.files.scene_tables import PLAN_KEYS
 
 _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is reported

@@ -16,13 +16,11 @@ from clsas.cli.wording import error_message
 from clsas.engine.data import reading, validate
 from clsas.engine.data.lines import first_two_banks
 from clsas.engine.data.validate import ArgumentError
-from clsas.engine.factorized.planner import TOLERANCE_DB
+from clsas.engine.factorized.planner import DEFAULT_REQUEST
 from clsas.files import scene_files as config
 from clsas.files.scene_files import SceneFile
 from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS
 from clsas.plot.canvas import colour_map as check_colour_map
-
-DEFAULT_REQUEST = {"tolerance_db": TOLERANCE_DB}
 
 
 def load(path: Path, *kinds: type) -> Any:

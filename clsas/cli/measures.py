@@ -15,7 +15,7 @@ from clsas.cli.outputs import json_able, print_json, printable, progress_bar, re
 from clsas.cli.parameters import HDF5, INPUT, POSITION, STAGES, Output
 from clsas.cli.wording import command
 from clsas.engine.factorized.plan import ExactImage
-from clsas.engine.factorized.planner import Request
+from clsas.engine.factorized.planner import TOLERANCE_DB, Request
 from clsas.files.scene_files import SceneFile
 from clsas.measures.quality import DARKEST, Cut, PointResponse, dark_level_db
 
@@ -157,9 +157,12 @@ def tradeoff(
 @command()
 @click.argument("case", required=False)
 @options.device
-@options.of(ExactImage, "accuracy_db", into="exactly", default="-50, of exact cases")
+@options.of(ExactImage, "accuracy_db", into="exactly", default=f"{TOLERANCE_DB:g}, of exact cases")
 @options.of(
-    Request, "tolerance_db", into="tolerance", default="-50, of factorized cases; mosaic: -40"
+    Request,
+    "tolerance_db",
+    into="tolerance",
+    default=f"{TOLERANCE_DB:g}, of factorized cases; others: -40",
 )
 @options.of(clsas.tradeoff, "repeats", into="timed", default="5")
 @options.as_json

@@ -21,7 +21,8 @@ _MOST_CYCLES = 1e3  # of phase within the search; more need more planes than any
 _POINTS = 5  # along either side of a grid, whose geometry is checked; arbitrary
 _LEAST_PHASE_RAD = 0.1  # over the whole search; less is not above the noise of usual coherences
 
-
+HEIGHTS_TOLERANCE_DB = -40.0
+"""Tolerance of the images of two banks for which none is requested."""
 SEARCH = Span(
     "m", least=-1e8, most=1e8, help="Heights above the grid between which the seabed lies."
 )

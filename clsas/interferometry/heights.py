@@ -29,6 +29,7 @@ from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.interferometry.baseline import Baseline, Lattice, sight_lattice
 from clsas.interferometry.checks import (
     COHERENCE,
+    HEIGHTS_TOLERANCE_DB,
     SEARCH,
     WINDOW,
     check_echoes,
@@ -79,7 +80,7 @@ def heights(
     *,
     search_m: Annotated[ArrayLike, SEARCH],
     window_m: Annotated[float | None, WINDOW] = None,
-    tolerance_db: Annotated[float, TOLERANCE] = -40.0,
+    tolerance_db: Annotated[float, TOLERANCE] = HEIGHTS_TOLERANCE_DB,
     least_coherence: Annotated[float, COHERENCE] = LEAST_COHERENCE,
     beam: BeamWindow | None = None,
     device: Device | str | int | None = None,

@@ -17,7 +17,7 @@ from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.factorized.planner import TOLERANCE
 from clsas.engine.signal.spectrum import middle_cycles_per_m
-from clsas.interferometry.checks import KNOWN_HEIGHT, check_pair
+from clsas.interferometry.checks import HEIGHTS_TOLERANCE_DB, KNOWN_HEIGHT, check_pair
 from clsas.interferometry.comparisons import Comparison, at_pixels, at_points, in_overlap
 from clsas.interferometry.displaced import Displaced
 from clsas.interferometry.estimate import MOST_SD_RAD, Estimate, estimated
@@ -51,7 +51,7 @@ def pair_errors(
     unknowns: Annotated[
         Sequence[str], Names(UNKNOWNS, help="Errors to estimate, the most important first.")
     ] = UNKNOWNS,
-    tolerance_db: Annotated[float, TOLERANCE] = -40.0,
+    tolerance_db: Annotated[float, TOLERANCE] = HEIGHTS_TOLERANCE_DB,
     beam: BeamWindow | None = None,
     device: Device | str | int | None = None,
 ) -> PairErrors:

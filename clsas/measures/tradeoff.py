@@ -38,6 +38,7 @@ from clsas.engine.factorized.planner import (
 )
 from clsas.engine.forming import form_exactly
 from clsas.engine.imaging import factorize
+from clsas.engine.signal.ambiguity import BEST_DB
 from clsas.engine.signal.doubts import warn_before_imaging
 from clsas.measures.quality import DARKEST, dark_level_db, measure_point
 
@@ -49,7 +50,7 @@ STUDIED_TAPS = tuple(product(ALIGN_TAPS, APERTURE_TAPS))
 STUDIED_DEPTHS = (1, 2, 3, 4)
 """Taps (in range, along the aperture) and numbers of stages that a study tries."""
 
-REFERENCE_DB = -85.0
+REFERENCE_DB = BEST_DB
 """Accuracy of the exact image that all errors are relative to, in dB."""
 
 _FIGURES = ("resolution_m", "pslr_db", "islr_db")

@@ -39,7 +39,15 @@ from clsas.engine.device.device import Device
 from clsas.engine.factorized.planner import TOLERANCE
 from clsas.interferometry import heights
 from clsas.interferometry.baseline import Baseline
-from clsas.interferometry.checks import COHERENCE, PATCH, SEARCH, WINDOW, check_grid, check_pair
+from clsas.interferometry.checks import (
+    COHERENCE,
+    HEIGHTS_TOLERANCE_DB,
+    PATCH,
+    SEARCH,
+    WINDOW,
+    check_grid,
+    check_pair,
+)
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.doubts import BEYOND
 from clsas.interferometry.errors import UnmeasurableError
@@ -71,7 +79,7 @@ def mosaic_heights(
     *,
     search_m: Annotated[ArrayLike, SEARCH],
     window_m: Annotated[float | None, WINDOW] = None,
-    tolerance_db: Annotated[float, TOLERANCE] = -40.0,
+    tolerance_db: Annotated[float, TOLERANCE] = HEIGHTS_TOLERANCE_DB,
     least_coherence: Annotated[float, COHERENCE] = LEAST_COHERENCE,
     beam: BeamWindow | None = None,
     patch_m: Annotated[float | None, PATCH] = None,

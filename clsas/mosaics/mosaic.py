@@ -42,6 +42,7 @@ from clsas.engine.device.device import Device
 from clsas.engine.exact.decide import ACCURACY
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import (
+    DEFAULT_REQUEST,
     THESIS_STAGES,
     TOLERANCE_DB,
     Request,
@@ -295,7 +296,7 @@ def _checked_request(
             request[name] = THESIS_STAGES.check(name, value)
         elif not isinstance(value, (int, float)):
             request[name] = float(value)
-    return request or {"tolerance_db": TOLERANCE_DB}
+    return request or DEFAULT_REQUEST
 
 
 def _check_client(client: object, source: object, store: object, device: object) -> None:

@@ -27,7 +27,7 @@ from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines, banks_of, first_two_banks
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device
-from clsas.engine.factorized.planner import TOLERANCE_DB
+from clsas.engine.factorized.planner import DEFAULT_REQUEST
 from clsas.engine.imaging import backproject, factorize, plan
 from clsas.files.hdf5 import save
 from clsas.files.scene_files import SceneFile
@@ -171,7 +171,7 @@ def is_mosaic(step: str, scene: SceneFile) -> bool:
 
 def request_of(scene: SceneFile) -> dict[str, Any]:
     """Return the scene's request for an image, or the default tolerance."""
-    return scene.request or {"tolerance_db": TOLERANCE_DB}
+    return scene.request or DEFAULT_REQUEST
 
 
 def inspect_step(job: Job) -> dict[str, Any]:

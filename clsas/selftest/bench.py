@@ -16,9 +16,11 @@ from clsas.engine.data.image_error import relative_error_db
 from clsas.engine.data.visibility import sines
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.factorized.plan import ExactImage
+from clsas.engine.factorized.planner import TOLERANCE_DB
 from clsas.engine.forming import SceneImager, form_exactly
 from clsas.engine.imaging import Imager, factorize, plan
 from clsas.engine.scene import Scene
+from clsas.interferometry.checks import HEIGHTS_TOLERANCE_DB
 from clsas.interferometry.heights import heights
 from clsas.interferometry.refinement import PASSES
 from clsas.interferometry.result import Heights
@@ -37,7 +39,7 @@ def run(
     case: str,
     *,
     device: Device | str | int | None = None,
-    accuracy_db: float = -50.0,
+    accuracy_db: float = TOLERANCE_DB,
     repeats: int = 5,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
@@ -119,7 +121,7 @@ def run_factorized(
     case: str | Case | DenseCase,
     *,
     device: Device | str | int | None = None,
-    tolerance_db: float = -50.0,
+    tolerance_db: float = TOLERANCE_DB,
     repeats: int = 5,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
@@ -302,7 +304,7 @@ def run_heights(
     case: str = "heights",
     *,
     device: Device | str | int | None = None,
-    tolerance_db: float = -40.0,
+    tolerance_db: float = HEIGHTS_TOLERANCE_DB,
     repeats: int = 3,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:

@@ -57,17 +57,19 @@ BEST_TOLERANCE_DB = -75.0
 """Tightest tolerance that may be requested: the rounding error of a factorized image in float32."""
 WORST_TOLERANCE_DB = -10.0
 """Loosest tolerance that may be requested."""
+TOLERANCE_DB = -50.0
+"""Tolerance of images for which none is requested."""
+DEFAULT_REQUEST = {"tolerance_db": TOLERANCE_DB}
+"""Request of an image without one."""
 TOLERANCE = Number(
     "dB",
     least=BEST_TOLERANCE_DB,
     most=WORST_TOLERANCE_DB,
     help="Largest relative rms error against the exact image.",
-    default="-50",
+    default=f"{TOLERANCE_DB:g}",
 )
 """Declares tolerances in dB."""
 
-TOLERANCE_DB = -50.0
-"""Tolerance of images for which none is requested."""
 NEAREST_UPSAMPLING = 8.0
 """Upsampling of lines before their linear interpolation."""
 
