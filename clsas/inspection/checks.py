@@ -60,7 +60,6 @@ _AROUND = 31  # steps in the running median that gives the usual advance near a 
 _LEAST_PER_WAVELENGTH = 50.0
 """Advances of a receiver per wavelength above which a unit must be wrong. Slow rails reach 20.
 Positions in kilometres multiply it by 1000, which finds advances of up to 20 wavelengths."""
-_SILENT_DB = -300.0  # reported for channels without any signal
 _ENDS_DB = -20.0  # power at the ends relative to whole lines, above which it is reported
 _FARTHEST = 1e4
 """First range relative to the length of a line, above which a unit must be wrong. Satellites reach
@@ -384,7 +383,7 @@ def check_dead(recording: Recording) -> Iterator[Finding]:
     dead, least = are_dead(power, usual), float(power.min())
     if not dead.any():
         return
-    least_db = decibels.in_db(least / usual) if least else _SILENT_DB
+    least_db = decibels.in_db(least / usual if least else 0.0)
     weakest = f"{least_db:.0f} dB" if least else "no signal"
     message = (
         f"{_of_channels(dead)} dead: at least {-DEAD_DB:.0f} dB below the median channel "

@@ -295,7 +295,7 @@ def measure_cut(
     return Cut(
         axis=axis.name,
         offset_m=offset,
-        level_db=10 * np.log10(np.maximum(power, 1e-30)),
+        level_db=in_db(power),
         resolution_m=sum(half_widths) * abs(step_m) / _UPSAMPLING,
         pslr_nearest_db=(nearest_db[0], nearest_db[1]),
         pslr_db=(highest_db[0], highest_db[1]),

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import MOST_TRACK_PINGS, BeamWindow
 from clsas.engine.data.coverage import reaches, warn_unreached
+from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.digests import digest, grid_digest
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
@@ -361,14 +362,14 @@ def warn_of_window(beam: BeamWindow, geometry: RangeLines, request: dict[str, An
         return
     growing = _beam_of_growing(beam)
     sine = np.linalg.norm(np.cross(beam.directions(geometry), growing.directions(geometry)), axis=1)
-    power = shift_error(beam, float(np.sqrt(np.mean(sine**2))), geometry)
+    error = shift_error(beam, float(np.sqrt(np.mean(sine**2))), geometry)
     ways = request.get("tolerance_db"), request.get("tolerance_wavelengths")
     asked_db = request.get("accuracy_db") or tolerance_in_db(*ways) or TOLERANCE_DB
-    if power > 10 ** (asked_db / 10):
+    if error > power(asked_db):
         validate.warn(
             "`source` may grow, or did when the mosaic began: the direction of the track is "
             f"smoothed over {MOST_TRACK_PINGS} pings, whatever their number. The image may differ "
-            f"by {10 * np.log10(power):.0f} dB from that of the {len(geometry.ping_starts)} pings "
+            f"by {in_db(error):.0f} dB from that of the {len(geometry.ping_starts)} pings "
             "in one file. Give `track_pings` for both, or put an empty file "
             f"'{END}' into a complete folder before its mosaic begins"
         )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import validate
-from clsas.engine.data.decibels import level_db
+from clsas.engine.data.decibels import in_db, level_db
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.pings import Transmissions
@@ -309,7 +309,7 @@ def _draw_spectrum(axes: Axes, found: Inspection) -> None:
     frequency = middle + (frequency - middle + 0.5) % 1.0 - 0.5
     order = np.argsort(frequency)
     at_hz = lines.carrier_hz + rate_hz * frequency[order]
-    level = 10 * np.log10(np.maximum(power[order] / power.max(), 1e-12))
+    level = in_db(power[order] / power.max())
     scale, unit = next((each for each in _PREFIXES if np.abs(at_hz).max() >= each[0]), (1.0, "Hz"))
     axes.plot(at_hz / scale, level, linewidth=0.8)
     axes.axvspan(

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.engine.data.decibels import amplitude
 from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.data.track import Channels
 from clsas.engine.data.validate import ArgumentError
@@ -33,7 +34,7 @@ _OF_SIGHT = Accuracy(2e-9, 1e-5)  # of sightlines
 _FLIGHT_STEPS = 4
 _TINY_M = 1e-300  # distance that stands for 0, which callers refuse
 
-MOST_FOCUS = 10 ** (10 / 20)
+MOST_FOCUS = amplitude(10)
 """Largest amplitude relative to that of a straight path. Ray theory has no limit at caustics; waves
 of 100 kHz have one at 10 to 15 dB."""
 

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.decibels import amplitude
 from clsas.engine.data.declared import Count, Number, check_fields
 from clsas.engine.data.validate import ArgumentError
 from clsas.simulation.refraction import Sightlines
@@ -285,7 +286,7 @@ class Seabed:
     @property
     def error(self) -> float:
         """Relative error that an echo may have: a third of the floor."""
-        return 10 ** (self.floor_db / 20) / 3
+        return amplitude(self.floor_db) / 3
 
     def height_m(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
         """Return the heights of the seabed at some positions, metres.
@@ -386,7 +387,7 @@ class Seabed:
             slack *= magnification
         gains = observer.gain(directions, slack)
         order = np.argsort(-observer.gain(directions, 0.0), kind="stable")
-        return order[gains[order] >= 10 ** (self.floor_db / 20)]
+        return order[gains[order] >= amplitude(self.floor_db)]
 
     def _lit(
         self,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import validate
+from clsas.engine.data.decibels import amplitude
 from clsas.engine.data.declared import Count, Flag, Number, Span, check_declared
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.sound_speed import USUAL_M_S, SoundSpeed, check_reaches
@@ -439,7 +440,7 @@ def _add_noise(samples: NDArray[np.complex64], snr_db: float, seed: int) -> None
     if peak == 0:
         raise ArgumentError("snr_db", "be left out without an echo", hint=NO_ECHO)
     # Standard deviation of the real and of the imaginary part.
-    deviation = np.float32(peak * 10 ** (-snr_db / 20) / np.sqrt(2))
+    deviation = np.float32(peak * amplitude(-snr_db) / np.sqrt(2))
     random = np.random.default_rng(int(seed))
     for line in samples:
         parts = random.standard_normal((len(line), 2), dtype=np.float32)

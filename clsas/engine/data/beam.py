@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import correlate1d
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.decibels import amplitude
 from clsas.engine.data.declared import Choice, Count, Flag, Number, check_fields
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.system import element_pattern
@@ -479,7 +480,7 @@ def _taylor(u: NDArray[np.float64]) -> NDArray[np.float64]:
     equal heights (Carrara, Goodman and Majewski 1995, pages 512-513).
     """
     terms = np.arange(1, _TAYLOR_TERMS)
-    a = math.acosh(10 ** (_TAYLOR_SIDE_LOBES_DB / 20)) / np.pi
+    a = math.acosh(amplitude(_TAYLOR_SIDE_LOBES_DB)) / np.pi
     stretch = _TAYLOR_TERMS**2 / (a**2 + (_TAYLOR_TERMS - 0.5) ** 2)
     found = []
     for m in terms:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +25,25 @@ REFERENCE = Number(above=0.0, help="Amplitude of 0 dB.", default="1 for db, othe
 """Declares the amplitude to which levels are relative."""
 
 
+_FLOOR = 1e-30  # power that stands for none: -300 dB
+_Number = TypeVar("_Number", float, NDArray[np.float64])
+
+
 def power(error_db: float) -> float:
     """Return the power of a relative rms error."""
     return 10 ** (error_db / 10)
 
 
-def in_db(power: float) -> float:
-    """Return a relative rms error from its power."""
-    return 10 * math.log10(max(power, 1e-30))
+def amplitude(level_db: float) -> float:
+    """Return the amplitude of a level."""
+    return 10 ** (level_db / 20)
+
+
+def in_db(power: _Number) -> _Number:
+    """Return a relative rms error, or a level, from its power; at least -300 dB."""
+    if isinstance(power, np.ndarray):
+        return 10 * np.log10(np.maximum(power, _FLOOR))
+    return 10 * math.log10(max(power, _FLOOR))
 
 
 def largest_amplitude(values: NDArray) -> float:

@@ -18,6 +18,8 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from clsas.engine.data.decibels import amplitude
+
 _INCLUDE = re.compile(r'#include "(?P<name>\w+\.h)"')
 _COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.DOTALL)
 _PARAMETER = re.compile(r"(?P<type>.*?)(?P<name>\w+)", re.DOTALL)
@@ -248,7 +250,7 @@ def phase_terms_within(error_db: float, share: float) -> int:
 
     `share` is the share of the error power that the polynomials may add.
     """
-    most = np.sqrt(share) * 10 ** (error_db / 20)
+    most = np.sqrt(share) * amplitude(error_db)
     found = (terms for terms in PHASE_TERMS if phase_error(terms) <= most)
     return next(found, PHASE_TERMS[-1])
 

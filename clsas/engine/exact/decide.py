@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.decibels import in_db, power
+from clsas.engine.data.decibels import amplitude, in_db, power
 from clsas.engine.data.declared import Number
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import cycles_per_m_at, fastest, some_channels, wavelength_m
@@ -147,7 +147,7 @@ def decide(
     if taps is not None and upsampling is not None:
         geometry_error, phase_terms = GEOMETRY_ERROR, kernels.PHASE_TERMS[-1]
     else:
-        geometry_error = max(GEOMETRY_ERROR, 10 ** ((accuracy_db + _GEOMETRY_SHARE_DB) / 20))
+        geometry_error = max(GEOMETRY_ERROR, amplitude(accuracy_db + _GEOMETRY_SHARE_DB))
         phase_terms = kernels.phase_terms_within(accuracy_db, kernels.EXACT_PHASE_SHARE)
 
     # All positions from which ranges or aspect angles are measured.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.decibels import in_db, power
+from clsas.engine.data.decibels import amplitude, in_db, power
 from clsas.engine.data.declared import Count, Flag, Number, Other, check_fields
 from clsas.engine.data.digests import grid_digest, lines_digest
 from clsas.engine.data.georeference import placed
@@ -204,7 +204,7 @@ def decibels(wavelengths: float) -> float:
 
 def wavelengths(decibels: float) -> float:
     """Return the range error in wavelengths that causes a relative rms error in dB."""
-    return 10 ** (decibels / 20) * math.sqrt(3) / (4 * math.pi)
+    return amplitude(decibels) * math.sqrt(3) / (4 * math.pi)
 
 
 TOLERANCE_WAVELENGTHS = Number(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, toeplitz
 
 from clsas.engine.data import reprs
+from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.spectrum import Spectrum, measure_spectrum
@@ -92,8 +93,8 @@ class Interpolator:
         nu = np.asarray(nu)
         square = (nu * nu)[..., None, None]
         values = np.zeros((*nu.shape, *self.coefficients.shape[:2]))
-        for power in range(self.coefficients.shape[2]):  # the highest first
-            values = values * square + self.coefficients[..., power]
+        for exponent in range(self.coefficients.shape[2]):  # the highest first
+            values = values * square + self.coefficients[..., exponent]
         even, odd = values[..., 0], values[..., 1] * nu[..., None]
         return np.concatenate([(even - odd)[..., ::-1], even + odd], axis=-1)
 
@@ -171,9 +172,7 @@ def designs(taps: int, upsamplings: Sequence[float], spectrum: Spectrum) -> list
     square = (even**2 + odd**2) @ mean
     bias = (even * aims[0] + odd * aims[1]) @ mean
     scatter = np.maximum(square - bias**2, 0.0) / (1 + bias) ** 2
-    error_db, scatter_db = (
-        10 * np.log10(np.maximum(each @ spectrum.power, 1e-30)) for each in (square, scatter)
-    )
+    error_db, scatter_db = (in_db(each @ spectrum.power) for each in (square, scatter))
     return [
         Interpolator(taps, *each)
         for each in zip(
@@ -238,8 +237,8 @@ def choose(
     """
     if taps is not None and upsampling is not None:
         return design(taps, upsampling, spectrum)
-    power_left = 10 ** (accuracy_db / 10) - other_error**2
-    target_db = 10 * np.log10(max(power_left, 1e-30) / spectrum.scatter) - _SCATTER_DB
+    power_left = power(accuracy_db) - other_error**2
+    target_db = in_db(power_left / spectrum.scatter) - _SCATTER_DB
     rates: Sequence[float] = UPSAMPLINGS if upsampling is None else (upsampling,)
     candidates = []
     for each_taps in TAPS if taps is None else (taps,):
@@ -435,7 +434,7 @@ def upsampler(
         # Power of the residual of the best fit, by phase.
         residual = np.maximum(wanted - np.einsum("pt,tp->p", coefficients, right), 0.0)
         total = (residual.sum() + residual[1:-1].sum()) / PHASES / (spectrum.power @ aim**2)
-        error_db = 10 * np.log10(max(float(total), 1e-30))
+        error_db = in_db(float(total))
         if error_db <= (most_db if taps == UPSAMPLING_TAPS[-1] else wanted_db):
             # The filters of the second half mirror those of the first.
             coefficients = np.concatenate([coefficients, coefficients[-2:0:-1, ::-1]])
