@@ -336,7 +336,7 @@ def _gaps(
     """Return the pings after which there are gaps, all steps, and the largest step allowed."""
     steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
     around_m = median_filter(steps_m, size=min(_AROUND, len(steps_m)), mode="nearest")
-    scatter_m = 1.48 * float(np.median(np.abs(steps_m - around_m)))  # of normal noise
+    scatter_m = decibels.DEVIATION_PER_MEDIAN * float(np.median(np.abs(steps_m - around_m)))
     limits_m = np.maximum(_GAP * around_m, around_m + _SCATTER * scatter_m)
     return np.flatnonzero(steps_m > limits_m), steps_m, limits_m
 

@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.engine.data.decibels import DEVIATION_PER_MEDIAN
 from clsas.interferometry.coherence import Window
 
 _ROUNDS = 30  # of each iteration; a handful is usual
 _OUTLIER = 4.0  # deviations; Gaussian errors exceed it at one place in 16 000
-_MEDIAN = 0.6745  # median absolute deviation of a Gaussian
 _SETTLED = 0.02  # rms last change of the modelled heights, in their deviations
 # Errors of heights that change slowly over the swath, in deviations: the mean error on simulated
 # dunes. Unlike noise, they do not average out.
@@ -149,7 +149,7 @@ def _robust_step(equations: Equations) -> tuple[NDArray[np.float64], NDArray[np.
     inside = np.ones(len(wanted), bool)
     for _ in range(_ROUNDS):
         before, distance = inside, np.abs(wanted - design @ step)
-        inside = distance <= _OUTLIER * max(float(np.median(distance)) / _MEDIAN, 1.0)
+        inside = distance <= _OUTLIER * max(DEVIATION_PER_MEDIAN * float(np.median(distance)), 1.0)
         step = _least_squares(design[inside], wanted[inside])
         if np.array_equal(inside, before):
             break

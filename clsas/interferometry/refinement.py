@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
+from clsas.engine.data.decibels import DEVIATION_PER_MEDIAN
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.interferometry.baseline import Lattice
@@ -31,7 +32,6 @@ _CONVERGED = 0.3
 # Last correction of a pixel, in deviations, from which on it is not valid: its window reaches to
 # where the relief is unknown, and contains echoes of another height.
 _UNSETTLED = 2.0
-_MEDIAN = 0.6745  # median absolute deviation of a Gaussian
 _CREDIBLE = 0.25  # largest credible correction of the sweep, in heights of ambiguity; arbitrary
 _FALSE_ALARM = 1e-3  # share of incoherent windows that exceed the threshold of coherence
 # Rms distance of the relief from the plane of a window, in deviations. Noise of the heights makes
@@ -137,7 +137,8 @@ def refine(
         valid &= planes.roughness_m < smooth_m
         change = np.abs(planes.height_m - relief_m) / sd_m
         # The median is not affected by the few pixels beside steps of the relief.
-        correction = float(np.median(change[valid])) / _MEDIAN if valid.any() else 0.0
+        median = float(np.median(change[valid])) if valid.any() else 0.0
+        correction = DEVIATION_PER_MEDIAN * median
         settled = valid & (change < _UNSETTLED)
         whole_sd_m = np.hypot(sd_m, displacement_m(planes.bend_m, sd_m, settled, window))
         found = Refined(

@@ -32,6 +32,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter
 from scipy.spatial.distance import cdist
 
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.decibels import DEVIATION_PER_MEDIAN
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines, wavelength_m
@@ -59,7 +60,6 @@ _PASSES = 3  # alternations between steps of the track and slopes of the respons
 _TRIED = 9  # displacements tried within half a wavelength: 4 per cycle of the sharpness
 _NEWTON = 3  # Newton steps from the best of them
 _SWEEPS = 2  # sweeps over all pings
-_DEVIATION_PER_MEDIAN = 1.4826  # standard deviation over median magnitude of normal errors
 # Blocks of pings that move together. With fewer blocks, the sum over the other pings would change
 # too much while a block moves.
 _BLOCKS = 16
@@ -545,4 +545,4 @@ def disagreement_m(passage: Passage, found: Contributions) -> float:
         apart -= np.median(apart, axis=1, keepdims=True)
         # The median ignores single pings for which one half is off by half a wavelength of path.
         apart_m.append(np.median(np.abs(np.einsum("up,upk->pk", apart, gradient))))
-    return float(np.median(apart_m)) * _DEVIATION_PER_MEDIAN / 2
+    return float(np.median(apart_m)) * DEVIATION_PER_MEDIAN / 2

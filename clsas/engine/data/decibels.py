@@ -1,4 +1,4 @@
-"""Errors and amplitudes in decibels; the power of errors adds."""
+"""Errors and amplitudes in decibels; the power of errors adds. Deviations from medians."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ DYNAMIC_RANGE = Number(
 REFERENCE = Number(above=0.0, help="Amplitude of 0 dB.", default="1 for db, otherwise the largest")
 """Declares the amplitude to which levels are relative."""
 
+DEVIATION_PER_MEDIAN = 1.482602
+"""Standard deviation over the median magnitude of normal errors."""
 
 _FLOOR = 1e-30  # power that stands for none: -300 dB
 _Number = TypeVar("_Number", float, NDArray[np.float64])
