@@ -47,6 +47,7 @@ from clsas.engine.factorized.planner import (
     THESIS_STAGES,
     TOLERANCE_DB,
     Request,
+    is_soon_done,
     planned,
     tolerance_in_db,
 )
@@ -86,8 +87,6 @@ MEMORY_BYTES = 1 << 30
 _LARGEST_SIDE = 4096  # pixels; such a patch takes seconds, and larger ones gain nothing
 _SMALLEST_SIDE = 128  # pixels; reading and planning smaller patches takes longer than imaging
 _MOST_ON_CLUSTER = 1000  # patches submitted at once: enough for any cluster, few to wait for
-# Pixels times channels. Backprojecting a smaller patch takes less time than planning it.
-_WORTH_A_PLAN = 5e7
 
 
 def mosaic(
@@ -816,8 +815,7 @@ def _formed(
             "use smaller patches",
         )
     accuracy_db = request.get("accuracy_db")
-    worth_a_plan = "stages" in request or lines.channels * grid.size > _WORTH_A_PLAN
-    if accuracy_db is None and not worth_a_plan:
+    if accuracy_db is None and "stages" not in request and is_soon_done(lines, grid, device):
         accuracy_db = tolerance_in_db(*(request.get(name) for name in REQUESTS[:2]))
     if accuracy_db is not None:
         scene = Scene.of(lines, grid, beam, accuracy_db)

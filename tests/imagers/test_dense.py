@@ -31,7 +31,7 @@ KINDS = ("hills", "volume", "bistatic", "moving")
 @pytest.fixture(autouse=True)
 def _searches_are_free(monkeypatch):
     """These images are so small that no second search would pay."""
-    monkeypatch.setattr(planner, "_SEARCH_S", 0.0)
+    monkeypatch.setattr(planner, "SEARCH_S", 0.0)
 
 
 @cache

@@ -30,7 +30,8 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.image_error import relative_error_db
 from clsas.engine.data.validate import ClsasWarning
 from clsas.engine.device.device import list_devices
-from clsas.engine.factorized import planner
+from clsas.engine.factorized import measured_costs, planner
+from clsas.engine.factorized.costs import Costs, KnownCosts
 from clsas.mosaics.devices import claim_device
 from clsas.mosaics.document import Document, Record
 from clsas.mosaics.patches import Layout
@@ -156,6 +157,14 @@ def test_the_directions_are_those_of_the_whole_track():
     assert relative_error_db(image, reference) < -65
 
 
+@pytest.mark.parametrize("pixel_ns", [1.0, pytest.param(1e6, marks=pytest.mark.slow)])
+def test_patches_are_planned_if_the_device_takes_longer_than_a_search(pixel_ns, monkeypatch):
+    costs = KnownCosts(Costs(pixel_ns=pixel_ns), "given")
+    monkeypatch.setattr(measured_costs, "load", lambda device: costs)
+    (patch,) = clsas.mosaic(LINES, GRID, tolerance_db=-30, beam=BEAM, patches=(1, 1))
+    assert (patch.record.plan is not None) == (pixel_ns > 1)
+
+
 class TestFactorized:
     """A scene so large that every patch is factorized."""
 
@@ -178,7 +187,7 @@ class TestFactorized:
             scene[0], cls.GRID, tolerance_db=cls.TOLERANCE_DB, beam=cls.BEAM, patches=(2, 2)
         )
         with pytest.MonkeyPatch.context() as patch:  # plan every patch, however small
-            patch.setattr(planner, "_SEARCH_S", 0.0)
+            patch.setattr(planner, "SEARCH_S", 0.0)
             return mosaic.image(patches.append), patches
 
     @pytest.mark.slow
@@ -388,7 +397,7 @@ def test_missing_samples_are_flagged(file, tmp_path):
 @pytest.mark.parametrize("wish", [{}, {"accuracy_db": None, "tolerance_db": -65}])
 def test_missing_channels_weigh_nothing(file, wish, monkeypatch):
     """Neither in a beam that divides by the sum of weights, nor in a plan."""
-    monkeypatch.setattr("clsas.mosaics.mosaic._WORTH_A_PLAN", 0)
+    monkeypatch.setattr(planner, "SEARCH_S", 0.0)
     beam = BeamWindow(8.0, "hann", normalise=True)
     kept = np.random.default_rng(1).random(160) > 0.2
     with h5py.File(file, "r+") as lines:

@@ -44,7 +44,7 @@ from clsas.engine.factorized.costs import (
 )
 from clsas.engine.factorized.errors import leaf_error, nearest_errors
 from clsas.engine.factorized.filters import ALIGN_TAPS
-from clsas.engine.factorized.plan import UNREACHED, ErrorBudget, Plan
+from clsas.engine.factorized.plan import UNREACHED, ErrorBudget, Plan, Work
 from clsas.engine.factorized.sampled import SampledRoots, SampledScene, Side, points_at_m
 from clsas.engine.factorized.search import MOST_STAGES, Choices
 from clsas.engine.factorized.track import MeanTrack, shapes_after
@@ -72,11 +72,12 @@ TOLERANCE = Number(
 
 NEAREST_UPSAMPLING = 8.0
 """Upsampling of lines before their linear interpolation."""
+SEARCH_S = 0.05
+"""Time that a search takes at least: 0.05 to 0.12 s on a core of 2.5 GHz."""
 
 _MOST_LEAF_ERROR = 1e-8  # power of the expansion of ranges in a tile: -80 dB
 # `scripts/bench sensitivity` halves and doubles these; without a remark nothing changes.
 _WORTH = 0.95  # of the time of an exact image, at most: less gain is within predictions' scatter
-_SEARCH_S = 0.05  # that a search takes at least: 0.05 to 0.12 s on a core of 2.5 GHz
 
 _NO_EXTENT = "all channels are at one place, or there is a single pixel"
 _NOT_FASTER = "no factorization is faster within the tolerance"
@@ -384,12 +385,22 @@ def _exact_fits(request: Request, exact: ExactPrediction) -> bool:
     return request.memory_bytes is None or exact.memory_bytes <= request.memory_bytes
 
 
+def is_soon_done(lines: RangeLines, grid: Grid, device: Device) -> bool:
+    """Return whether lines are backprojected in less time than a search for a plan takes.
+
+    The time is that of 4 taps, all channels and all pixels, by the known costs of the device.
+    """
+    pairs = float(lines.channels * grid.size)
+    work = Work(pixel=pairs) if grid.is_planar else Work(point=pairs)
+    return bool(measured_costs.load(device).costs.seconds(work) <= SEARCH_S)
+
+
 def _worth_a_search(request: Request, exact: ExactPrediction, costs: Costs) -> bool:
     """Return whether a search may pay, or is needed because the exact image does not fit."""
     if request.stages is not None:
         return False
     is_needed = not _exact_fits(request, exact) or request.choices is not None
-    return is_needed or bool(costs.seconds(exact.work) > _SEARCH_S)
+    return is_needed or bool(costs.seconds(exact.work) > SEARCH_S)
 
 
 def _completed(found: Plan, request: Request, scene: Scene, costs: KnownCosts) -> Plan:
@@ -440,10 +451,10 @@ def _fastest_of_shapes(
         # Another search must pay for itself.
         if best.plan is not None:
             to_beat_s = _WORTH * best.plan.predicted_seconds
-        other = sampled.with_shape(shape) if to_beat_s > _SEARCH_S else None
+        other = sampled.with_shape(shape) if to_beat_s > SEARCH_S else None
         if other is None:
             continue
-        found = _fastest_unless_hindered(other, limits, conditions, to_beat_s - _SEARCH_S, choices)
+        found = _fastest_unless_hindered(other, limits, conditions, to_beat_s - SEARCH_S, choices)
         if found.plan is not None:
             best = found
         elif best.plan is None:

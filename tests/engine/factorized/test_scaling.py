@@ -36,7 +36,7 @@ def measured(monkeypatch):
     found = Measured()
     monkeypatch.setattr(costs, "measure", lambda device: found.append(device) or found.scale)
     # However small the image is.
-    monkeypatch.setattr("clsas.engine.factorized.planner._SEARCH_S", 0.0)
+    monkeypatch.setattr("clsas.engine.factorized.planner.SEARCH_S", 0.0)
     return found
 
 
@@ -94,7 +94,7 @@ def test_plans_without_a_search_measure_nothing(cache, measured, request_):
 
 def test_nor_do_plans_of_small_images_or_with_given_costs(cache, measured, monkeypatch):
     assert plan(*scene(), **REQUEST, costs=EXACT_IS_SLOW).prediction.cost_source == "given"
-    monkeypatch.setattr("clsas.engine.factorized.planner._SEARCH_S", 1e6)
+    monkeypatch.setattr("clsas.engine.factorized.planner.SEARCH_S", 1e6)
     assert plan(*scene(), **REQUEST).prediction.cost_source == "default"
     assert not measured
 
