@@ -62,7 +62,9 @@ _LOOK = "look_direction"  # which only some files of a survey may state
 # Files added later may remove the look direction of all channels.
 _NOT_IN_PARTS: Without = {RangeLines: ("samples", _LOOK, "georeference")}
 _SKIPPED = 64  # unused channels in a row that are read along: faster than a second read
-_GAP = 3.0  # a gap is a distance between pings of more than this many median distances
+# Gap between the phase centres of a patch, in median distances. It is larger than that of a check
+# of pings: arrays, and passes beside each other, make uneven distances even if no ping is lost.
+_PATCH_GAP = 3.0
 # Files below which their order says little, and the share of those out of place that is reported:
 # plain choices. Shuffled names reach 0.9. A file is out of place if the next one begins so many
 # times farther away than the nearest, and that lies as near as adjacent files do.
@@ -642,7 +644,7 @@ def beam_json(beam: BeamWindow) -> str:
 
 
 def largest_gap_m(lines: RangeLines, missing: NDArray[np.bool_]) -> float:
-    """Return the longest distance between consecutive pings, metres, or 0 if it is not a gap.
+    """Return the longest distance of phase centres along the track, or 0 if it is not a gap.
 
     A gap is longer than three median distances. Missing channels cause gaps too.
     """
@@ -656,4 +658,4 @@ def largest_gap_m(lines: RangeLines, missing: NDArray[np.bool_]) -> float:
     steps_m = np.diff(np.sort(every_m[:, axis]))
     median_m = float(np.median(steps_m[steps_m > 0])) if steps_m.any() else 0.0
     longest_m = float(np.diff(np.sort(some_m[:, axis])).max(initial=0.0))
-    return longest_m if longest_m > _GAP * median_m else 0.0
+    return longest_m if longest_m > _PATCH_GAP * median_m else 0.0

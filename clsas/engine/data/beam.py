@@ -19,6 +19,7 @@ from clsas.engine.data import reprs, validate
 from clsas.engine.data.decibels import amplitude
 from clsas.engine.data.declared import Choice, Count, Flag, Number, check_fields
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.pings import PASS_JUMP
 from clsas.engine.data.system import element_pattern
 from clsas.engine.data.validate import ArgumentError
 
@@ -43,7 +44,6 @@ _STEEP_TAPER = 0.1  # largest taper with which the errors of "tukey" are those o
 
 # Of the direction of the track
 _SMOOTHED_SHARE = 4  # by default a cubic is fitted to a quarter of the pings
-_NEW_LEG = 10.0  # step between pings, in median steps, from which on a new leg of the track begins
 _SHORTEST_LEG = 5  # pings: those that a cubic needs, and one more
 _JUMPS = 0.05  # share of steps to other places from which on pings are out of order; of legs of 20
 _WINDING = 4.0  # length of a track over its extent up to which the order is not questioned
@@ -567,7 +567,7 @@ def _along_track(lines: RangeLines) -> NDArray[np.int64] | None:
     from scipy.spatial import cKDTree  # slow to import
 
     apart_m = np.median(cKDTree(pings_m).query(pings_m, k=2)[0][:, 1])
-    if np.mean(steps_m > _NEW_LEG * apart_m) <= _JUMPS:
+    if np.mean(steps_m > PASS_JUMP * apart_m) <= _JUMPS:
         return None
     rank = np.empty(len(pings_m), np.int64)
     left_m = pings_m.copy()
@@ -586,7 +586,7 @@ def _legs(centres_m: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
     median_m = np.median(steps_m)
     starts = [0]
-    for start in np.flatnonzero(steps_m > _NEW_LEG * median_m) + 1 if median_m else ():
+    for start in np.flatnonzero(steps_m > PASS_JUMP * median_m) + 1 if median_m else ():
         if min(start - starts[-1], len(centres_m) - start) >= _SHORTEST_LEG:
             starts.append(int(start))
     return np.split(centres_m, starts[1:])

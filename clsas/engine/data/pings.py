@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 STILL = 0.1
 """Share of the usual advance within which a platform counts as standing still."""
+PASS_JUMP = 8.0
+"""Step over the median step from which on another pass, or leg, of the track begins."""
 # Pings of the shortest halt. Noise in positions brings two or three pings together without a halt.
 _LEAST_HALT = 5
 # Share of pings after which the track turns back. If it is larger, the pings are out of order, and

@@ -23,6 +23,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from clsas.engine.data.lines import RangeLines, some_channels
+from clsas.engine.data.pings import PASS_JUMP
 
 Shape = Literal["track", "strips", "sheet"]
 """Shape of a mean track: one curve, several curves, or a curve that moves sideways."""
@@ -50,7 +51,6 @@ _SCREENED = 512  # channels by which a single curve is accepted or rejected
 _FAR_OFF = 2.0  # rms distance per axis at which one curve is rejected, wavelengths
 
 # Strips
-_JUMP = 8.0  # median steps between channels; a longer step begins another pass
 _LEAST_OF_STRIP = 32  # fewest channels of a strip
 _MOST_STRIPS = 128
 _MOST_PAIRS = 64.0  # most neighbours of a channel within a jump, on average
@@ -438,7 +438,7 @@ def strips(lines: RangeLines, wavelength_m: float) -> MeanTrack | None:
 def _passes_between_jumps(centres_m: NDArray[np.float64]) -> list[NDArray[np.int64]]:
     """Return the channels of each pass, for passes that follow each other, separated by jumps."""
     steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
-    jumps = np.flatnonzero(steps_m > _JUMP * np.median(steps_m)) + 1
+    jumps = np.flatnonzero(steps_m > PASS_JUMP * np.median(steps_m)) + 1
     return np.split(np.arange(len(centres_m)), jumps)
 
 
@@ -453,11 +453,12 @@ def _passes_of_neighbours(centres_m: NDArray[np.float64]) -> list[NDArray[np.int
     some = centres_m[some_channels(count, _SCREENED)]
     # Channels of a helix or a planar array, which have no passes, have many neighbours in a jump.
     step_m = float(np.median(tree.query(some, k=2)[0][:, -1]))
-    neighbours = tree.query_ball_point(some, _JUMP * step_m, return_length=True)
+    neighbours = tree.query_ball_point(some, PASS_JUMP * step_m, return_length=True)
     # The mean bounds the memory for pairs: all channels of a platform at rest are neighbours.
-    if step_m == 0 or np.median(neighbours) > 2 * _JUMP + 1 or np.mean(neighbours) > _MOST_PAIRS:
+    has_passes = np.median(neighbours) <= 2 * PASS_JUMP + 1 and np.mean(neighbours) <= _MOST_PAIRS
+    if step_m == 0 or not has_passes:
         return []
-    pairs = tree.query_pairs(_JUMP * step_m, output_type="ndarray")
+    pairs = tree.query_pairs(PASS_JUMP * step_m, output_type="ndarray")
     joined = coo_array((np.ones(len(pairs), np.int8), tuple(pairs.T)), shape=(count, count))
     _, label = connected_components(joined, directed=False)
     return np.split(np.argsort(label, kind="stable"), np.cumsum(np.bincount(label))[:-1])

@@ -51,12 +51,13 @@ def test_a_direction_that_is_given_is_made_a_unit():
     np.testing.assert_allclose(each, np.eye(3))
 
 
-def test_directions_of_legs():
+@pytest.mark.parametrize("apart_m", [4.5, 20])
+def test_directions_of_legs(apart_m):
     """Each leg has its own direction up to its ends."""
     leg = np.zeros((60, 3))
     leg[:, 0] = np.linspace(0, 30, 60)
     across = leg[:, [1, 0, 2]] + [40, 5, 0]
-    tx_m = np.concatenate([leg, leg[::-1] + [0, 20, 0], across])
+    tx_m = np.concatenate([leg, leg[::-1] + [0, apart_m, 0], across])
     lines = RangeLines(np.ones((180, 1), complex), 0.0, 0.1, tx_m, tx_m, 1e5, 1500.0)
     directions = BeamWindow(10).directions(lines)
     expected = np.repeat([[1, 0, 0], [-1, 0, 0], [0, 1, 0]], 60, axis=0)
