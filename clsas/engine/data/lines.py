@@ -241,6 +241,15 @@ class RangeLines:
         return 2 * self.carrier_hz / self.sound_speed_m_s
 
     @property
+    def highest_cycles_per_m(self) -> float:
+        """Two-way phase per metre of range at the highest frequency sampled, cycles per metre.
+
+        Lines whose carrier was mixed out contain half the sample rate beyond it; those on their
+        carrier, up to the whole rate.
+        """
+        return self.carrier_cycles_per_m + 1 / self.range_step_m
+
+    @property
     def last_range_m(self) -> NDArray[np.float64]:
         """Range of each channel's last sample, metres, shape [channels]."""
         return self.first_range_m + (self.length - 1) * self.range_step_m
@@ -719,9 +728,9 @@ def fastest(lines: RangeLines) -> float:
 def wavelength_m(lines: RangeLines) -> float:
     """Return the wavelength of the carrier, metres; infinite for lines without a carrier.
 
-    Element patterns, and beams that correct for them, use this wavelength. Lengths such as a track
-    error or the spacing of channels are compared with `band_wavelength_m`, which does not depend on
-    what was mixed out.
+    Element patterns, beams that correct for them, and limits of the spacing of channels, which a
+    sonar has without lines, use this wavelength. Lengths in lines, such as a track error, are
+    compared with `band_wavelength_m`, which does not depend on what was mixed out.
     """
     return lines.sound_speed_m_s / lines.carrier_hz if lines.carrier_hz else math.inf
 

@@ -114,7 +114,7 @@ def simplify(
     flat = grid.is_planar or len(grid.shape) != 2
     if allowed_db is None or (flat and not apart and lines.rx_velocity_m_s is None):
         return full
-    highest = lines.carrier_cycles_per_m + 1 / lines.range_step_m
+    highest = lines.highest_cycles_per_m
     most = math.sqrt(SHARE * power(allowed_db))
     if not flat and (apart or lines.rx_velocity_m_s is not None):
         most /= 2  # because the amplitudes of antennas and relief add up

@@ -234,7 +234,7 @@ class Plan:
                 raise ArgumentError(name, allowed, hint="make a new plan with `clsas.plan`")
         if not self.is_exact:
             # Sampled lines contain no higher frequencies; a higher bound would only need memory.
-            most = abs(lines.carrier_cycles_per_m) + 1 / lines.range_step_m
+            most = lines.highest_cycles_per_m
             if lines.sound_speed is not None:  # slower water at the seabed has shorter wavelengths
                 most *= 2
             given = self.factorization.highest_cycles_per_m

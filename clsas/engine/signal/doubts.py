@@ -20,7 +20,8 @@ from clsas.engine.data.coverage import behind
 from clsas.engine.data.findings import Finding, warn_of
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines, banks_of, some_channels
+from clsas.engine.data.lines import RangeLines, band_wavelength_m, banks_of, some_channels
+from clsas.engine.data.lines import wavelength_m as carrier_wavelength_m
 from clsas.engine.data.reprs import measured
 from clsas.engine.data.track import LEAST_FIXES, MOST_HELD, held_fixes, rounded_to
 from clsas.engine.data.visibility import sines
@@ -103,8 +104,8 @@ def doubts(
 ) -> Iterator[Finding]:
     """Yield what cannot be right about lines, and about a grid and a beam for them."""
     # Lines on their carrier have about the wavelength of the highest frequency sampled.
-    step_m = 4 * lines.range_step_m
-    wavelength_m = lines.sound_speed_m_s / lines.carrier_hz if lines.carrier_hz else step_m
+    on_carrier_m = band_wavelength_m(lines, 0.0)
+    wavelength_m = carrier_wavelength_m(lines) if lines.carrier_hz else on_carrier_m
     wrong_units = list(_speed(lines)) or list(_units(lines, wavelength_m))
     yield from wrong_units
     yield from doubts_of_fixes(lines, None if wrong_units or not lines.carrier_hz else wavelength_m)
@@ -406,7 +407,7 @@ def _focused(
     """
     centres_m = lines.phase_centres_m
     points_m = grid.spread(_ARC)
-    wavelength_m = lines.sound_speed_m_s / lines.carrier_hz
+    wavelength_m = carrier_wavelength_m(lines)
 
     def at(places_m: NDArray[np.float64], some: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
         range_m = pairwise_range_m(places_m, lines.tx_m[some], lines.rx_m[some])

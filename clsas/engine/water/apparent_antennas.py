@@ -161,6 +161,7 @@ class Change:
         included. Lines get as many more samples as their band then needs.
         """
         changed = self.antennas(lines, slice(None))
+        # Not `highest_cycles_per_m`: a band around the carrier reaches half the sample rate beyond.
         highest = 2 * lines.carrier_hz / sound_speed_m_s + 0.5 / changed.range_step_m
         finer = 1 + 2 * highest * self._steepest * changed.range_step_m
         length = 1 + math.ceil((lines.length - 1) * finer)

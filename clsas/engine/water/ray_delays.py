@@ -248,7 +248,7 @@ class RaySample:
             self.visible, (2 * range_m / lines.sound_speed_m_s - self.delay_s) ** 2, 0.0
         )
         seen = np.maximum(np.count_nonzero(self.visible, axis=1), 1)
-        highest_hz = lines.carrier_hz + lines.sound_speed_m_s / (2 * lines.range_step_m)
+        highest_hz = lines.highest_cycles_per_m * lines.sound_speed_m_s / 2
         return float((2 * np.pi * highest_hz) ** 2 * (square.sum(axis=1) / seen).max())
 
 
