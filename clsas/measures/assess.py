@@ -34,7 +34,7 @@ from clsas.engine.data.lines import (
 )
 from clsas.engine.data.reprs import Report, Table
 from clsas.engine.data.simplify import APART, MOTION, REFRACTION, RELIEF, SHARE, leave_out
-from clsas.engine.data.sound_speed import SoundSpeed
+from clsas.engine.data.sound_speed import SoundSpeed, range_bounds_m
 from clsas.engine.data.surface import surface_of
 from clsas.engine.data.system import Sonar, element_pattern
 from clsas.engine.data.track import Pointing, Track, channels
@@ -793,7 +793,7 @@ def survey_lines(
     near_m, far_m = range_m.min(axis=0), range_m.max(axis=0)
     if sound_speed is not None:
         validate.instance("sound_speed", sound_speed, SoundSpeed)
-        near_m, far_m = sound_speed.bounds_m(near_m, far_m, sonar.sound_speed_m_s)
+        near_m, far_m = range_bounds_m(sound_speed, near_m, far_m, sonar.sound_speed_m_s)
     first_m = near_m - _MARGIN * step_m
     extent = float((far_m - first_m).max() / step_m)
     validate.memory("oversampling", 8 * len(first_m) * extent)

@@ -32,6 +32,7 @@ from clsas.engine.data.digests import Without, digest
 from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.sound_speed import range_bounds_m
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import BeamTrack, Boxes
 from clsas.files.hdf5 import FileFormatError, read_geometry, read_samples
@@ -433,7 +434,7 @@ class SurveyVisibility:
             extent_m += 1.1 * speed * (middle_m + radius_m)
         near_m, far_m = middle_m - extent_m, middle_m + extent_m
         if (profile := geometry.sound_speed) is not None:
-            near_m, far_m = profile.bounds_m(near_m, far_m, geometry.sound_speed_m_s)
+            near_m, far_m = range_bounds_m(profile, near_m, far_m, geometry.sound_speed_m_s)
         return near_m, far_m
 
     def channels(self, grid: Grid) -> NDArray[np.bool_]:

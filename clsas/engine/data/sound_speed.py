@@ -241,21 +241,6 @@ class SoundSpeed:
         check_reaches(self, z)
         return np.interp(self.surface_z_m - z, self.depth_m, self.speed_m_s)
 
-    def bounds_m(
-        self, near_m: NDArray[np.float64], far_m: NDArray[np.float64], sound_speed_m_s: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return bounds of ranges by delays in this water, metres.
-
-        Parameters
-        ----------
-        near_m, far_m : float64 array
-            Bounds of the ranges in homogeneous water, metres.
-        sound_speed_m_s : float
-            Sound speed by which delays become ranges, metres per second.
-        """
-        fastest, slowest = self.speed_m_s.max(), self.speed_m_s.min()
-        return near_m * (sound_speed_m_s / fastest), far_m * (sound_speed_m_s / slowest)
-
     def mean_m_s(self, one_z_m: float, other_z_m: float) -> float:
         """Return the mean sound speed between two heights, metres per second.
 
@@ -287,6 +272,14 @@ class SoundSpeed:
             np.log1p(relative), relative, out=np.ones_like(relative), where=relative > 0
         )
         return float((top - bottom) / np.sum(np.diff(depth) / slower * share))
+
+
+def range_bounds_m(
+    profile: SoundSpeed, near_m: NDArray[np.float64], far_m: NDArray[np.float64], speed_m_s: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return bounds of ranges in a profile from those in water of the speed by which they count."""
+    fastest, slowest = profile.speed_m_s.max(), profile.speed_m_s.min()
+    return near_m * (speed_m_s / fastest), far_m * (speed_m_s / slowest)
 
 
 def check_reaches(profile: SoundSpeed, z_m: ArrayLike, name: str = "`z_m`") -> None:
