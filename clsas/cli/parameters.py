@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import click
 
 from clsas.cli.wording import option_name
 from clsas.engine.data import validate
+from clsas.engine.data.atomic import check_writable
 from clsas.engine.data.extras import check_installed
 from clsas.engine.data.reading import check_ordinary
 
@@ -149,8 +149,7 @@ class Output(File):
             self.fail(f"there is no folder {str(path.parent)!r}", param, ctx)
         try:
             special = _exists(path) and not path.is_file()
-            with tempfile.TemporaryFile(dir=path.parent):
-                pass
+            check_writable(path.parent, path)
         except OSError as error:
             self.fail(f"{str(path)!r} cannot be written: {error.strerror}", param, ctx)
         if special:

@@ -16,6 +16,7 @@ from clsas.cli.outputs import printable, report
 from clsas.cli.parameters import POSITION, File, Output, keep_out, need_matplotlib
 from clsas.cli.wording import command
 from clsas.files.formats import SUFFIXES
+from clsas.mosaics.levels import COARSEST_SIDE
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.plot.images import amplitude_at, window_around
 
@@ -33,7 +34,6 @@ Shown: TypeAlias = (
 )
 
 _ENDINGS = (*SUFFIXES, ".mat", ".json", ".zarr")  # that the picture's name does without
-_MOST_PIXELS = 1024  # of a mosaic, along its longer side; a picture has as many dots
 _JSON = b"{"
 _MARKS = ("--north-arrow", "--scale-bar")
 
@@ -173,11 +173,11 @@ def _drawn(
         chosen = {name: levels[name] for name in levels if name == "colour_map"}
         return plot.heights(shown, **chosen, title=title), repr(shown)
     if isinstance(shown, clsas.Store) and shown.layers:
-        found = shown.overview_heights(_MOST_PIXELS, *_window(shown, near, extent_m))
+        found = shown.overview_heights(COARSEST_SIDE, *_window(shown, near, extent_m))
         chosen = {name: levels[name] for name in levels if name == "colour_map"}
         return plot.heights(found, **chosen, title=title), repr(found)
     if isinstance(shown, clsas.Store):
-        shown = shown.overview(_MOST_PIXELS, *_window(shown, near, extent_m))
+        shown = shown.overview(COARSEST_SIDE, *_window(shown, near, extent_m))
     elif isinstance(shown, clsas.Image) and shown.grid.points_m is None:
         shown = _part(shown, near, extent_m)
     values = shown.pixels if isinstance(shown, clsas.Image) else shown.samples

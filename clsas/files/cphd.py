@@ -25,6 +25,7 @@ from scipy.constants import speed_of_light
 from clsas.engine.data import reading, validate
 from clsas.engine.data.atomic import replacing
 from clsas.engine.data.extras import needed
+from clsas.engine.data.fourier import turned
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.reading import parse_json
@@ -425,7 +426,7 @@ def _lines_of_toa(
     for row, line in enumerate(signal):
         cycles = (middle_hz[row] - carrier_hz) * (start_s[row] + number * step_s[0])
         cycles -= 2 * carrier_hz / speed_of_light * reference_m[row]
-        samples[row] = line * np.exp(2j * np.pi * (cycles - np.rint(cycles)))
+        samples[row] = line * turned(cycles)
     return RangeLines(
         samples,
         first_range_m=reference_m + speed_of_light / 2 * start_s,
@@ -549,7 +550,7 @@ def _vectors(lines: RangeLines, origin_m: NDArray) -> tuple[NDArray, NDArray[np.
     for row, line in enumerate(lines.samples):
         range_m = lines.first_range_m[row] + np.arange(lines.length) * lines.range_step_m
         cycles = 2 / speed_of_light * (carrier_hz * reference_m[row] - moved_hz * range_m)
-        signal[row] = line * np.exp(2j * np.pi * (cycles - np.rint(cycles)))
+        signal[row] = line * turned(cycles)
     return vectors, signal
 
 

@@ -21,7 +21,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.coverage import behind
 from clsas.engine.data.findings import Finding
 from clsas.engine.data.geometry import pairwise_range_m
-from clsas.engine.data.grid import Grid
+from clsas.engine.data.grid import SAMPLED_PIXELS, Grid
 from clsas.engine.data.lines import RangeLines, banks_of, some_channels, wavelength_between_m
 from clsas.engine.data.pings import STILL, Transmissions
 from clsas.engine.data.reprs import measured
@@ -70,8 +70,6 @@ a quarter of a line exceed it. A full matrix capture reaches 0.12 by surface wav
 along the array and arrive before any echo."""
 _OUTSIDE = 0.01  # share of the pixels that no line reaches, above which it is reported
 _SLIPPED = 0.25  # such a share, above which slips of units are tried
-_POINTS = 16
-"""Grid points sampled along either side."""
 _EXPLAINED = 0.5  # least share of the uncovered grid that a slip must explain
 _LONGEST = 30.0
 """Length of corrected lines relative to the farthest range of the grid, at most. Longer lines would
@@ -585,7 +583,7 @@ def check_grid(recording: Recording) -> Iterator[Finding]:
     lines, grid = recording.lines, recording.grid
     if grid is None or _beyond_any_range(lines):
         return
-    points_m = grid.spread(_POINTS).reshape(-1, 3)
+    points_m = grid.spread().reshape(-1, 3)
     share = _covered(lines, points_m)
     if share >= 1 - _OUTSIDE:
         return
@@ -599,7 +597,7 @@ def check_grid(recording: Recording) -> Iterator[Finding]:
     )
     low_m, high_m = grid.bounds_m
     remedy = "choose another grid, or check the time of the first sample and the sound speed"
-    if near_m <= float(np.linalg.norm(high_m - low_m)) / _POINTS:
+    if near_m <= float(np.linalg.norm(high_m - low_m)) / SAMPLED_PIXELS:
         remedy = "choose another grid: the track runs through this one"
     elif 1 - share > _SLIPPED and (likely := _likely_slip(lines, points_m, share, far_m)):
         slip, corrected = likely

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,13 +10,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
+from clsas.engine.data import validate
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, some_channels
-from clsas.engine.data.validate import ClsasWarning
 from clsas.engine.device.device import Device
 from clsas.engine.imaging import backproject
 from clsas.engine.scene import check_numbers
+from clsas.engine.signal.doubts import blurred_aperture_m
 
 CLEAR = 1.5
 """Least ratio of the two sharpnesses that determines the sign. In speckle it reaches 1.1."""
@@ -25,9 +25,6 @@ _SHARP = 10.0
 """Least sharpness along the track of a patch in focus. A point has 80 and speckle 2. Where the arcs
 of several targets cross, or on a noisy track, it reaches 7 with either sign."""
 _TARGETS = 5  # targets whose patches are compared; all that are in focus must agree
-_BLUR = 100.0
-"""Length of the aperture relative to the resolution it gives. The wrong sign blurs a point by this
-factor."""
 _LEAST_BLUR = 8.0  # below it, both signs look alike
 _LEAST_CHANNELS, _MOST_CHANNELS = 16, 1024
 _MOST_BEND = 0.25
@@ -101,8 +98,7 @@ def phase_sign(
             continue
         sharpness = []
         for each in (part, replace(part, samples=part.samples.conj())):
-            with warnings.catch_warnings():  # about accuracy, which is not needed here
-                warnings.simplefilter("ignore", ClsasWarning)
+            with validate.muted():  # about accuracy, which is not needed here
                 image = backproject(each, patch, device=device, accuracy_db=_ACCURACY_DB)
             # Row by row, that is along the track: echoes confined to a few ranges do not count as
             # sharp, since blurred ones are too.
@@ -259,7 +255,7 @@ def _patch(
     middle_m = centres_m[channel]
     look_m = position_m - middle_m
     range_m = float(np.linalg.norm(look_m))
-    aperture_m = math.sqrt(_BLUR / 2 * wavelength_m * range_m)
+    aperture_m = blurred_aperture_m(wavelength_m, range_m)
     near = np.flatnonzero(np.linalg.norm(centres_m - middle_m, axis=1) <= aperture_m / 2)
     if len(near) < _LEAST_CHANNELS:
         raise _UndeterminedError(

@@ -24,6 +24,8 @@ from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 
 SLACK = 0.01
 """Relative excess of a spacing that is tolerated: a sway of centimetres changes it a little."""
+ROUNDING = 1e-6
+"""Relative excess of a limit that rounding explains."""
 
 
 def check_sampling(
@@ -169,7 +171,7 @@ def check_sampling(
     if isinstance(sonar, Sonar) and isinstance(track, Track) and track.pings > 1:
         _, last_s = receive_interval_s(far_m, far_m, sonar.pulse.duration_s, sonar.sound_speed_m_s)
         rate_hz = float(1 / np.diff(track.time_s).min())
-        if rate_hz * last_s > 1 + 1e-6:
+        if rate_hz * last_s > 1 + ROUNDING:
             message = (
                 f"the ping rate of {rate_hz:.4g} Hz is above {1 / last_s:.4g} Hz: the last echo, "
                 f"from {far_m:.4g} m, ends {last_s:.4g} s after its ping, when the next ping has "

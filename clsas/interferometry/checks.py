@@ -34,7 +34,11 @@ WINDOW = Number(
     default="that of about 50 independent samples",
 )
 """Declares the windows in which the phase between the banks is averaged."""
-PATCH = Number("m", above=0.0, help="Side of the patches of a store.", default="1024 pixels")
+PATCH_PIXELS = 1024
+"""Pixels along a patch of a mosaic of heights by default, which then takes about 0.6 GiB."""
+PATCH = Number(
+    "m", above=0.0, help="Side of the patches of a store.", default=f"{PATCH_PIXELS} pixels"
+)
 """Declares the approximate side of the patches of a mosaic of heights."""
 COHERENCE = Number(least=0.1, most=0.99, help="Smallest coherence of a valid height.")
 """Declares the coherence from which on heights are valid."""

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from clsas.engine.data.beam import track_directions
+from clsas.engine.data.fourier import turned
 from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, antennas_of, wavelength_m
@@ -121,8 +122,7 @@ def lines_of_point(
     from_end = np.minimum(np.arange(lines.length), np.arange(lines.length)[::-1])
     pulse *= np.sin(np.pi / 2 * np.minimum(4 * from_end / lines.length, 1)) ** 2
     amplitude = _two_way_pattern(lines, point_m, along) * _gains(lines)
-    turns = lines.carrier_cycles_per_m * range_m
-    received = amplitude * np.exp(-2j * np.pi * (turns - np.rint(turns)))
+    received = amplitude * turned(-lines.carrier_cycles_per_m * range_m)
     largest = float(np.abs(received).max() * np.abs(pulse).max())
     return replace(
         lines,

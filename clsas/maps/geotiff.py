@@ -27,6 +27,7 @@ from clsas.engine.data.atomic import assembling
 from clsas.engine.data.extras import needed
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
+from clsas.engine.data.threads import cores
 from clsas.engine.data.validate import ArgumentError
 from clsas.maps.georeferencing import Affine, Orientation, cover, warn_of_place
 from clsas.maps.sources import Band, Source, bands_of, windows_of
@@ -171,7 +172,7 @@ def write(
                     file.scales, file.offsets = (step_db,), (-dynamic_range_db - step_db,)
             rasterio.shutil.copy(
                 base, made, driver="COG", OVERVIEWS="FORCE_USE_EXISTING", BLOCKSIZE=_TILE,
-                BIGTIFF="IF_SAFER", NUM_THREADS="ALL_CPUS", **_COMPRESSION[kind],
+                BIGTIFF="IF_SAFER", NUM_THREADS=cores(), **_COMPRESSION[kind],
             )  # fmt: skip
             steps.add(4 * grid.size)
             check_whole(made)

@@ -18,7 +18,6 @@ import itertools
 import json
 import math
 import os
-import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from importlib import resources
@@ -30,7 +29,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from clsas.engine.data import validate
-from clsas.engine.data.atomic import replacing_folder
+from clsas.engine.data.atomic import check_writable, replacing_folder
 from clsas.engine.data.decibels import DYNAMIC_RANGE, largest_amplitude
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
@@ -180,6 +179,7 @@ def write(
         "factors": list(factors.values()),
         "reference": reference,
         "step_db": step_db,
+        "brightest": BRIGHTEST,
         "frame": frame_of(known),
         "geographic": None,
         "patches": _patches(readers[0]),
@@ -248,8 +248,7 @@ def check_folder(folder: Path) -> None:
             folder.lstat()  # raises for too long a name
         except FileNotFoundError:
             exists = False
-        with tempfile.TemporaryFile(dir=parent):
-            pass
+        check_writable(parent, folder)
     except OSError as error:
         raise type(error)(f"{folder} cannot be written: {error.strerror}") from error
     if not exists:

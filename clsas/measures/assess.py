@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,6 +31,7 @@ from clsas.engine.data.lines import (
     some_channels,
     wavelength_m,
 )
+from clsas.engine.data.pings import channels_per_ping
 from clsas.engine.data.reprs import Report, Table
 from clsas.engine.data.simplify import APART, MOTION, REFRACTION, RELIEF, SHARE, leave_out
 from clsas.engine.data.sound_speed import SoundSpeed, range_bounds_m
@@ -50,6 +50,7 @@ from clsas.engine.imaging import plan
 from clsas.engine.scene import Scene
 from clsas.engine.signal.ambiguity import ends_error
 from clsas.engine.signal.compression import Window, compress
+from clsas.engine.signal.interpolation import MOST_TAPS
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.engine.water.refraction import Homogeneous, homogeneous
 from clsas.simulation.scenes import PointTargets
@@ -85,8 +86,6 @@ _FULL, _FORMED = "full", "formed"  # images beside those without one effect
 _CHANNELS, _PIXELS = 256, 16  # channels sampled, and pixels along either side of the grid
 _FREQUENCIES = 8  # frequencies of the band sampled, each with an equal share of the power
 _IN_FRONT = 1e-12  # sine by which a point may lie behind an element's face, for rounding
-_POINTS = 16  # grid points along either side whose ranges determine the extent of lines
-_MARGIN = 32  # samples of the lines of a survey on either side of the grid
 
 
 def assess(
@@ -358,8 +357,7 @@ def _images(inputs: Inputs, planned: Callable[..., Plan]) -> dict[str, _Image]:
         flat = leave_out(lines, grid, beam, (RELIEF,)).grid
         if flat.is_planar:
             altered[RELIEF] = lines, flat, beam
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", validate.ClsasWarning)  # of ends, which are an effect
+    with validate.muted():  # about ends, which are an effect
         full = planned(lines, grid, beam=inputs.beam)
         images = {}
         if full.left_out:
@@ -375,8 +373,7 @@ def _images(inputs: Inputs, planned: Callable[..., Plan]) -> dict[str, _Image]:
 def _measured(images: dict[str, _Image], device: Device, repeats: int) -> dict[str, float]:
     """Return the shortest time of every image; they are formed in turns, after an untimed one."""
     seconds: dict[str, list[float]] = {name: [] for name in images}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", validate.ClsasWarning)
+    with validate.muted():
         for turn in range(repeats + 1):
             for name, (lines, grid, beam, chosen) in images.items():
                 start = time.perf_counter()
@@ -520,8 +517,7 @@ def track_errors_m(lines: RangeLines) -> NDArray[np.float64]:
     not an error.
     """
     centres_m = lines.phase_centres_m
-    starts = lines.ping_starts
-    counts = np.diff(np.append(starts, lines.channels))
+    counts = channels_per_ping(lines.ping_starts, lines.channels)
     pings_m = lines.ping_centres_m
     middle_m = pings_m.mean(axis=0)
     direction = np.linalg.svd(pings_m - middle_m, full_matrices=False)[2][0]
@@ -789,15 +785,16 @@ def survey_lines(
         geometry = geometry._replace(tx_m=middle_m, rx_m=middle_m)
     pulse = sonar.pulse
     step_m = sonar.sound_speed_m_s / (2 * float(oversampling) * pulse.bandwidth_hz)
-    range_m = pairwise_range_m(grid.spread(_POINTS), *geometry, sonar.sound_speed_m_s)
+    range_m = pairwise_range_m(grid.spread(), *geometry, sonar.sound_speed_m_s)
     near_m, far_m = range_m.min(axis=0), range_m.max(axis=0)
     if sound_speed is not None:
         validate.instance("sound_speed", sound_speed, SoundSpeed)
         near_m, far_m = range_bounds_m(sound_speed, near_m, far_m, sonar.sound_speed_m_s)
-    first_m = near_m - _MARGIN * step_m
+    # Filters read beyond the grid on either side.
+    first_m = near_m - MOST_TAPS * step_m
     extent = float((far_m - first_m).max() / step_m)
     validate.memory("oversampling", 8 * len(first_m) * extent)
-    length = math.ceil(extent) + _MARGIN
+    length = math.ceil(extent) + MOST_TAPS
     middle = np.ravel_multi_index([n // 2 for n in grid.shape], grid.shape)
     lines = simulate_lines(
         geometry.tx_m,

@@ -20,7 +20,13 @@ from clsas.engine.data.reprs import Report, Table
 from clsas.engine.data.system import Sonar
 from clsas.engine.data.track import Pointing, Track, channels
 from clsas.engine.signal.compression import Window
-from clsas.inspection.sampling import SLACK, corners_of, measure_spacing, receive_interval_s
+from clsas.inspection.sampling import (
+    ROUNDING,
+    SLACK,
+    corners_of,
+    measure_spacing,
+    receive_interval_s,
+)
 from clsas.measures.elevation import phase_per_height
 from clsas.measures.resolution import Survey, range_width_m
 
@@ -63,8 +69,6 @@ LABELS = {
 _Missing = tuple[str, str]
 """Names of results, separated by spaces, and why they cannot be given."""
 
-_POINTS = 16  # grid points along either side that represent the grid
-_ROUNDING = 1e-6  # relative excess of a limit that rounding explains
 _UNITS = {"_m_s": "m/s", "_hz": "Hz", "_db": "dB", "_m": "m", "_s": "s"}
 
 _NO_PINGS = "requires a track of two or more pings at different positions"
@@ -221,7 +225,7 @@ def _result(
     *,
     most: float | None = None,
     least: float | None = None,
-    slack: float = _ROUNDING,
+    slack: float = ROUNDING,
     consequence: str = "",
 ) -> Limit:
     """Return a result, whose unit is that of its name. `most` or `least` is its limit."""
@@ -619,7 +623,7 @@ def _heights(survey: Survey, sonar: Sonar) -> Iterator[Limit | _Missing]:
         return
 
     # The ping that passes closest sees each point.
-    points_m = survey.grid.spread(_POINTS)
+    points_m = survey.grid.spread()
     outermost = Sonar(sonar.pulse, np.stack([low_m, high_m]), tx_m=sonar.tx_m)
     tx_m, rx_m, _ = channels(outermost, survey.track)
     tx_m, rx_m = tx_m[::2], rx_m.reshape(-1, 2, 3)

@@ -31,7 +31,6 @@ from clsas.engine.signal.compression import Window, band_window, compress
 from clsas.inspection.sampling import corners_of, course, grating_lobe_m
 
 _CHANNELS = 1024  # channels whose ranges to the grid are computed, beside the first and last ping
-_POINTS = 16  # grid points along either side for these ranges; the corners are among them
 _STRAIGHT = 0.9  # length of a track over the path along it, below which the track is too curved
 _ALONG = 0.01  # share of the array's extent that lies along the track, below which it is across
 
@@ -169,7 +168,7 @@ class Survey:
         each = self.sonar.receivers
         ends = np.concatenate([np.arange(each), np.arange(len(tx) - each, len(tx))])
         some = np.unique(np.concatenate([ends, some_channels(len(tx), _CHANNELS)]))
-        points_m = np.concatenate([corners_of(self.grid), self.grid.spread(_POINTS)])
+        points_m = np.concatenate([corners_of(self.grid), self.grid.spread()])
         range_m = pairwise_range_m(points_m, tx[some], rx[some])
         if self.beam is not None and self.is_moving:
             low, high = self.beam.limits

@@ -7,7 +7,6 @@ import math
 import os
 import statistics
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -293,8 +292,7 @@ def _with_errors(row: Row, image: Image, reference: Image) -> Row:
         across, upward = image.grid.sides
         at = np.unravel_index(np.abs(reference.pixels).argmax(), reference.grid.shape)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", validate.ClsasWarning)  # about other targets nearby
+            with validate.muted():  # about other targets nearby
                 point = measure_point(image, (across.places_m[at[1]], upward.places_m[at[0]]))
             azimuth, range_ = (
                 Response(cut.resolution_m, max(cut.pslr_nearest_db), cut.islr_db)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from clsas.engine.data import reprs, validate
-from clsas.engine.data.atomic import make_folders, replacing
+from clsas.engine.data.atomic import check_writable, make_folders, replacing
 from clsas.engine.data.digests import digest, is_intact, with_digest
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
@@ -562,11 +561,7 @@ def check_place(path: Path) -> None:
         Document.read(path)
     elif not path.parent.is_dir():
         raise FileNotFoundError(2, "there is no such folder", str(path.parent))
-    try:
-        with tempfile.TemporaryFile(dir=path if path.is_dir() else path.parent):
-            pass
-    except OSError as error:  # it names the temporary file
-        raise type(error)(error.errno, error.strerror, str(path)) from error
+    check_writable(path if path.is_dir() else path.parent, path)
 
 
 def check_own(store: Path, folder: Path) -> None:

@@ -43,6 +43,7 @@ from clsas.interferometry.checks import (
     COHERENCE,
     HEIGHTS_TOLERANCE_DB,
     PATCH,
+    PATCH_PIXELS,
     SEARCH,
     WINDOW,
     check_grid,
@@ -64,7 +65,6 @@ from clsas.mosaics.relief_shadows import mask_shadows, of_shadows
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import PatchSource, Survey, SurveyVisibility, largest_gap_m, open_survey
 
-_SIDE = 1024  # pixels along a patch by default, which then takes about 0.6 GiB
 _TRIAL = 512  # largest side of the part of the grid that decides on the windows; arbitrary
 _NAMED = 4  # patches that a warning names; the others are only counted
 _MARGIN_WINDOWS = 2.0  # beside half a large one: for as many passes, of half a window each
@@ -204,7 +204,7 @@ def mosaic_heights(
     if given is not None and given is not beam:
         warn_of_window(given, banks[0].geometry, {"tolerance_db": request.tolerance_db})
     devices = open_devices(device)
-    sides = [_SIDE, _SIDE]
+    sides = [PATCH_PIXELS, PATCH_PIXELS]
     if patch_m is not None:
         sides = [round(patch_m / float(np.linalg.norm(step_m))) for step_m in grid.vectors_m[1:]]
     counts = [math.ceil(n / max(side, 1)) for n, side in zip(grid.shape, sides, strict=True)]

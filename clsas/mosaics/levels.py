@@ -28,7 +28,7 @@ CHUNK_SIDE = 1024
 """Largest side of a chunk, pixels: 8 MiB of complex pixels, which viewers load at once."""
 
 COARSEST_SIDE = 1024
-"""Largest side of the coarsest level, pixels, which fills a screen."""
+"""Largest side of the coarsest level and of overviews, pixels, which fills a screen."""
 
 IN_DB = "amplitude_db"
 """Name of the array with the coarsest level in dB, which programs can plot as it is."""

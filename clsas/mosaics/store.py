@@ -43,7 +43,7 @@ from clsas.mosaics.document import (
     is_there,
     stamp_of,
 )
-from clsas.mosaics.levels import LAYERS, LEVELS, SHADOWED, level_shape
+from clsas.mosaics.levels import COARSEST_SIDE, LAYERS, LEVELS, SHADOWED, level_shape
 from clsas.mosaics.pyramid import coarser, reduced, step_of
 
 if TYPE_CHECKING:
@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 
     from clsas.mosaics.store_files import StoreFiles
 
-_OVERVIEW = 1024  # pixels along the longer side, which fills a screen
 _READ = 2048  # pixels along a side that are read at once; a plain choice
 _AMPLITUDE = "amplitude"
 _HEIGHTS_BYTES = 100  # per pixel of `Heights`: eight numbers and their copies
@@ -529,7 +528,7 @@ class Store:
 
     def overview_heights(
         self,
-        most: int = _OVERVIEW,
+        most: int = COARSEST_SIDE,
         rows: slice = slice(None),
         columns: slice = slice(None),
     ) -> Heights:
@@ -625,7 +624,7 @@ class Store:
 
     def overview(
         self,
-        most: int = _OVERVIEW,
+        most: int = COARSEST_SIDE,
         rows: slice = slice(None),
         columns: slice = slice(None),
     ) -> Image:

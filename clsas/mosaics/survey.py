@@ -35,6 +35,7 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.sound_speed import range_bounds_m
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import BeamTrack, Boxes
+from clsas.engine.signal.interpolation import MOST_TAPS
 from clsas.files.hdf5 import FileFormatError, read_geometry, read_samples
 from clsas.mosaics.document import PatchIndex
 from clsas.mosaics.patches import Layout
@@ -56,7 +57,7 @@ FOLLOW = Number(
 )
 """Declares for how long the folder of a survey is followed."""
 _TAPER = 64  # samples over which a line fades where it is cut
-_MARGIN = 32  # unchanged samples between pixels and taper, for interpolation and its ringing
+_MARGIN = MOST_TAPS  # unchanged samples between pixels and taper, for filters and their ringing
 _DIGESTED = 16  # lines of a file that enter its digest; all of them would take too long to read
 _LOOK = "look_direction"  # which only some files of a survey may state
 # Samples are those of the part, and the georeference is that of the grid, which mosaics compare.

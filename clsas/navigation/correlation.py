@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from clsas.engine.data import decibels
+from clsas.engine.data.fourier import turned
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at
 from clsas.engine.data.system import element_pattern
 from clsas.engine.signal.interpolation import Readout
@@ -252,7 +253,7 @@ class Correlator:
         carrier = geometry.lines.carrier_cycles_per_m
         turns = carrier * path_m - self.cycles_per_m * range_m
         values = self.readout.read(channels, path_m).astype(np.complex128)
-        return values * np.exp(2j * np.pi * (turns - np.rint(turns)))
+        return values * turned(turns)
 
 
 def are_dead(power: NDArray[np.float64], usual: NDArray[np.float64] | float) -> NDArray[np.bool_]:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import least_squares
 
+from clsas.engine.data.fourier import turned
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at, some_channels
 from clsas.engine.signal.interpolation import Readout
@@ -241,8 +242,8 @@ class Reflectors:
     ) -> NDArray[np.complex128]:
         """Return values around ranges, [channels, points, offsets], without the path's phase."""
         at_m = (range_m[..., None] + offsets_m).reshape(len(channels), -1)
-        turns = self.lines.carrier_cycles_per_m * at_m
-        values = self.readout.read(channels, at_m) * np.exp(2j * np.pi * (turns - np.rint(turns)))
+        turn = turned(self.lines.carrier_cycles_per_m * at_m)
+        values = self.readout.read(channels, at_m) * turn
         return values.reshape(*range_m.shape, len(offsets_m))
 
 

@@ -33,12 +33,13 @@ from scipy.spatial.distance import cdist
 
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import DEVIATION_PER_MEDIAN
+from clsas.engine.data.fourier import phasors, turned_single
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines, wavelength_m
 from clsas.engine.data.threads import in_threads
 from clsas.engine.data.visibility import sines
-from clsas.engine.signal.interpolation import Readout, phasors
+from clsas.engine.signal.interpolation import Readout
 from clsas.navigation.checks import displacement_axes, parabola_peak
 
 READ_DB = -40.0
@@ -193,9 +194,7 @@ def contributions(
         ).T
         range_m[some] = path_m
         at_m = (path_m[..., None] + offsets_m).reshape(len(some), -1)
-        turns = lines.carrier_cycles_per_m * at_m
-        phase = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
-        received = readout.read(some, at_m) * phasors(phase)
+        received = readout.read(some, at_m) * turned_single(lines.carrier_cycles_per_m * at_m)
         values[some] = received.reshape(len(some), len(points_m), -1)
         if beam is not None and along is not None:
             sine = sines(points_m, part.phase_centres_m, along[some])

@@ -36,6 +36,8 @@ PADDING_IN = 0.1
 """Margin around labels and axes in inches."""
 COLOUR_MAP = "inferno"
 """Default colour map, which is perceptually even from black to pale yellow."""
+MOST_PIXELS = 1500
+"""Most pixels drawn along an axis; pictures have fewer dots."""
 COUNTED = 1 << 22
 """Most values from which percentiles are computed."""
 
@@ -48,7 +50,6 @@ _SETTINGS: Any = {
     "svg.hashsalt": "clsas",  # the same picture gives the same file
 }
 _DATES = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
-_MOST_PIXELS = 1500  # pixels drawn along an axis; pictures have fewer dots
 _SAME_DB = 1e-3  # largest difference of levels that may come from rounding
 
 # From black over copper to cream, as sidescan displays show sand. The colours lie at equal
@@ -288,7 +289,7 @@ def draw_levels(
     greatest = level  # of the pixels that share a dot, since a mean would hide points
     for axis in (0, 1):
         count = level.shape[axis]
-        first = np.linspace(0, count, min(count, _MOST_PIXELS), endpoint=False).astype(int)
+        first = np.linspace(0, count, min(count, MOST_PIXELS), endpoint=False).astype(int)
         greatest = np.maximum.reduceat(greatest, first, axis)
     drawn = axes.imshow(
         np.maximum(greatest, low),

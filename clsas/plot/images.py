@@ -22,6 +22,7 @@ from clsas.engine.data.image import Image
 from clsas.engine.data.reprs import quantity
 from clsas.engine.data.validate import ArgumentError
 from clsas.measures.quality import on_axes
+from clsas.mosaics.levels import COARSEST_SIDE
 from clsas.plot.canvas import (
     COLOUR_MAP,
     COUNTED,
@@ -48,7 +49,6 @@ _WIDTH_IN = 7.0  # width of figures; about the height of those that are higher t
 _FLAT = 0.4  # height relative to width, below which the colour bar is drawn below an image
 _PREVIEW_IN, _PREVIEW_DPI = 4.5, 96.0  # for 10 to 100 kB in a notebook
 _PREVIEW_LEVELS, _PREVIEW_GREYS = 208, 48  # 0.3 dB each over 60 dB, and 48 for letters
-_OVERVIEW = 1024  # pixels along the longer side of an overview
 _BAR = 0.25  # largest length of a scale bar relative to the width of the axes: a plain choice
 _ARROW = 0.1  # length of the arrow relative to the shorter side: a plain choice
 _HORIZONTAL = 1e-6  # least part of a step that must be horizontal
@@ -298,7 +298,7 @@ def _height_per_width(image: Image) -> float:
 def mosaic(
     store: Store | str | os.PathLike,
     *,
-    most: int = _OVERVIEW,
+    most: int = COARSEST_SIDE,
     borders: bool = False,
     **options: Any,
 ) -> Figure:
@@ -455,7 +455,7 @@ def window_around(
             "m",
             above=0.0,
             help="The distance on either side that is drawn.",
-            default="32 pixels",
+            default=f"{_AROUND} pixels",
         ),
     ] = None,
 ) -> tuple[slice, slice]:

@@ -14,14 +14,15 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.interferogram import Interferogram
 from clsas.interferometry.result import Heights
-from clsas.plot.canvas import colour_map as checked_colour_map
 from clsas.plot.canvas import (
+    MOST_PIXELS,
     drawable,
     grid_extent,
     label_grid,
     new_figure,
     plain_ticks,
 )
+from clsas.plot.canvas import colour_map as checked_colour_map
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-_MOST_PIXELS = 1500  # pixels drawn along an axis; pictures have fewer dots
 _PANEL_IN = 5.0  # longer side of a panel
 _LEAST_IN = 1.2  # shorter side of a panel, so that its labels fit
 _LABELS_IN = 1.3, 0.9  # room for the labels and the colour bar of a panel, across and upward
@@ -164,7 +164,7 @@ def _draw(
 
 def _every(count: int) -> int:
     """Return how many pixels share a dot."""
-    return max(-(-count // _MOST_PIXELS), 1)
+    return max(-(-count // MOST_PIXELS), 1)
 
 
 def _thinned(values: NDArray) -> NDArray:

@@ -17,6 +17,7 @@ from clsas.engine.signal.spectrum import power_spectrum
 from clsas.inspection.inspection import Inspection
 from clsas.plot.canvas import (
     COLOUR_MAP,
+    MOST_PIXELS,
     Scale,
     axis_label,
     draw_levels,
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
-_MOST_CHANNELS, _MOST_ROWS = 1500, 800  # columns and rows drawn; pictures have fewer dots
+_MOST_ROWS = 800  # drawn; pictures have fewer dots
 _LEVELS_DB = 30.0, 80.0  # least and largest dynamic range of the levels of inspected lines
 _SPECTRUM_DB = 80.0  # level below the strongest frequency at which the axis ends
 _PREFIXES = ((1e9, "GHz"), (1e6, "MHz"), (1e3, "kHz"))
@@ -284,7 +285,7 @@ def _pooled(lines: RangeLines) -> tuple[NDArray[np.float32], float, float]:
     if not high_m > low_m:
         low_m, high_m = float(first_m.min()), float(lines.last_range_m.max()) + step_m
     rows = int(np.clip((high_m - low_m) / step_m, 1, _MOST_ROWS))
-    columns = min(lines.channels, _MOST_CHANNELS)
+    columns = min(lines.channels, MOST_PIXELS)
     column = np.arange(lines.channels) * columns // lines.channels
     result = np.zeros((rows, columns), np.float32)
     for channel in range(lines.channels):

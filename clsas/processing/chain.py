@@ -15,6 +15,7 @@ from typing import Annotated, Any
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.atomic import staging, sync_folder
 from clsas.engine.data.declared import Names
+from clsas.engine.data.digests import file_digest
 from clsas.engine.data.extras import install_command, is_installed
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
@@ -33,7 +34,6 @@ from clsas.processing.record import (
     RecordingFile,
     StepRecord,
     checked_folder,
-    file_digest,
     loaded,
     made,
     read_records,

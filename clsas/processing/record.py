@@ -6,7 +6,6 @@ folder that clsas wrote and may replace.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
@@ -22,7 +21,7 @@ import scipy
 
 from clsas.engine.data import reading, reprs, validate
 from clsas.engine.data.atomic import locked, replacing
-from clsas.engine.data.digests import DIGEST, digest, is_intact, with_digest
+from clsas.engine.data.digests import DIGEST, digest, file_digest, is_intact, with_digest
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
@@ -300,10 +299,3 @@ def write_records(
 def step_digest(name: str, options: dict[str, Any], *inputs: str) -> str:
     """Return the digest of a step, from its options and the digests of its inputs."""
     return digest([__version__, name, options, *inputs])
-
-
-def file_digest(path: Path) -> str:
-    """Return a digest of the contents of a file, which must be an ordinary one."""
-    reading.check_ordinary(path)
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()[:16]

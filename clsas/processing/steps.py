@@ -22,6 +22,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.contrast import contrast, entropy
 from clsas.engine.data.digests import digest
 from clsas.engine.data.extras import is_installed
+from clsas.engine.data.findings import warn_of
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines, banks_of, first_two_banks
@@ -182,7 +183,7 @@ def inspect_step(job: Job) -> dict[str, Any]:
         element_length_m=None if scene.sonar is None else scene.sonar.element_length_m,
     )  # fmt: skip
     for finding in found.findings:
-        validate.warn(f"{finding.name}: {finding.message}")
+        warn_of([finding], f"{finding.name}: ")
     with replacing(job.staged / "inspect.txt") as temporary:
         temporary.write_text(found.describe() + "\n")
     job.draw("inspect.png", lambda: plot.inspection(found, scene.grid))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -110,8 +109,7 @@ def run(
         measured_db, failure = None, ""
         try:
             known = made(scene)
-            with warnings.catch_warnings():  # only the measured error matters
-                warnings.simplefilter("ignore", validate.ClsasWarning)
+            with validate.muted():  # only the measured error matters
                 image = form(imager, known, bound_db, used)
             measured_db = known.error_db(image.pixels)
         except Exception as error:  # a driver may raise anything; the other images still count

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas import plot
+from clsas.engine.data.atomic import replacing
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.system import Sonar
@@ -166,7 +167,8 @@ def _scene_in(out: Path) -> SceneFile:
             f"in {out} the demo would overwrite {', '.join(taken)}"
         )
     out.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(text)
+    with replacing(file) as temporary:
+        temporary.write_bytes(text)
     return read_scene(file)
 
 

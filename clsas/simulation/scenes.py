@@ -22,6 +22,8 @@ from clsas.engine.data.declared import Count, Number, check_fields
 from clsas.engine.data.validate import ArgumentError
 from clsas.simulation.refraction import Sightlines
 
+FLOOR_DB = -50.0
+"""Two-way element pattern below which scatterers of seabeds are left out by default, dB."""
 _TILE_M = 2.0  # side of the tiles that are kept or left out as a whole, depending on the beam
 _CLEAR = -1e30  # height beyond the lattice, where nothing casts shadows
 
@@ -238,7 +240,7 @@ class Seabed:
             most=-10.0,
             help="Scatterers whose two-way element pattern is below this level are left out.",
         ),
-    ] = -50.0
+    ] = FLOOR_DB
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""

@@ -11,7 +11,7 @@ from scipy import fft
 
 from clsas.engine.data import validate
 from clsas.engine.data.validate import ArgumentError
-from clsas.simulation.scenes import Seabed, checked_extent
+from clsas.simulation.scenes import FLOOR_DB, Seabed, checked_extent
 
 _MOST_BOULDERS = 100_000  # boulders of about 1 m2 each, many times the default patch of 2560 m2
 _LARGEST_CELL_M = 1.0  # coarser height fields do not show a wreck
@@ -28,7 +28,7 @@ def wreck(
     cell_m: float = 0.1,
     density_m2: float = 600.0,
     seed: int = 0,
-    floor_db: float = -50.0,
+    floor_db: float = FLOOR_DB,
 ) -> Seabed:
     """Return a fishing vessel of 25 m by 7 m that stands upright on sand.
 
@@ -88,7 +88,7 @@ def pipeline(
     cell_m: float = 0.1,
     density_m2: float = 600.0,
     seed: int = 0,
-    floor_db: float = -50.0,
+    floor_db: float = FLOOR_DB,
 ) -> Seabed:
     """Return a pipeline of 0.9 m diameter, a third of which is sunk into sand.
 
@@ -124,7 +124,7 @@ def rocks(
     cell_m: float = 0.1,
     density_m2: float = 600.0,
     seed: int = 0,
-    floor_db: float = -50.0,
+    floor_db: float = FLOOR_DB,
 ) -> Seabed:
     """Return boulders of 0.5 to 4 m across, scattered on sand.
 

@@ -106,7 +106,7 @@ def test_shading_of_a_plane_is_even_and_of_noise_is_finite():
 
 
 def test_large_results_are_thinned(monkeypatch):
-    monkeypatch.setattr(interferometry, "_MOST_PIXELS", 40)
+    monkeypatch.setattr(interferometry, "MOST_PIXELS", 40)
     figure = plot.interferogram(fringes())
     assert figure.axes[0].images[0].get_array().shape == (34, 27)
     plot.heights(hill())

@@ -324,6 +324,10 @@ def test_usual_steps_and_warnings_of_inspection(scene):
     assert (found.folder / "inspect.png").exists()
     findings = found["inspect"].numbers["findings"]
     assert len(found["inspect"].warnings) == len(findings) > 0
+    for finding, warning in zip(findings, found["inspect"].warnings, strict=True):
+        assert warning.startswith(
+            f"{finding['name']}: {finding['message']}. "
+        )  # the remedy follows
     assert clsas.process(scene).repeated == ()  # without a warning
 
 

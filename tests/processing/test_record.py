@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import clsas
+from clsas.engine.data.digests import file_digest
 from clsas.engine.data.validate import ClsasWarning
 from clsas.files.scene_files import SceneFile
 from clsas.processing.record import (
     RecordingFile,
     StepRecord,
-    file_digest,
     read_records,
     write_records,
 )

@@ -13,6 +13,7 @@ import fcntl
 import os
 import shutil
 import stat
+import tempfile
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -23,6 +24,15 @@ from clsas.engine.data.reading import check_ordinary
 _PATTERN = ".clsas-*.part"
 _LOCK = ".clsas.lock"
 _HERE, _EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
+
+
+def check_writable(folder: Path, path: Path) -> None:
+    """Raise OSError, which names `path`, if no file can be written into a folder."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:  # it names the temporary file
+        raise type(error)(error.errno, error.strerror, str(path)) from error
 
 
 @contextmanager

@@ -148,7 +148,7 @@ class BeamWindow:
         Count(
             5,
             help="Pings over which the direction of the track is smoothed.",
-            default="a quarter of all, at most 101",
+            default=f"a quarter of all, at most {MOST_TRACK_PINGS}",
         ),
     ] = None
 

@@ -27,10 +27,8 @@ from clsas.engine.data.visibility import BeamTrack, Boxes, sines
 MIRRORED = 0.01
 """Least share of a grid behind the elements that is reported."""
 
-# Channels, and pixels along either side of the grid, in the quick test of `reaches`, which finds
-# that nearly every grid is covered.
+# Channels in the quick test of `reaches`, which finds that nearly every grid is covered.
 _SAMPLED_CHANNELS = 64
-_SAMPLED_PIXELS = 16
 _BLOCKS = 8  # along either side of the grid; smaller blocks would find smaller gaps
 _TAPS = 8  # samples by which an interpolated line extends beyond its ends
 
@@ -61,7 +59,7 @@ def reaches(
     """
     # The quick test: does any sampled channel receive from any sampled pixel?
     some = some_channels(lines.channels, _SAMPLED_CHANNELS)
-    points_m = grid.spread(_SAMPLED_PIXELS)
+    points_m = grid.spread()
     range_m = pairwise_range_m(points_m, *antennas_of(lines, some))
     inside = (range_m >= lines.first_range_m[some]) & (range_m <= lines.last_range_m[some])
     track = None
@@ -123,7 +121,7 @@ def warn_unreached(
             return
         lines_m = float(lines.first_range_m.min()), float(lines.last_range_m.max())
     some = some_channels(lines.channels, _SAMPLED_CHANNELS)
-    points_m = grid.spread(_SAMPLED_PIXELS)
+    points_m = grid.spread()
     range_m = pairwise_range_m(points_m, *antennas_of(lines, some))
     where = (
         f"the lines span {lines_m[0]:.6g} to {lines_m[1]:.6g} m, the grid lies at "

@@ -9,6 +9,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.reading import check_ordinary
 
 Without = Mapping[type, tuple[str, ...]]
 """Names of the fields that do not count, by the class that has them."""
@@ -31,6 +33,8 @@ NOT_IN_IMAGES: Without = MappingProxyType(
 # Most samples that enter a digest. From 8 million or more it takes 0.25 ms, and 4 ms with 16 times
 # as many; an image of 1000 pixels from 64 lines takes 1.5 ms, of which the digest is 0.05 ms.
 _SAMPLES = 1 << 12
+
+_DIGITS = 16  # hexadecimal digits of a digest that are kept
 
 DIGEST = "digest"
 """Key of a record's digest, which is that of all its other entries."""
@@ -55,7 +59,14 @@ def digest(value: Any, without: Without = MappingProxyType({})) -> str:
         If the value contains anything else.
     """
     text = json.dumps(value, sort_keys=True, default=partial(_described, without))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]
+
+
+def file_digest(path: Path) -> str:
+    """Return a digest of the contents of a file, which must be an ordinary one."""
+    check_ordinary(path)
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:_DIGITS]
 
 
 def lines_digest(lines: RangeLines) -> str:

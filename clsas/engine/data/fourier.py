@@ -1,4 +1,4 @@
-"""Non-uniform Fourier sums and integrals, and smooth edges."""
+"""Phasors, filters, non-uniform Fourier sums and integrals, and smooth edges."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ from scipy.sparse import csr_array
 from scipy.special import erfc, i0
 
 from clsas.engine.data import validate
+from clsas.engine.data.threads import cores
+
+FFT_BLOCK = 1 << 22
+"""Complex numbers in the channels whose FFTs are computed together."""
 
 # Half the width of a smooth edge in standard deviations. At its ends 6e-8 (-145 dB) remains.
 _EDGE_SIGMAS = 5.3
@@ -31,6 +35,47 @@ def smooth_edge(position: ArrayLike) -> NDArray[np.float64]:
     w, the Fourier transform falls below 6e-8 at `EDGE_PRODUCT`/w.
     """
     return 0.5 * erfc(_EDGE_SIGMAS * (2 * np.asarray(position) - 1) / np.sqrt(2))
+
+
+def turned(cycles: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return exp(j 2 pi cycles) of phases of many cycles."""
+    return np.exp(2j * np.pi * (cycles - np.rint(cycles)))
+
+
+def turned_single(cycles: NDArray[np.float64]) -> NDArray[np.complex64]:
+    """Return exp(j 2 pi cycles) of phases of many cycles in single precision."""
+    return phasors((2 * np.pi * (cycles - np.rint(cycles))).astype(np.float32))
+
+
+def phasors(phase_rad: NDArray[np.float32]) -> NDArray[np.complex64]:
+    """Return exp(j phase) in single precision.
+
+    NumPy vectorises sines and cosines of real numbers, but not complex exponentials. On AVX2 this
+    function takes a fifteenth of the time of `np.exp(1j * phase_rad)`.
+    """
+    found = np.empty(phase_rad.shape, np.complex64)
+    np.cos(phase_rad, out=found.real)
+    np.sin(phase_rad, out=found.imag)
+    return found
+
+
+def filtered(
+    samples: NDArray[np.complex64], responses: NDArray[np.float64]
+) -> NDArray[np.complex64]:
+    """Return lines [channels, n], filtered by frequency responses, [responses, channels, n].
+
+    The responses [responses, m] are those of lines that are padded with zeros to m samples.
+    """
+    result = np.empty((len(responses), *samples.shape), np.complex64)
+    rows = max(1, FFT_BLOCK // responses.shape[1])
+    for first in range(0, len(samples), rows):
+        some = slice(first, first + rows)
+        padded = samples[some].astype(np.complex128)
+        spectrum = scipy.fft.fft(padded, responses.shape[1], workers=cores())
+        for number, response in enumerate(responses):
+            whole = scipy.fft.ifft(spectrum * response, workers=cores(), overwrite_x=True)
+            result[number, some] = whole[:, : samples.shape[1]]
+    return result
 
 
 def taps_for(error_db: float, oversampling: float) -> int:

@@ -14,6 +14,8 @@ from clsas.engine.data.declared import Number, Other
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 
+SAMPLED_PIXELS = 16
+"""Sample points along either side of a grid that represent it, unless stated otherwise."""
 _ALL = slice(None)
 _PARALLEL = 1e-12  # sine of the angle between parallel steps; float64 rounds to 1e-16
 
@@ -387,7 +389,7 @@ class Grid:
             positions[..., 2] += self.height_m.reshape(-1)[index]
         return positions
 
-    def spread(self, most: int) -> NDArray[np.float64]:
+    def spread(self, most: int = SAMPLED_PIXELS) -> NDArray[np.float64]:
         """Return the positions of sample points all over the grid, edges included, [n, 3].
 
         There are up to `most` sample points along either side.

@@ -12,7 +12,7 @@ from scipy import fft
 
 from clsas.engine.data import pings, reprs, validate
 from clsas.engine.data.declared import Choice, Count, Number, check_declared
-from clsas.engine.data.fourier import EDGE_PRODUCT, smooth_edge
+from clsas.engine.data.fourier import EDGE_PRODUCT, filtered, smooth_edge
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.sound_speed import SoundSpeed, check_reaches
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
@@ -34,7 +34,6 @@ STATISTICS = ("mean", "median")
 """Estimates of the background that all pings have in common."""
 
 _UNIT = 1e-12  # error of a unit vector's length, far above rounding
-_FILTERED = 1 << 22  # complex128 samples of the channels that are filtered together
 # Steps by which the first ranges of pings may differ. The resulting error is -50 dB.
 _EQUAL_RANGE = 1e-3
 _MOST_BANKS = 1000  # far more than any sonar has: a plain choice
@@ -390,14 +389,7 @@ class RangeLines:
         validate.memory("cutoff_hz", 16 * padded)
         frequency = np.abs(self.carrier_hz + fft.fftfreq(padded, 1 / rate))
         response = smooth_edge((cutoff - frequency) / width)
-        samples = np.empty_like(self.samples)
-        rows = max(1, _FILTERED // padded)
-        for first in range(0, self.channels, rows):
-            block = slice(first, first + rows)
-            spectrum = fft.fft(self.samples[block].astype(np.complex128), padded, workers=-1)
-            filtered = fft.ifft(spectrum * response, workers=-1, overwrite_x=True)
-            samples[block] = filtered[:, : self.length]
-        return replace(self, samples=samples)
+        return replace(self, samples=filtered(self.samples, response[None])[0])
 
     def tapered_ends(
         self,

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from clsas.engine.data.grid import Grid
 
 LEAST_SIDE = (16, 4)
-"""Rows and columns of the smallest subimages; sides of all others are multiples of these."""
+"""Rows and columns of the smallest subimages, whole work-items with any number of lanes; sides of
+all others are multiples of these."""
 
 _LEAST_CELL_M = 1e-6
 _CORNERS = {n: np.array(list(product((-0.5, 0.5), repeat=n))) for n in (2, 3)}  # of boxes

@@ -56,6 +56,13 @@ def wait(futures: Collection[Future], timeout: float | None = None) -> set[Futur
             return done
 
 
+def cores() -> int:
+    """Return the number of cores that this process may use, which can be fewer than there are."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def in_threads(
     function: Callable[[Item], Result], items: Iterable[Item], workers: int | None = None
 ) -> Iterator[Result]:
@@ -68,12 +75,12 @@ def in_threads(
     items : iterable
         Items, all of which are read before the first result.
     workers : int, optional
-        Number of threads; by default as many as the machine has cores.
+        Number of threads; by default `cores`.
     """
     if workers is not None:
         workers = validate.count("workers", workers)
     futures: deque[Future[Result]] = deque()
-    pool = ThreadPoolExecutor(workers or os.cpu_count())
+    pool = ThreadPoolExecutor(workers or cores())
     try:
         with uninterrupted():
             futures.extend(pool.submit(function, item) for item in items)

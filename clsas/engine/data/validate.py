@@ -15,7 +15,7 @@ import re
 import reprlib
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from numbers import Real
 from pathlib import Path
 from typing import Any, TypeVar
@@ -111,6 +111,14 @@ def warn(message: str, category: type[ClsasWarning] = ClsasWarning) -> None:
         frame = frame.f_back
         level += 1
     warnings.warn(message, category, stacklevel=level)
+
+
+@contextlib.contextmanager
+def muted() -> Iterator[None]:
+    """Issue no ClsasWarning in the block."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ClsasWarning)
+        yield
 
 
 def number(

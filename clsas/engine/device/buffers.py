@@ -96,13 +96,13 @@ def upsampling_buffers(channels: int, length: int, pitch: int, half_precision: b
     }
 
 
-def padded_length(resampling: Resampling) -> int:
-    """Return the length of an upsampled line on the device, with the zeros around it.
+def padded_length(resampling: Resampling, margin: int = MARGIN) -> int:
+    """Return the length of an upsampled line on the device, with the zeros on either side.
 
     A multiple of 256 is avoided, because lines at the same positions of cache sets would evict each
     other.
     """
-    length = round_up(resampling.length + 2 * MARGIN, 16)
+    length = round_up(resampling.length + 2 * margin, 16)
     return length + 16 * (length % 256 == 0)
 
 
@@ -189,6 +189,17 @@ def filter_table(device: Device, coefficients: NDArray[np.floating]) -> cl.Buffe
 def phase_polynomials(device: Device, terms: int) -> cl.Buffer:
     """Upload the polynomials for sine and cosine of phases."""
     return device.upload(sine_and_cosine(terms))
+
+
+def geometry_buffer(
+    channels: int, beam: BeamWindow | None, *, bistatic: bool = False, moving: bool = False
+) -> Buffer:
+    """Return the buffer of the geometry of some channels, with the rows of cl/antennas.h.
+
+    Rows are padded, so that a vector may begin at the last channel.
+    """
+    rows = 6 + 6 * bistatic + 3 * moving + 3 * (beam is not None)
+    return Buffer((rows, channels + VECTOR_ROOM), np.float32)
 
 
 def float_pairs(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -60,9 +60,7 @@ channels."""
 _ROUNDED = 2.0**-24 / math.sqrt(12)  # rms error of a float32 from 0.5 to 1, samples
 _GEOMETRY_SHARE_DB = -12.0  # error power that the geometry may add, over that of the image: 6 %
 
-# Channels, and pixels along either side of the grid, for which the beam's fullness is evaluated.
-_SAMPLED_CHANNELS = 256
-_SAMPLED_PIXELS = 16
+_SAMPLED_CHANNELS = 256  # for which the beam's fullness is evaluated
 _BAND_RMS = 0.3  # rms frequency of lines within their band, cycles per sample
 
 _ONE_CHANNEL = 5.0  # largest relative excess of the error power with a single channel
@@ -163,7 +161,7 @@ def decide(
     fullness = 1.0  # relative errors of a beam's weights grow by the inverse
     if beam is not None and scene.along is not None:
         some = some_channels(lines.channels, _SAMPLED_CHANNELS)
-        sine = sines(grid.spread(_SAMPLED_PIXELS), lines.phase_centres_m[some], scene.along[some])
+        sine = sines(grid.spread(), lines.phase_centres_m[some], scene.along[some])
         fullness = beam.fullness(sine, wavelength_m(lines), len(some) / lines.channels)
 
     # Divide the grid into tiles if their errors are small enough, else into groups.

@@ -24,7 +24,6 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import BeamTrack
 from clsas.engine.device.buffers import (
-    VECTOR_ROOM,
     Buffer,
     Buffers,
     Slot,
@@ -34,9 +33,10 @@ from clsas.engine.device.buffers import (
     expansion_terms,
     filter_table,
     float_pairs,
+    geometry_buffer,
+    padded_length,
     phase_polynomials,
     pixel_buffers,
-    round_up,
     slices,
     upsampled_lines,
 )
@@ -52,7 +52,7 @@ _CHANNELS_AT_ONCE = 512
 # Blocks and bands that the memory of a device has room for, of which two each are there at a time.
 _BLOCKS_IN_MEMORY, _BANDS_IN_MEMORY = 8, 4
 _PART_BYTES = 64 << 20  # device memory for one set of parts, a job of some tenths of a second
-_SINE_ROUNDING = 1e-5  # upper bound on the device's rounding error of a sine
+_MOST_SINE_ROUNDING = 1e-5  # upper bound on the device's rounding error of a sine
 _MOST_KEPT_BYTES = 256 << 20  # of references that are kept: more than 20 million of 12 bytes each
 
 
@@ -168,7 +168,7 @@ class ExactImager:
             ranges = np.tile(every, (band.stop - band.start, 1))
         else:
             low, high = beam.limits
-            limits = low - _SINE_ROUNDING, high + _SINE_ROUNDING
+            limits = low - _MOST_SINE_ROUNDING, high + _MOST_SINE_ROUNDING
             track = BeamTrack(limits, lines.phase_centres_m[channels], along[channels])
             ranges = track.spans(self.layout.boxes(band)).ranges
         self._keep(key, {"ranges": ranges})
@@ -426,11 +426,7 @@ def references_of(
         if correction_m is not None:
             channel = np.minimum(first[:, None] + np.arange(count), lines.channels - 1)
             range_m += np.take_along_axis(correction_m[visible], channel, axis=1)
-    position = (range_m - first_range_m) / lines.range_step_m + resampling.lead
-    range_m *= lines.carrier_cycles_per_m
-    cycles = range_m + position * resampling.centre_cycles_per_sample
-    cycles -= np.rint(cycles)
-    position *= resampling.ratio
+    position, cycles = resampling.places(range_m, first_range_m, lines)
     position += blocks.margin - resampling.first
     nearest = np.rint(position)
     position -= nearest
@@ -539,9 +535,7 @@ def blocks_of(
     """
     reach = math.ceil(radius_m * resampling.samples_per_m(lines) * 1.1) + taps
     margin = 2 * reach + 2 * device.info.width
-    pitch = round_up(resampling.length + 2 * margin, 16)
-    if pitch % 256 == 0:  # lines at the same positions of cache sets would evict each other
-        pitch += 16
+    pitch = padded_length(resampling, margin)
     terms = expansion_terms(beam) if tiled else 0
     line_bytes = 8 * pitch
     part_bytes = _CHANNELS_AT_ONCE * (16 + 4 * terms) + 12 * part_pixels
@@ -578,8 +572,6 @@ def block_buffers(
 ) -> Buffers:
     """Return the buffers of a block of channels: upsampled lines and the antennas' geometry.
 
-    Rows of the geometry are padded, so that a vector may begin at the last channel.
-
     Parameters
     ----------
     lines : RangeLines
@@ -589,12 +581,14 @@ def block_buffers(
     blocks : Blocks
     beam : BeamWindow or None
     """
-    rows = 6 + 6 * is_bistatic(lines)
-    rows += 3 * (lines.rx_velocity_m_s is not None) + 3 * (beam is not None)
-    pitch = channel_pitch(channels) + VECTOR_ROOM
     return {
         "samples": Buffer((channels, blocks.pitch, 2), np.float32),
-        "geometry": Buffer((rows, pitch), np.float32),
+        "geometry": geometry_buffer(
+            channel_pitch(channels),
+            beam,
+            bistatic=is_bistatic(lines),
+            moving=lines.rx_velocity_m_s is not None,
+        ),
     }
 
 

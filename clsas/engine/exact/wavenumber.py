@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,18 +19,18 @@ from clsas.engine.data.fourier import (
     gridding_weights,
     smooth_edge,
     taps_for,
+    turned_single,
 )
 from clsas.engine.data.geometry import bistatic_range_m, pairwise_range_m
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Formed, Image
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at, wavelength_m
-from clsas.engine.data.threads import in_threads
+from clsas.engine.data.threads import cores, in_threads
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
 from clsas.engine.scene import check_numbers
 from clsas.engine.signal.doubts import warn_before_imaging
-from clsas.engine.signal.interpolation import phasors
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.engine.water.refraction import homogeneous
 
@@ -150,7 +149,7 @@ def wavenumber(
     grid = placed(lines, grid)
     validate.instance("beam", beam, BeamWindow, type(None))
     validate.flag("motion_compensation", motion_compensation)
-    workers = validate.count("workers", (os.cpu_count() or 1) if workers is None else workers)
+    workers = validate.count("workers", cores() if workers is None else workers)
     if not grid.is_planar:
         kind = "heights" if grid.points_m is None else "points"
         raise ArgumentError("grid", "be a plane with rows along the track", kind)
@@ -458,7 +457,7 @@ def migrate(
         turns = np.multiply.outer(centre_m - begin_m[some], per_m / (2 * np.pi) * cycles)
         turns += (lines.wavenumber_rad_m / np.pi * track.shift_m[some])[:, None]
         turns -= np.multiply.outer(track.along_m[some] / period_m, [middle])
-        spectra[some] = whole * _turned(turns)
+        spectra[some] = whole * turned_single(turns)
 
     # Fourier transform along the track: channels are spread onto a regular track.
     onto = gridding(track.along_m * (fine / period_m), fine, taps, _OVERSAMPLING)
@@ -497,7 +496,7 @@ def migrate(
         for tap in range(taps):
             moved += kernel[tap].take(at) * some.take(left + tap)
         turns = across * ((near_m + far_m) / 4 / np.pi)
-        moved *= _turned(turns - (k - 2 * lines.wavenumber_rad_m) * (centre_m / (2 * np.pi)))
+        moved *= turned_single(turns - (k - 2 * lines.wavenumber_rad_m) * (centre_m / (2 * np.pi)))
         moved *= (k >= band[0]) & (k <= band[1])
 
         at = np.clip((along / k - sine[0]) * per_sine + 1, 0, len(tables[0]) - 1).astype(np.intp)
@@ -506,7 +505,7 @@ def migrate(
         strength = scale / np.sqrt(across)
         strength /= gridding_gain(places / count, taps, _OVERSAMPLING)
         onto = gridding(row_m * (count / depth_m), count, taps, _OVERSAMPLING).astype(np.float32)
-        carrier = _turned(across[len(across) // 2] / (2 * np.pi) * row_m)
+        carrier = turned_single(across[len(across) // 2] / (2 * np.pi) * row_m)
         for power, term in enumerate(tables):
             part = np.zeros((len(mode), count), np.complex64)
             factor = strength.astype(np.complex64) if power == 0 else 1j * strength / k
@@ -524,14 +523,9 @@ def migrate(
     along_m = track.pixel_along_m
     start_m = along_m[:, 0] - along_m[0, 0]
     if start_m.any():  # every row begins at its own position along the track
-        focused *= _turned(np.multiply.outer(modes / period_m, start_m))
+        focused *= turned_single(np.multiply.outer(modes / period_m, start_m))
     whole = np.zeros((fine, rows), np.complex64)
     whole[(modes - middle) % fine] = focused / gain[:, None]
     whole = scipy.fft.ifft(whole, axis=0, overwrite_x=True, norm="forward", workers=workers)
     onto = gridding(along_m[0] * (fine / period_m), fine, taps, _OVERSAMPLING).astype(np.float32)
-    return (onto @ whole).T * _turned(middle / period_m * along_m[0])
-
-
-def _turned(cycles: NDArray[np.float64]) -> NDArray[np.complex64]:
-    """Return exp(j 2 pi cycles) of many cycles in single precision."""
-    return phasors((2 * np.pi * (cycles - np.rint(cycles))).astype(np.float32))
+    return (onto @ whole).T * turned_single(middle / period_m * along_m[0])

@@ -18,6 +18,7 @@ from clsas.engine.device.buffers import (
     Buffers,
     channel_pitch,
     expansion_terms,
+    geometry_buffer,
     lines_buffer,
     round_up,
 )
@@ -155,13 +156,13 @@ def leaf_tables(
     corrected_channels : int
         Virtual channels of a leaf if ranges are corrected, else 0.
     """
-    columns = virtual_channels + VECTOR_ROOM
+    geometry = geometry_buffer(virtual_channels, beam)
     tables = {
-        "geometry": Buffer((6 if beam is None else 9, columns), np.float32),
+        "geometry": geometry,
         "ranges": Buffer((parts, 3), np.int32),
     }
     if beam is not None and beam.normalise:
-        tables["represented"] = Buffer((1, columns), np.float32)
+        tables["represented"] = Buffer((1, geometry.shape[1]), np.float32)
     if points is not None:
         tables["centres"] = Buffer((parts, 6), np.float32)
         tables["offsets"] = Buffer((3, points), np.float32)

@@ -419,10 +419,7 @@ def predicted_plan(
     # On either side of a subimage's centre, lines are longer by half of the taps of later stages.
     samples_per_m = lines.resampling.samples_per_m(scene.lines) * (1 + max(roots.stretch.mean, 0.0))
     half_lengths = tuple(
-        math.ceil(extent_m * samples_per_m)
-        + (len(sides) - 1 - level) * (align.taps // 2 + 1)
-        + final.taps // 2
-        + 1
+        math.ceil(extent_m * samples_per_m) + (len(sides) - 1 - level) * align.reach + final.reach
         for level, extent_m in enumerate(half_range_extents_m(roots, sides))
     )
     levels = [Level.of(half, width) for half in half_lengths]

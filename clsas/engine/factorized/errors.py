@@ -745,7 +745,7 @@ def _needed_samples(
     Dense apertures have so many channels that upsampling whole lines takes most of the time.
     """
     step_m = roots.sampled.scene.lines.range_step_m
-    spare = len(sides) * (align.taps // 2 + 1) + final.taps + 2
+    spare = len(sides) * align.reach + 2 * final.reach
     first, last = (
         math.floor((each_m / step_m + resampling.lead) * resampling.ratio) - resampling.first
         for each_m in roots.sampled.range_window_m(sides[0])

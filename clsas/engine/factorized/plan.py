@@ -38,6 +38,7 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.reading import parse_json
 from clsas.engine.data.reprs import Report, Table
 from clsas.engine.data.simplify import EFFECTS
+from clsas.engine.data.surface import LEAST_SIDE
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.engine.device.kernels import PHASE_TERMS
 from clsas.engine.exact.decide import ACCURACY
@@ -445,8 +446,9 @@ class Factorization:
             "sides",
             f"rows and columns, each divisible by the next and at last by {self.tile}",
         )
-        whole_items = self.tile[0] % 16 == 0 and self.tile[1] % 4 == 0
-        require(whole_items, "tile", "a multiple of 16 rows and 4 columns")
+        rows, columns = LEAST_SIDE
+        whole_items = self.tile[0] % rows == 0 and self.tile[1] % columns == 0
+        require(whole_items, "tile", f"a multiple of {rows} rows and {columns} columns")
         whole_leaves = self.aperture.splits_leaves or self.tile == self.sides[-1]
         require(whole_leaves, "tile", "the last pair of sides")
         ascend = self.limits is None or self.limits[0] < self.limits[1]

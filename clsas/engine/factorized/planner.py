@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field, replace
+from fractions import Fraction
 from typing import Annotated
 
 import numpy as np
@@ -574,10 +575,16 @@ def obstacle(sampled: SampledScene) -> str:
     if sampled.track.is_sheet and _directions_unknown(sampled):
         return "the heading turns, and large parts of the smooth aperture have no channel"
     if not sampled.track.is_sheet and _turns_between_channels(sampled):
-        return "the heading changes from channel to channel by more than 1/16 of the beam's width"
+        return (
+            "the heading changes from channel to channel by more than "
+            f"{Fraction(_MOST_TURNED)} of the beam's width"
+        )
     # Normalising divides by a small sum at the beam's edge, which amplifies errors there.
     if beam.normalise and coverage(sampled, 1).min() < _LEAST_COVERED:
-        return "the beam normalises, and weights of some pixels sum to less than 1/4 of the most"
+        return (
+            "the beam normalises, and weights of some pixels sum to less than "
+            f"{Fraction(_LEAST_COVERED)} of the most"
+        )
     # If a step of the beam crosses few pixels, their error exceeds the mean that is predicted.
     if beam.jumps and 0 < partly_visible_share(sampled) < _LEAST_PARTIAL:
         return "the step at the beam's edge crosses only few pixels"

@@ -629,12 +629,7 @@ def references(geometry: Geometry, sector: Sector) -> dict[str, NDArray]:
         middle = sector.roots + np.array(factorization.sides[0]) // 2
         range_m += corrections.at(surface.pixels_in(middle)) @ beyond.T
 
-    position = (range_m - lines.first_range_m[channels]) / lines.range_step_m
-    position += resampling.lead
-    cycles = lines.carrier_cycles_per_m * range_m
-    cycles += position * resampling.centre_cycles_per_sample
-    cycles -= np.rint(cycles)
-    position *= resampling.ratio
+    position, cycles = resampling.places(range_m, lines.first_range_m[channels], lines)
     position += MARGIN - resampling.first - factorization.half_lengths[0]
     lower = np.floor(position)
     start = np.clip(lower + 1 - factorization.align.taps // 2, -_FAR, _FAR)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
+from clsas.engine.data.fourier import turned
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import (
@@ -31,6 +32,7 @@ from clsas.engine.data.lines import (
     wavelength_m,
 )
 from clsas.engine.data.visibility import sines
+from clsas.engine.signal.interpolation import TAPS
 from clsas.engine.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum, representative_channels
 
 BEST_DB = -85.0
@@ -160,14 +162,14 @@ def ambiguity(
 
 # Error power near an end over the power of the end, measured on noise in 40 to 90 % of the band.
 _AT_END = 0.03
-_END = 4  # samples whose mean power is taken as that of an end: the taps on one side of a filter
-_NEAR_END = 5  # samples around an end within which interpolators differ: half of 8 taps, plus one
+# Samples whose mean power is taken as that of an end: the taps on one side of the widest filter.
+_END = max(TAPS) // 2
+_NEAR_END = _END + 1  # samples around an end within which interpolators differ
 # An end fades if the power of its last sample is below this share of the mean of so many samples.
 _CUT, _FADING = 0.01, 16
 # Half bandwidth, cycles per sample, up to which a cut affects only the samples within `_NEAR_END`.
 _THIN = 0.42
 _END_CHANNELS = 64  # channels sampled; half or twice as many change nothing
-_END_POINTS = 16  # points sampled along either side of the grid
 
 
 def ends_error(
@@ -193,7 +195,7 @@ def ends_error(
     times the power of an end sample, unless the lines fade.
     """
     some = some_channels(lines.channels, _END_CHANNELS)
-    part, points_m = lines.select(some), grid.spread(_END_POINTS)
+    part, points_m = lines.select(some), grid.spread()
     range_m = pairwise_range_m(
         points_m, part.tx_m, part.rx_m, part.rx_velocity_m_s, part.sound_speed_m_s
     )
@@ -362,7 +364,7 @@ def _brightness_of_groups(
         # Phases that focus on the points, and the weights of the beam.
         turns = spectrum.centre * between
         turns += part.carrier_cycles_per_m * range_m
-        values *= np.exp(2j * np.pi * (turns - np.rint(turns)))
+        values *= turned(turns)
         values *= inside
         if beam is not None and along is not None:
             values *= _beam_weights(lines, channels, some_m, beam, along)
@@ -462,8 +464,8 @@ def independent_pixels(
     frequency = np.copysign(np.interp(np.abs(away), share / share[-1], spectrum.frequency), away)
     channels = some[chosen]
     range_m = pairwise_range_m(points_m, *antennas_of(lines, channels))
-    turns = range_m * cycles_per_m_at(lines, spectrum.centre + frequency)
-    terms = np.exp(2j * np.pi * (turns - np.rint(turns))).astype(np.complex64)
+    per_m = cycles_per_m_at(lines, spectrum.centre + frequency)
+    terms = turned(range_m * per_m).astype(np.complex64)
     sample = (range_m - lines.first_range_m[channels]) / lines.range_step_m
     is_reached = (sample > -1) & (sample < lines.length)
     terms *= is_reached * weights[:, chosen] / np.sqrt(_TERMS * seen[chosen])

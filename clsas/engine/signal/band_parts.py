@@ -8,11 +8,11 @@ import numpy as np
 from scipy import fft
 
 from clsas.engine.data import validate
+from clsas.engine.data.fourier import filtered
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.spectrum import measure_spectrum
 
-_BLOCK = 1 << 22  # complex128 samples that are filtered together
 _MOST = 64  # parts of a band: a plain choice, far beyond what leaves any resolution
 
 
@@ -73,17 +73,11 @@ def sub_bands(lines: RangeLines, count: int) -> tuple[RangeLines, ...]:
     if width * lines.length < count:
         most = f"{int(width * lines.length)} parts of lines of {lines.length} samples"
         raise ArgumentError("count", f"leave a cycle per line in every part, at most {most}", count)
-    validate.memory("count", 8 * count * lines.samples.size)
     padded = fft.next_fast_len(2 * lines.length)
+    # Lines, and their filters, of which three arrays exist while they are computed.
+    validate.memory("count", 8 * count * (lines.samples.size + 3 * padded))
     distance = np.mod(fft.fftfreq(padded) - found.centre + 0.5, 1.0) - 0.5
     place = ((distance / width + 0.5) * count).clip(0.5, count - 0.5) - 0.5  # in middles of parts
-    samples = np.empty((count, *lines.samples.shape), np.complex64)
-    rows = max(1, _BLOCK // padded)
-    for first in range(0, lines.channels, rows):
-        block = slice(first, first + rows)
-        spectrum = fft.fft(lines.samples[block].astype(np.complex128), padded, workers=-1)
-        for number in range(count):
-            response = np.cos(np.pi / 2 * np.minimum(np.abs(place - number), 1)) ** 2
-            filtered = fft.ifft(spectrum * response, workers=-1, overwrite_x=True)
-            samples[number, block] = filtered[:, : lines.length]
-    return tuple(replace(lines, samples=each) for each in samples)
+    from_middle = np.abs(place - np.arange(count)[:, None])
+    responses = np.cos(np.pi / 2 * np.minimum(from_middle, 1)) ** 2
+    return tuple(replace(lines, samples=each) for each in filtered(lines.samples, responses))

@@ -17,9 +17,10 @@ from scipy.interpolate import CubicSpline
 
 from clsas.engine.data import validate
 from clsas.engine.data.declared import Flag, Number, Other, check_declared
-from clsas.engine.data.fourier import EDGE_PRODUCT, fourier_integral, smooth_edge
+from clsas.engine.data.fourier import EDGE_PRODUCT, FFT_BLOCK, fourier_integral, smooth_edge, turned
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.system import Pulse
+from clsas.engine.data.threads import cores
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.echoes import Echoes
 from clsas.engine.signal.replica import Replica
@@ -41,7 +42,6 @@ _LEAST_PRODUCT = 0.1
 # the same side lobes and noise to 0.1 dB.
 _LEAST_POWER = 0.01
 _PER_RIPPLE = 8  # frequencies per 1/T that measure the mean; arbitrary
-_BLOCK = 1 << 22  # complex128 samples of the channels that are compressed together
 # Model of the memory in use, fitted to measured peaks of 0.3 to 2 GiB, which it predicts to 30 %.
 _FFT_LINES = 3  # twiddle factors and work area of an FFT, in lines of the transform's length
 _BYTES_MIXED = 64  # per sample that is mixed to baseband
@@ -169,7 +169,7 @@ def compress(
     outermost = math.ceil((0.5 * band + edge) * padded / rate)
     # If the edges of the filter do not fit, compute more points, and keep one of `every`.
     every = -(-(2 * outermost + 1) // resampled)
-    rows = min(max(1, _BLOCK // max(padded, every * resampled)), echoes.channels)
+    rows = min(max(1, FFT_BLOCK // max(padded, every * resampled)), echoes.channels)
     in_work = 16 * (rows + _FFT_LINES) * (padded + every * resampled)
     in_work += _BYTES_MIXED * rows * echoes.length + _BYTES_FILTERED * 2 * outermost
     budget.take(cause, 0, passing_bytes=in_work)
@@ -182,10 +182,10 @@ def compress(
     samples = np.empty((echoes.channels, length), np.complex64)
     for first in range(0, echoes.channels, rows):
         block = slice(first, first + rows)
-        spectrum = fft.fft(_baseband(echoes, block), padded, workers=-1)
+        spectrum = fft.fft(_baseband(echoes, block), padded, workers=cores())
         lines = np.zeros((len(spectrum), every * resampled), np.complex128)
         lines[:, bins] = spectrum[:, bins % padded] * response
-        lines = fft.ifft(lines, workers=-1, overwrite_x=True)
+        lines = fft.ifft(lines, workers=cores(), overwrite_x=True)
         samples[block] = lines[:, : every * length : every]
         if progress is not None:
             progress(min(first + rows, echoes.channels), echoes.channels)
@@ -357,5 +357,4 @@ def _baseband(echoes: Echoes, block: slice) -> NDArray:
     if not echoes.is_passband:
         return samples.astype(np.complex128)
     time = echoes.start_time_s[block, None] + np.arange(echoes.length) / echoes.sample_rate_hz
-    cycles = echoes.carrier_hz * time
-    return 2 * samples * np.exp(-2j * np.pi * (cycles - np.rint(cycles)))
+    return 2 * samples * turned(-echoes.carrier_hz * time)

@@ -18,6 +18,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.coverage import behind
 from clsas.engine.data.findings import Finding, warn_of
+from clsas.engine.data.fourier import turned
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, band_wavelength_m, banks_of, some_channels
@@ -398,6 +399,11 @@ def _focus(lines: RangeLines, grid: Grid) -> Iterator[Finding]:
             return
 
 
+def blurred_aperture_m(wavelength_m: float, range_m: float) -> float:
+    """Return the aperture over which the wrong sign blurs a point by `_BLUR`."""
+    return math.sqrt(_BLUR / 2 * wavelength_m * range_m)
+
+
 def _focused(
     lines: RangeLines, grid: Grid, first_m: NDArray[np.float64], step_m: float
 ) -> tuple[float, float] | None:
@@ -428,7 +434,7 @@ def _focused(
         return None
     channel, far_m = int(searched[row]), float(places_m[row, sample])
     # Channels that see it over an aperture in which the wrong sign blurs a point.
-    reach_m = math.sqrt(_BLUR / 2 * wavelength_m * far_m) / 2
+    reach_m = blurred_aperture_m(wavelength_m, far_m) / 2
     near = np.flatnonzero(np.linalg.norm(centres_m - centres_m[channel], axis=1) <= reach_m)
     near = near[some_channels(len(near), _PHASED)]
     if len(near) < _LEAST_PHASED:
@@ -472,7 +478,6 @@ def _focused(
     cells = min(2 * (2 * step_m / wavelength_m + 4), 128)
     errors_m = np.linspace(-1, 1, int(8 * cells) + 1) * cells * wavelength_m / extent
     linear = np.exp(2j * np.pi / wavelength_m * np.outer(errors_m, directions - directions.mean()))
-    cycles = 2 / wavelength_m * range_m
-    aligned = np.exp(2j * np.pi * (cycles - np.rint(cycles)))
+    aligned = turned(2 / wavelength_m * range_m)
     sums = [np.abs(linear @ (each * aligned)).max() for each in (found, found.conj())]
     return float(sums[0]) / total, float(sums[1]) / total

@@ -18,6 +18,7 @@ from scipy.linalg import cho_factor, cho_solve, toeplitz
 
 from clsas.engine.data import reprs
 from clsas.engine.data.decibels import in_db, power
+from clsas.engine.data.fourier import turned
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.spectrum import Spectrum, measure_spectrum
@@ -87,6 +88,11 @@ class Interpolator:
     def __post_init__(self) -> None:
         """Keep the coefficients from being changed."""
         self.coefficients.flags.writeable = False
+
+    @property
+    def reach(self) -> int:
+        """Samples on either side of a position, rounded to a sample, that may be read."""
+        return self.taps // 2 + 1
 
     def weights(self, nu: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the weights of the taps at positions `nu` from the middle, [..., taps]."""
@@ -300,6 +306,24 @@ class Resampling:
         """Return the number of upsampled samples per metre of range."""
         return self.ratio / lines.range_step_m
 
+    def places(
+        self,
+        range_m: NDArray[np.float64],
+        first_range_m: NDArray[np.float64],
+        lines: RangeLines,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return upsampled samples at ranges, and phases by which they are turned back, cycles.
+
+        Samples are counted from the first of the whole upsampled line, not from `first`. Ranges are
+        overwritten, since there are many.
+        """
+        position = (range_m - first_range_m) / lines.range_step_m + self.lead
+        range_m *= lines.carrier_cycles_per_m
+        cycles = range_m + position * self.centre_cycles_per_sample
+        cycles -= np.rint(cycles)
+        position *= self.ratio
+        return position, cycles
+
     def cycles_per_m(self, lines: RangeLines) -> float:
         """Return the phase per metre of range at the spectral centre, cycles."""
         return cycles_per_m_at(lines, self.centre_cycles_per_sample)
@@ -356,6 +380,8 @@ def resampling(length: int, interpolator: Interpolator, spectrum: Spectrum) -> R
 PHASES = 32
 """Number of polyphase filters of an `Upsampler`."""
 UPSAMPLING_TAPS = (8, 12, 16, 20, 24, 28, 32)
+MOST_TAPS = max(UPSAMPLING_TAPS)
+"""Samples of the widest filter of the imagers."""
 _FINE = 4096  # frequency shifts are multiples of 1/(4096 step) cycles per sample
 # Spectral centre, cycles per sample, up to which lines are not shifted. It is half the resolution
 # of a measured spectrum.
@@ -435,7 +461,7 @@ def upsampler(
         residual = np.maximum(wanted - np.einsum("pt,tp->p", coefficients, right), 0.0)
         total = (residual.sum() + residual[1:-1].sum()) / PHASES / (spectrum.power @ aim**2)
         error_db = in_db(float(total))
-        if error_db <= (most_db if taps == UPSAMPLING_TAPS[-1] else wanted_db):
+        if error_db <= (most_db if taps == MOST_TAPS else wanted_db):
             # The filters of the second half mirror those of the first.
             coefficients = np.concatenate([coefficients, coefficients[-2:0:-1, ::-1]])
             return Upsampler(step, coefficients, error_db)
@@ -445,7 +471,7 @@ def upsampler(
 @functools.lru_cache(maxsize=4)
 def _cosines(frequency: bytes) -> NDArray[np.float64]:
     """Return cosines at multiples of 1/PHASES samples, [multiples, frequencies of a spectrum]."""
-    positions = np.arange(max(UPSAMPLING_TAPS) * PHASES) / PHASES
+    positions = np.arange(MOST_TAPS * PHASES) / PHASES
     return np.cos(2 * np.pi * np.outer(positions, np.frombuffer(frequency)))
 
 
@@ -493,7 +519,7 @@ class Readout:
         Returns
         -------
         complex64 [n, m]
-            Interpolated samples. The carrier that was mixed out is not restored; see `phasors`.
+            Interpolated samples. The carrier that was mixed out is not restored; see `turned`.
         """
         lines = self.lines
         index = (range_m - lines.first_range_m[channels, None]) / lines.range_step_m
@@ -560,18 +586,5 @@ def between(
             at = np.clip(at, 0, last)
         total += weight * flat[lines + at]
     if resampling.shift:
-        turns = resampling.centre_cycles_per_sample * index
-        total *= np.exp(2j * np.pi * (turns - np.rint(turns)))
+        total *= turned(resampling.centre_cycles_per_sample * index)
     return total
-
-
-def phasors(phase_rad: NDArray[np.float32]) -> NDArray[np.complex64]:
-    """Return exp(j phase) in single precision.
-
-    NumPy vectorises sines and cosines of real numbers, but not complex exponentials. On AVX2 this
-    function takes a fifteenth of the time of `np.exp(1j * phase_rad)`.
-    """
-    found = np.empty(phase_rad.shape, np.complex64)
-    np.cos(phase_rad, out=found.real)
-    np.sin(phase_rad, out=found.imag)
-    return found

@@ -9,12 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from clsas.engine.data import validate
-from clsas.engine.data.fourier import fourier_series
+from clsas.engine.data.fourier import FFT_BLOCK, fourier_series, turned
 from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.threads import cores
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.compression import OVERSAMPLING, Window, band_window
 
-_BLOCK = 1 << 22  # complex128 samples of the channels that are transformed together
 _LEAST_OF_BAND = 1e-2
 """Lowest frequency over the width of the band, below which a unit is probably wrong. The ratio is
 0.03 for radars that look into the ground, and 1e-9 of the right one for GHz mistaken for Hz."""
@@ -141,7 +141,7 @@ def from_phase_history(
     width = np.ptp(band_hz, axis=1) / step_hz
 
     lines = np.empty((channels, length), np.complex64)
-    rows = max(1, _BLOCK // length)
+    rows = max(1, FFT_BLOCK // length)
     for first in range(0, channels, rows):
         block = slice(first, first + rows)
         spectrum = samples[block].astype(np.complex128)
@@ -153,12 +153,12 @@ def from_phase_history(
             raise ArgumentError("window", "have a sum other than 0", given)
         spectrum = (spectrum if sign == -1 else spectrum.conj()) * (weights / total)
         if equal:
-            part = fft.fftshift(length * fft.ifft(spectrum, length, workers=-1), axes=1)
+            part = fft.fftshift(length * fft.ifft(spectrum, length, workers=cores()), axes=1)
         else:
             part = _at_own_steps(spectrum, step_hz[block] / step_hz.max(), length)
         cycles = np.multiply.outer(2 * (first_hz[block] - carrier_hz) / speed, offset_m)
         cycles -= (2 * carrier_hz / speed * reference_m[block])[:, None]
-        lines[block] = part * np.exp(2j * np.pi * (cycles - np.rint(cycles)))
+        lines[block] = part * turned(cycles)
     return RangeLines(
         lines,
         first_range_m=reference_m + offset_m[0],

@@ -13,11 +13,12 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from clsas.engine.data.decibels import in_db
+from clsas.engine.data.fourier import turned
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.simplify import SHARE
 from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.data.validate import ArgumentError
-from clsas.engine.signal.interpolation import Readout
+from clsas.engine.signal.interpolation import MOST_TAPS, Readout
 from clsas.engine.water.ray_delays import FLIGHT_STEPS, RaySample, at_speed, straight_m, times_s
 from clsas.engine.water.rays import Rays, rays, shadow
 
@@ -25,9 +26,6 @@ _NODES = 64  # distances from which the change of a range axis follows
 _DEGREE = 28  # of the polynomial through them
 _CHANGED_AT_ONCE = 1 << 16  # samples that are interpolated together; they fit into a cache
 _BEYOND = 0.1  # of the distances of sample pixels, by which those of others may extend farther
-# Samples of the widest filters of the imagers, from which an image reads. Where a line of few
-# samples changes from a curved to a linear offset within them, it is not band-limited there.
-_READ = 32
 _RESAMPLED_DB = -80.0  # largest error of the interpolation of samples
 
 
@@ -180,9 +178,8 @@ class Change:
             some = everyone[first : first + rows]
             range_m = first_m[some, None] + steps_m
             offset_m = self.offsets_m(some, range_m)
-            turns = cycles_per_m * offset_m
             values = readout.read(some, scale * (range_m + offset_m))
-            samples[some] = values * np.exp(2j * np.pi * (turns - np.rint(turns)))
+            samples[some] = values * turned(cycles_per_m * offset_m)
         return replace(changed, samples=samples, first_range_m=first_m)
 
     @property
@@ -218,7 +215,9 @@ def _limits_m(sample: RaySample, level_m: float) -> tuple[float, float]:
     near, far = min(on_level.min(), distance.min()), max(on_level.max(), distance.max())
     near, far = near - min(_BEYOND * (far - near), near / 2), far + _BEYOND * (far - near)
     depth_m = float(np.abs(antenna_z - level_m).max())
-    read_m = _READ * sample.lines.range_step_m
+    # Where a line of few samples changes from a curved to a linear offset within those that an
+    # image reads, it is not band-limited there.
+    read_m = MOST_TAPS * sample.lines.range_step_m
     nearer = np.hypot(near, depth_m) - read_m
     near = max(near / 2, math.sqrt(max(nearer, depth_m) ** 2 - depth_m**2))
     far = math.sqrt((np.hypot(far, depth_m) + read_m) ** 2 - depth_m**2)

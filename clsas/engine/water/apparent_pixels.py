@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.sound_speed import SoundSpeed
-from clsas.engine.data.threads import in_threads
+from clsas.engine.data.threads import cores, in_threads
 from clsas.engine.water.apparent_antennas import Change
 from clsas.engine.water.ray_delays import FLIGHT_STEPS, RaySample
 from clsas.engine.water.ray_times import RayTimes
@@ -41,7 +41,7 @@ def apparent_grid(grid: Grid, lines: RangeLines, sample: RaySample, change: Chan
         change = Change.of(level, sample, None, middles_m)
     centres_m = level.phase_centres_m
     moved_m = grid.positions_m().reshape(-1, 3).copy()
-    distance_m, nearest = cKDTree(centres_m[:, :2]).query(moved_m[:, :2], workers=-1)
+    distance_m, nearest = cKDTree(centres_m[:, :2]).query(moved_m[:, :2], workers=cores())
     bend = _curvature(profile, float(np.median(distance_m)), level.tx_m[0, 2], change.level_m)
     limits = [(float(each.min()), float(each.max())) for each in (distance_m, moved_m[:, 2])]
     times = RayTimes(profile, limits[0], limits[1], expected=grid.size)

@@ -25,7 +25,7 @@ const [COARSEST, FINEST] = scene.scales; // numbered as levels of Deep Zoom
 const SIDE = scene.side;
 // Rows and columns of the image that a pixel of a level covers.
 const factorsOf = (level) => scene.factors[level - COARSEST];
-const BRIGHTEST = 255; // level of 0 dB; 0 where nothing was received
+const BRIGHTEST = scene.brightest; // level of 0 dB; 0 where nothing was received
 const LOWEST_DB = -Math.floor((BRIGHTEST - 1) * scene.step_db);
 
 // The plane of the screen has metres to the right and up: u and v.

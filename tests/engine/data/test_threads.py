@@ -1,5 +1,6 @@
 """Work in threads, with Ctrl-C at any point of the main thread."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -9,12 +10,12 @@ from concurrent.futures import Future
 
 import pytest
 
-from clsas.engine.data.threads import in_threads, uninterrupted, wait
+from clsas.engine.data.threads import cores, in_threads, uninterrupted, wait
 
 # Ctrl-C at the n-th line that the main thread executes in Python's own locks and pools.
 EVERYWHERE = """
 import faulthandler, signal, sys, threading, time
-from clsas.engine.data.threads import in_threads
+from clsas.engine.data.threads import cores, in_threads
 
 faulthandler.dump_traceback_later(50, exit=True)
 OURS = ("threading.py", "_base.py", "thread.py")
@@ -128,6 +129,13 @@ def test_closing_early_leaves_the_rest():
 def test_errors_come_out():
     with pytest.raises(ZeroDivisionError):
         list(in_threads(lambda item: 1 / item, [1, 0, 1]))
+
+
+def test_cores_are_those_that_the_process_may_use(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 3}, raising=False)
+    assert cores() == 2
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert cores() == os.cpu_count()
 
 
 def test_workers_are_checked():

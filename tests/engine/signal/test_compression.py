@@ -310,7 +310,7 @@ def test_channels_in_blocks_progress_and_fields(monkeypatch):
     echoes = simulate(sonar, track, PointTargets([[0, 40, 0]]), motion_in_flight=True)
     whole = compress(echoes)
     calls = []
-    monkeypatch.setattr(compression, "_BLOCK", 1)
+    monkeypatch.setattr(compression, "FFT_BLOCK", 1)
     parts = compress(echoes, progress=lambda *done: calls.append(done))
     assert calls == [(i + 1, 6) for i in range(6)]
     np.testing.assert_array_equal(whole.samples, parts.samples)

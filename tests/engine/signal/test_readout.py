@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from cases import lines_over
 
+from clsas.engine.data.fourier import phasors
 from clsas.engine.data.grid import Grid
 from clsas.engine.signal import interpolation
-from clsas.engine.signal.interpolation import Readout, phasors
+from clsas.engine.signal.interpolation import Readout
 
 
 @pytest.fixture(scope="module")
