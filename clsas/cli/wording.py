@@ -75,6 +75,7 @@ _WORDS = {
     "clsas.pair_errors": "clsas pair-errors",
     "clsas.plan": "clsas plan",
     "first_range_m": "first range",
+    "georeference": "georeference",
     "georeference.north_up(grid, pixel_m)": "a north-up grid with clsas image --scene",
     "lines.high_passed(hz)": "clsas convert --high-pass-hz",
     "lines.tapered_ends": "clsas convert --taper-m",
