@@ -89,6 +89,7 @@ _WORDS = {
     "rx_velocity_m_s": "receiver velocities",
     "sound_speed": "sound-speed profile",
     "sound_speed_m_s": "sound speed",
+    "source and against": "both images",
     "tx_m": "transmitter positions",
 }
 

@@ -11,14 +11,12 @@ import weakref
 from collections.abc import Callable, Sequence
 from types import TracebackType
 
-import numpy as np
-
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.digests import lines_digest
 from clsas.engine.data.georeference import placed
-from clsas.engine.data.grid import Grid
+from clsas.engine.data.grid import Grid, check_one_grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
@@ -661,11 +659,7 @@ class Imager:
 def check_accumulate(image: Image, grid: Grid, beam: BeamWindow | None) -> None:
     """Raise an error if the image on a grid cannot be added to the image `accumulate`."""
     validate.instance("accumulate", image, Image)
-    is_placed_alike = image.grid.georeference == grid.georeference
-    if image.grid is not grid and not (
-        is_placed_alike and np.array_equal(image.grid.positions_m(), grid.positions_m())
-    ):
-        raise ArgumentError("accumulate", "be an image on the same grid")
+    check_one_grid("accumulate and grid", image.grid, grid)
     if beam is not None and beam.normalise:
         hint = "normalised images are means and cannot be added"
         raise ArgumentError("accumulate", "be None with a beam that normalises", hint=hint)

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import reprs, validate
-from clsas.engine.data.grid import Grid
+from clsas.engine.data.grid import Grid, check_one_grid
 from clsas.engine.data.image import Image
-from clsas.engine.data.image_error import check_one_grid
 from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.coherence import (
     Moments,
@@ -160,9 +159,7 @@ def interferogram(a: Image, b: Image, window_m: float) -> Interferogram:
     window_m = validate.positive("window_m", window_m, "m")
     if a.grid.points_m is not None or b.grid.points_m is not None:
         raise ArgumentError("a and b", "lie on a plane or a height map", "arbitrary points")
-    if a.shape != b.shape:
-        raise ArgumentError("a and b", "lie on one grid", f"shapes {a.shape} and {b.shape}")
-    check_one_grid(a.grid, b.grid, "a and b")
+    check_one_grid("a and b", a.grid, b.grid)
     window = window_within(a.grid, window_m)
     most = effective_looks((a.pixels, b.pixels), window)
     check_looks(window_m, most)

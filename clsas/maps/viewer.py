@@ -32,7 +32,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.atomic import check_writable, replacing_folder
 from clsas.engine.data.decibels import DYNAMIC_RANGE, largest_amplitude
 from clsas.engine.data.georeference import Georeference
-from clsas.engine.data.grid import Grid
+from clsas.engine.data.grid import Grid, check_one_grid, without_heights
 from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
@@ -60,7 +60,6 @@ _SCRIPTS = ("geometry", "view", "tiles", "marks", "controls", "events")
 _FILES = (PAGE, "viewer.css", *(f"{name}.js" for name in _SCRIPTS))
 _COLOURS = ("inferno", "sonar", "gray")
 _ADDED = {".DS_Store", "Thumbs.db", "desktop.ini"}  # by file browsers, which show folders
-_SAME = 1e-6  # of a pixel, by which positions of two images may differ
 _FAINTEST = np.float32(1e-30)  # relative amplitude above 0 in float32, but below every level
 _LEVEL = 0.5  # cosine between the normal of a plane and the vertical above which it is a map
 _DEGREE = 5  # of polynomials for latitudes and longitudes
@@ -204,21 +203,8 @@ def _check_grids(grids: Sequence[Grid]) -> None:
     for name, grid in zip(("source", "against"), grids, strict=False):
         if grid.points_m is not None:
             raise ArgumentError(name, "be on a plane or height map for the viewer", "points")
-    if len(grids) < 2:
-        return
-    one, other = grids
-    steps_m = min(float(np.linalg.norm(step)) for step in steps_of(one))
-    most_m = max(
-        float(np.abs(mine - theirs).max()) * count
-        for mine, theirs, count in zip(one.vectors_m, other.vectors_m, (1, *one.shape), strict=True)
-    )
-    if one.shape != other.shape or most_m > _SAME * steps_m:
-        allowed = f"be on the grid of `source`, {one}"
-        raise ArgumentError("against", allowed, str(other), "form it on that grid")
-    places = [grid.georeference for grid in grids]
-    if None not in places and places[0] != places[1]:
-        allowed = f"have the georeference of `source`, {places[0]}"
-        raise ArgumentError("against", allowed, str(places[1]), "form both with the same one")
+    if len(grids) == 2:  # seen from above
+        check_one_grid("source and against", *map(without_heights, grids))
 
 
 def check_folder(folder: Path) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from clsas.engine.data import validate
-from clsas.engine.data.digests import digest
+from clsas.engine.data.grid import check_one_grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
 
@@ -73,14 +73,13 @@ def multilook(images: Image | Sequence[Image], *, window_m: float | None = None)
         raise ArgumentError("images", "have at least one image", "none")
     for look in looks:
         validate.instance("every entry of images", look, Image)
-    digests = {digest(look.grid) for look in looks}
-    if len(digests) > 1:
-        raise ArgumentError("images", "have one grid", f"{len(digests)} different ones")
     if len(looks) == 1 and window_m is None:
         allowed = "be given for a single image, or `images` be several looks"
         raise ArgumentError("window_m", allowed)
 
     grid = looks[0].grid
+    for look in looks[1:]:
+        check_one_grid("images", look.grid, grid)
     size = []  # rows and columns of the window, both odd
     if window_m is not None:
         if grid.points_m is not None:

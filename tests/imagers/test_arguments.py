@@ -92,7 +92,7 @@ REFUSED = [
      "accumulate must be .*Image"),
     *(
         (IN_PARTS, "accumulate", Image(np.zeros(grid.shape, complex), grid), ValueError,
-         "accumulate must be an image on the same grid")
+         "accumulate and grid must lie on one grid")
         for grid in (SHIFTED, GRID.window(slice(0, 24), slice(0, 23)))
     ),
     (IN_PARTS, "progress", 5, TypeError, "progress must be a function"),

@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import integrate, optimize
 
+from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.image_error import relative_error_db
@@ -303,6 +306,16 @@ def test_relative_error_is_of_one_place():
             ValueError, match=f"image and ref.* one grid, got .* by up to {apart} m"
         ):
             relative_error_db(image, Image(pixels, other))
+
+
+def test_relative_error_is_of_one_place_on_earth():
+    plane = Grid.plane((0, 1, 40), (0, 1, 30))
+    places = [Georeference.local(60, longitude, heading_deg=0) for longitude in (5, 6)]
+    grids = [replace(plane, georeference=place) for place in (None, *places)]
+    unknown, one, other = (Image(speckle(30, 40), grid) for grid in grids)
+    assert relative_error_db(one, unknown) == -np.inf
+    with pytest.raises(ValueError, match="image and reference must lie on one grid, got georef"):
+        relative_error_db(one, other)
 
 
 def test_relative_error_names_bad_input():

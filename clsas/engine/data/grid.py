@@ -513,3 +513,25 @@ def _check_steps(
 def without_heights(grid: Grid) -> Grid:
     """Return the plane of a height map, or the grid itself if it has no heights."""
     return replace(grid, height_m=None)
+
+
+def check_one_grid(names: str, grid: Grid, other: Grid) -> None:
+    """Raise ValueError unless two grids have the same pixel positions, up to rounding.
+
+    A georeference that only one of them has counts for both.
+    """
+    allowed = "lie on one grid"
+    if grid.shape != other.shape:
+        raise ArgumentError(names, allowed, f"shapes {grid.shape} and {other.shape}")
+    places = grid.georeference, other.georeference
+    if None not in places and places[0] != places[1]:
+        got = "georeferences {} and {}".format(*places)
+        raise ArgumentError(names, allowed, got, "form both with the same one")
+    part = [_ALL] * 2
+    if grid.is_planar and other.is_planar:
+        part = [slice(None, None, max(count - 1, 1)) for count in grid.shape]  # the corners
+    positions_m = other.positions_m(*part)
+    apart_m = np.abs(grid.positions_m(*part) - positions_m).max()
+    if apart_m > 1e-9 + 1e-14 * np.abs(positions_m).max():
+        got = f"pixel positions that differ by up to {apart_m:g} m"
+        raise ArgumentError(names, allowed, got)

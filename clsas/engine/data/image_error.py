@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import validate
-from clsas.engine.data.grid import Grid
+from clsas.engine.data.grid import check_one_grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
 
@@ -26,7 +26,7 @@ def relative_error_db(
     Parameters
     ----------
     image, reference : Image or array_like
-        Complex images of one shape. Two Images must also have the same pixel positions.
+        Complex images of one shape. Two Images must also lie on one grid.
     darkest : float, optional
         Share of the pixels over which both norms are taken: the darkest pixels of the reference
         (0.1 is a tenth of them). The result is then the error in shadows, relative to their own
@@ -56,7 +56,7 @@ def relative_error_db(
         allowed = f"have the shape of `reference`, {wanted.shape}"
         raise ArgumentError("image", allowed, str(given.shape))
     if isinstance(image, Image) and isinstance(reference, Image):
-        check_one_grid(image.grid, reference.grid)
+        check_one_grid("image and reference", image.grid, reference.grid)
     if not wanted.any():
         raise ArgumentError("reference", "not be zero everywhere")
     if darkest is not None:
@@ -77,18 +77,6 @@ def complex_values(name: str, image: Image | ArrayLike) -> NDArray[np.complex128
     if values.dtype.kind in "iuf":
         values = values.astype(np.complex128)
     return validate.array(name, values, np.complex128, (None,) * max(values.ndim, 1))
-
-
-def check_one_grid(image: Grid, reference: Grid, names: str = "image and reference") -> None:
-    """Raise ValueError unless two grids of one shape have the same pixel positions."""
-    part = [slice(None)] * 2
-    if image.is_planar and reference.is_planar:
-        part = [slice(None, None, max(count - 1, 1)) for count in image.shape]  # the corners
-    positions_m = reference.positions_m(*part)
-    apart_m = np.abs(image.positions_m(*part) - positions_m).max()
-    if apart_m > 1e-9 + 1e-14 * np.abs(positions_m).max():
-        got = f"pixel positions that differ by up to {apart_m:g} m"
-        raise ArgumentError(names, "lie on one grid", got)
 
 
 def _norm_db(values: NDArray[np.float64]) -> float:
