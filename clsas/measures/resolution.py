@@ -26,7 +26,7 @@ from clsas.engine.data.lines import RangeLines, some_channels
 from clsas.engine.data.system import Sonar, element_pattern
 from clsas.engine.data.track import Pointing, Track, channels
 from clsas.engine.data.validate import ArgumentError
-from clsas.engine.data.visibility import sines
+from clsas.engine.data.visibility import is_within, sines
 from clsas.engine.signal.compression import Window, band_window, compress
 from clsas.inspection.sampling import corners_of, course, grating_lobe_m
 
@@ -171,9 +171,8 @@ class Survey:
         points_m = np.concatenate([corners_of(self.grid), self.grid.spread()])
         range_m = pairwise_range_m(points_m, tx[some], rx[some])
         if self.beam is not None and self.is_moving:
-            low, high = self.beam.limits
             sine = sines(points_m, self.centres_m[some], self.beam_directions[some]).T
-            seen = (sine > low) & (sine < high)
+            seen = is_within(sine, self.beam.limits)
             if seen.any():
                 range_m = range_m[seen]
         return float(range_m.min()), float(range_m.max())

@@ -29,9 +29,8 @@ from clsas.engine.data import validate
 from clsas.engine.data.beam import MOST_TRACK_PINGS, BeamWindow
 from clsas.engine.data.declared import Number
 from clsas.engine.data.digests import Without, digest
-from clsas.engine.data.geometry import bistatic_range_m
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.lines import RangeLines, reached_m
 from clsas.engine.data.sound_speed import range_bounds_m
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import BeamTrack, Boxes
@@ -424,16 +423,11 @@ class SurveyVisibility:
         return int(pings[-later]) if len(pings) > 2 * later else 0
 
     def ranges_m(self, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return bounds of the nearest and farthest range of a grid from every channel, metres."""
+        """Return between which ranges every channel may contribute to a grid, metres."""
         centre_m, half_m = bounding_box(grid)
         geometry = self.survey.geometry
-        middle_m = bistatic_range_m(centre_m, geometry.tx_m, geometry.rx_m)
-        radius_m = np.linalg.norm(np.abs(half_m).sum(axis=0))
-        extent_m = np.full(len(middle_m), radius_m + 2 * geometry.range_step_m)
-        if geometry.rx_velocity_m_s is not None:
-            speed = np.linalg.norm(geometry.rx_velocity_m_s, axis=1) / geometry.sound_speed_m_s
-            extent_m += 1.1 * speed * (middle_m + radius_m)
-        near_m, far_m = middle_m - extent_m, middle_m + extent_m
+        radius_m = float(np.linalg.norm(np.abs(half_m).sum(axis=0)))
+        near_m, far_m = reached_m(geometry, centre_m, radius_m)
         if (profile := geometry.sound_speed) is not None:
             near_m, far_m = range_bounds_m(profile, near_m, far_m, geometry.sound_speed_m_s)
         return near_m, far_m

@@ -13,7 +13,7 @@ import numpy as np
 from clsas.engine.data import validate
 from clsas.engine.data.image import Image
 from clsas.engine.data.image_error import relative_error_db
-from clsas.engine.data.visibility import sines
+from clsas.engine.data.visibility import is_within, sines
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import TOLERANCE_DB
@@ -274,8 +274,7 @@ def run_mosaic(
     found = _in_turns(methods, repeats, progress)
     points_m = wreck.grid(_VISIBILITY_PIXELS).positions_m().reshape(-1, 3)
     sine = sines(points_m, lines.phase_centres_m, beam.directions(lines))
-    low, high = beam.limits
-    share_seen = float(((sine > low) & (sine < high)).mean())
+    share_seen = float(is_within(sine, beam.limits).mean())
     seconds = found["seconds"]["median"]
     predicted = [r.predicted_error_db for r in records if r.predicted_error_db is not None]
     return {

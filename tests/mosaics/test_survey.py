@@ -1,5 +1,6 @@
 """Surveys are read in slices, and imaged as if they had been read whole."""
 
+import warnings
 from dataclasses import replace
 
 import h5py
@@ -93,6 +94,25 @@ def test_nothing_is_read_beyond_what_is_recorded():
     np.testing.assert_array_equal(lines.samples, LINES.samples)
     beyond = Grid.plane((-3, 3, 61), (1e3, 2e3, 121))
     assert not SurveyVisibility.of(survey, None).channels(beyond).any()
+
+
+@pytest.mark.parametrize("velocity_m_s", [None, np.array([[30.0, 0, 0]])])
+def test_a_line_contributes_to_pixels_just_beyond_its_ends(velocity_m_s, platform):
+    """As in an image of the whole grid, whose interpolation reads the samples at the end."""
+    antenna_m, pixel = np.zeros((1, 3)), Grid.plane((3, 3, 1), (40, 40, 1))
+    range_m = pairwise_range_m(pixel.spread(1), antenna_m, antenna_m, velocity_m_s, 1500.0)[0]
+    samples, contributing, expected = np.ones((1, 16), complex), [], []
+    for beyond in (*range(-1, -9, -1), *range(16, 24), -100, 115):
+        line = RangeLines(
+            samples, range_m - 0.03 * (beyond + 0.5), 0.03, antenna_m, antenna_m, 1e4, 1500.0,
+            velocity_m_s,
+        )  # fmt: skip
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ClsasWarning)
+            image = backproject(line, pixel, device=platform, taps=8, upsampling=1.0)
+        expected.append(bool(image.pixels.any()))
+        contributing.append(bool(SurveyVisibility.of(open_survey(line), None).channels(pixel)[0]))
+    assert contributing == expected == 15 * [True] + 3 * [False]
 
 
 def test_channels_without_samples_are_told(tmp_path):

@@ -22,6 +22,7 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.pings import PASS_JUMP
 from clsas.engine.data.system import element_pattern
 from clsas.engine.data.validate import ArgumentError
+from clsas.engine.data.visibility import is_within, sine_width
 
 SHAPES = ("rectangular", "hann", "hamming", "taylor", "tukey", "inverse")
 
@@ -271,8 +272,8 @@ class BeamWindow:
     @property
     def edge(self) -> float:
         """Approximate extent, in sine, over which the weights rise from 0 to 1."""
-        low, high = np.clip(self.limits, -1, 1)
-        return (high - low) / 2 * (max(self.taper, 0.02) if self.shape == "tukey" else 1.0)
+        share = max(self.taper, 0.02) if self.shape == "tukey" else 1.0
+        return sine_width(self.limits) / 2 * share
 
     @property
     def jumps(self) -> bool:
@@ -291,8 +292,7 @@ class BeamWindow:
         begin with a kink that no cubic follows. The other shapes are smooth between the limits.
         """
         reach = validate.number("reach", reach, least=0.0)
-        low, high = np.clip(self.limits, -1, 1)
-        width = high - low
+        width = sine_width(self.limits)
         if not self._has_taper:
             return 0.01 * (math.pi * reach / self.edge) ** 4
         x = math.pi * reach / (width / 2 * self.taper)
@@ -373,8 +373,7 @@ class BeamWindow:
         """
         q = validate.array("q", q, np.float64, None)
         wavelength_m = _positive_or_infinite(wavelength_m)
-        low, high = self.limits
-        inside = (q > low) & (q < high)
+        inside = is_within(q, self.limits)
         weights = np.zeros(q.shape)
         weights[inside] = self._inside(q[inside], wavelength_m)
         return weights

@@ -21,8 +21,8 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.findings import Finding
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.lines import RangeLines, antennas_of, some_channels, steepest
-from clsas.engine.data.visibility import BeamTrack, Boxes, sines
+from clsas.engine.data.lines import RangeLines, antennas_of, reached_m, some_channels
+from clsas.engine.data.visibility import BeamTrack, Boxes, is_within, sines
 
 MIRRORED = 0.01
 """Least share of a grid behind the elements that is reported."""
@@ -30,7 +30,6 @@ MIRRORED = 0.01
 # Channels in the quick test of `reaches`, which finds that nearly every grid is covered.
 _SAMPLED_CHANNELS = 64
 _BLOCKS = 8  # along either side of the grid; smaller blocks would find smaller gaps
-_TAPS = 8  # samples by which an interpolated line extends beyond its ends
 
 # Of `behind`. Plain choices: a grid on the right side takes less than a millisecond, on the wrong
 # one some.
@@ -64,22 +63,16 @@ def reaches(
     inside = (range_m >= lines.first_range_m[some]) & (range_m <= lines.last_range_m[some])
     track = None
     if beam is not None and along is not None:
-        low, high = beam.limits
         track = BeamTrack(beam.limits, lines.phase_centres_m, along)
         sine = sines(points_m, track.position_m[some], along[some]).T
-        inside &= (sine > low) & (sine < high)
+        inside &= is_within(sine, beam.limits)
     if inside.any():
         return True
 
     # The full test: may any channel receive from any of the boxes that contain the pixels?
-    beyond_m = _TAPS * lines.range_step_m
     for centre_m, sides_m in zip(*_boxes(grid), strict=True):
-        range_m = pairwise_range_m(
-            centre_m[None], lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
-        )[0]
-        radius_m = np.linalg.norm(sides_m) * steepest(lines) + beyond_m
-        reached = range_m + radius_m >= lines.first_range_m
-        reached &= range_m - radius_m <= lines.last_range_m
+        near_m, far_m = reached_m(lines, centre_m, float(np.linalg.norm(sides_m)))
+        reached = (far_m >= lines.first_range_m) & (near_m <= lines.last_range_m)
         if track is not None and reached.any():
             reached &= track.touching(Boxes.equal(centre_m[None], np.diag(sides_m)))[0]
         if reached.any():

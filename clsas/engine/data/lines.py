@@ -13,6 +13,7 @@ from scipy import fft
 from clsas.engine.data import pings, reprs, validate
 from clsas.engine.data.declared import Choice, Count, Number, check_declared
 from clsas.engine.data.fourier import EDGE_PRODUCT, filtered, smooth_edge
+from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.sound_speed import SoundSpeed, check_reaches
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
@@ -36,6 +37,9 @@ STATISTICS = ("mean", "median")
 _UNIT = 1e-12  # error of a unit vector's length, far above rounding
 # Steps by which the first ranges of pings may differ. The resulting error is -50 dB.
 _EQUAL_RANGE = 1e-3
+# Samples by which an interpolated line extends beyond its ends. With 8 taps, 4 samples are kept
+# there, and pixels up to 4 samples farther out read them.
+_REACH = 8
 _MOST_BANKS = 1000  # far more than any sonar has: a plain choice
 _LEAST_CYCLES = 0.02  # per sample, at the middle of a band that shows the carrier
 _Number = TypeVar("_Number", float, NDArray[np.float64])
@@ -699,6 +703,16 @@ def antennas_of(
     velocity = lines.rx_velocity_m_s
     moving = None if velocity is None else velocity[channels]
     return lines.tx_m[channels], lines.rx_m[channels], moving, lines.sound_speed_m_s
+
+
+def reached_m(
+    lines: RangeLines, centre_m: NDArray[np.float64], radius_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return between which ranges lines must have samples to contribute to a ball, [channels]."""
+    antennas = lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
+    range_m = pairwise_range_m(centre_m[None], *antennas)[0]
+    beyond_m = radius_m * steepest(lines) + _REACH * lines.range_step_m
+    return range_m - beyond_m, range_m + beyond_m
 
 
 def steepest(lines: RangeLines) -> float:

@@ -23,7 +23,7 @@ from clsas.engine.data.decibels import power
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, some_channels, wavelength_m
-from clsas.engine.data.visibility import sines
+from clsas.engine.data.visibility import is_within, sines
 
 MOTION = "motion during flight"
 APART = "transmitter and receiver apart"
@@ -208,7 +208,7 @@ class _SampledRanges:
         if beam is not None and along is not None:
             around = _BEYOND_BEAM * step_m / np.maximum(range_m, 1e-30)
             sine = sines(points_m, lines.phase_centres_m, along).T
-            visible = (sine > beam.limits[0] - around) & (sine < beam.limits[1] + around)
+            visible = is_within(sine, beam.limits, around)
         return cls(lines, beam, along, points_m, step_m, range_m, visible)
 
     def antennas_m(

@@ -36,6 +36,21 @@ def sines(
     return _sines(points_m, phase_centres_m, along)[0].T
 
 
+def is_within(
+    sine: NDArray[np.float64],
+    limits: tuple[float, float],
+    beyond: float | NDArray[np.float64] = 0.0,
+) -> NDArray[np.bool_]:
+    """Return which sines of aspect angles lie in a beam, or outside it by less than `beyond`."""
+    low, high = limits
+    return (sine > low - beyond) & (sine < high + beyond)
+
+
+def sine_width(limits: tuple[float, float]) -> float:
+    """Return the width of a beam between limits that may lie beyond end-fire, at most 2."""
+    return float(np.ptp(np.clip(limits, -1, 1)))
+
+
 @dataclass(frozen=True, eq=False)
 class Boxes:
     """Boxes whose sides have the same directions.

@@ -20,7 +20,7 @@ from clsas.engine.data.declared import Number
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import cycles_per_m_at, fastest, some_channels, wavelength_m
 from clsas.engine.data.validate import ArgumentError
-from clsas.engine.data.visibility import sines
+from clsas.engine.data.visibility import sine_width, sines
 from clsas.engine.device import kernels
 from clsas.engine.device.device import Device
 from clsas.engine.exact.layout import (
@@ -284,8 +284,7 @@ def fitting_tiles(
         most_of_sines = math.inf
         if beam is not None:
             of_width = max(_SINE_ERROR, (most * fullness) ** 2)
-            beam_width = float(np.ptp(np.clip(beam.limits, -1, 1)))
-            most_of_sines = max(of_width * beam_width, _SINE_ROUNDING)
+            most_of_sines = max(of_width * sine_width(beam.limits), _SINE_ROUNDING)
         for tiles, of_pixels, of_sines in candidates:
             if of_pixels <= most and of_sines <= most_of_sines:
                 return replace(tiles, cosines=tiles.cosines_of(antennas_m))

@@ -21,7 +21,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.lines import wavelength_m
-from clsas.engine.data.visibility import sines
+from clsas.engine.data.visibility import sine_width, sines
 from clsas.engine.device import kernels
 from clsas.engine.device.device import Device
 from clsas.engine.exact.decide import ROUNDING
@@ -192,8 +192,7 @@ def leaf_error(
     result = (2 * np.pi * sampled.highest_cycles_per_m * remainder_m) ** 2
     if beam is not None:
         result += [beam.block_error(reach) ** 2 for reach in block_m / distance_m]
-        window_sine = np.ptp(np.clip(beam.limits, -1, 1))
-        result += (0.1 * (radius_m / distance_m) ** 4 / window_sine) ** 2
+        result += (0.1 * (radius_m / distance_m) ** 4 / sine_width(beam.limits)) ** 2
     return np.maximum(result.mean(axis=1), result[:, 0] / _MOST_OF_MEAN)
 
 

@@ -24,7 +24,7 @@ from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, some_channels, wavelength_m
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
-from clsas.engine.data.visibility import sines
+from clsas.engine.data.visibility import is_within, sine_width, sines
 from clsas.engine.device.device import Device
 from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.engine.factorized import measured_costs
@@ -555,7 +555,7 @@ def trimmed(
     # The channels alone do not suffice, because filters extend into gaps of the track. Neither does
     # one point: from a short aperture, a pixel receives only from a small part of the beam.
     for sine in (_sines_of_channels(sampled), of_track):
-        sine = sine[(sine > low) & (sine < high)]
+        sine = sine[is_within(sine, (low, high))]
         power = beam.weights(sine, wavelength_m(sampled.scene.lines)) ** 2
         index = np.minimum((sine - low) * (_BINS / (high - low)), _BINS - 1).astype(np.int64)
         total = np.bincount(index, power, _BINS).cumsum()
@@ -616,7 +616,7 @@ def _directions_unknown(sampled: SampledScene) -> bool:
 def _width(sampled: SampledScene) -> float:
     """Return the width of the beam, in sine of the aspect angle."""
     assert sampled.scene.beam is not None
-    return float(np.ptp(np.clip(sampled.scene.beam.limits, -1, 1)))
+    return sine_width(sampled.scene.beam.limits)
 
 
 def _turns_between_channels(sampled: SampledScene) -> bool:
@@ -656,8 +656,7 @@ def _sweeps_once(sampled: SampledScene, of_strip: NDArray[np.bool_]) -> bool:
     along_m += 1e-9 * np.arange(len(along_m))  # a track may stand still
     rate = -np.gradient(sine, along_m, axis=1)
     rate *= sampled.distance_m[:, on_track] / np.maximum(1 - sine**2, 1e-3)
-    low, high = sampled.scene.beam.limits
-    visible = (sine > low) & (sine < high)
+    visible = is_within(sine, sampled.scene.beam.limits)
     count = np.maximum(visible.sum(axis=1), 1)
     mean = rate.sum(axis=1, where=visible) / count
     fastest = rate.max(axis=1, where=visible, initial=-np.inf)
@@ -681,9 +680,7 @@ def coverage(sampled: SampledScene, power: int) -> NDArray[np.float64]:
 def partly_visible_share(sampled: SampledScene) -> float:
     """Return the fraction of points in the beam of some channels, but not of others."""
     assert sampled.scene.beam is not None
-    low, high = sampled.scene.beam.limits
-    sine = _sines_of_channels(sampled)
-    visible = ((sine > low) & (sine < high)).mean(axis=0)
+    visible = is_within(_sines_of_channels(sampled), sampled.scene.beam.limits).mean(axis=0)
     return float(((visible > 0) & (visible < 1)).mean())
 
 

@@ -27,7 +27,7 @@ from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.lines import RangeLines, antennas_of, band_wavelength_m
 from clsas.engine.data.surface import Surface
 from clsas.engine.data.validate import ArgumentError
-from clsas.engine.data.visibility import BeamTrack, Boxes
+from clsas.engine.data.visibility import BeamTrack, Boxes, sine_width
 from clsas.engine.device.buffers import MARGIN
 from clsas.engine.factorized.phase_rates import (
     BeamDirections,
@@ -292,7 +292,7 @@ def _rectangle(
     exceeds that of a leaf by no more than `BEAM_MARGIN`.
     """
     parent, side = sides[max(len(sides) - 2, 0)], sides[-1]
-    most_m = BEAM_MARGIN * nearest_m * np.ptp(np.clip(limits, -1, 1))
+    most_m = BEAM_MARGIN * nearest_m * sine_width(limits)
     along_m = np.abs(surface.steps_m[:2] @ along.T)
     while True:
         doubled = [(2 * side[0], side[1]), (side[0], 2 * side[1])]

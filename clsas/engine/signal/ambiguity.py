@@ -31,7 +31,7 @@ from clsas.engine.data.lines import (
     some_channels,
     wavelength_m,
 )
-from clsas.engine.data.visibility import sines
+from clsas.engine.data.visibility import is_within, sines
 from clsas.engine.signal.interpolation import TAPS
 from clsas.engine.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum, representative_channels
 
@@ -202,9 +202,8 @@ def ends_error(
     sample = (range_m - part.first_range_m) / part.range_step_m
     visible = np.ones(sample.shape, bool)
     if beam is not None and along is not None:
-        low, high = beam.limits
         sine = sines(points_m, part.phase_centres_m, along[some]).T
-        visible = (sine > low) & (sine < high)
+        visible = is_within(sine, beam.limits)
     nearest = np.where(visible, sample, np.inf).min(axis=0)
     farthest = np.where(visible, sample, -np.inf).max(axis=0)
     half_width = np.clip(0.5 / spectrum.oversampling, _THIN, 0.499)

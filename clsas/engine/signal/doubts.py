@@ -25,7 +25,7 @@ from clsas.engine.data.lines import RangeLines, band_wavelength_m, banks_of, som
 from clsas.engine.data.lines import wavelength_m as carrier_wavelength_m
 from clsas.engine.data.reprs import measured
 from clsas.engine.data.track import LEAST_FIXES, MOST_HELD, held_fixes, rounded_to
-from clsas.engine.data.visibility import sines
+from clsas.engine.data.visibility import is_within, sine_width, sines
 
 # Speeds of waves outside of which there is no medium, m/s: nothing that one looks into is slower
 # than air (330 m/s) by a factor of six, solids stay below 20 km/s, and light in water has 3e7.
@@ -263,12 +263,12 @@ def _beam(
 ) -> Iterator[Finding]:
     """Yield that a beam is so narrow that hardly any channels lie within it, or so coarse."""
     try:
-        along, (low, high) = beam.directions(lines), beam.limits
+        along = beam.directions(lines)
     except ValueError:  # a platform that stands still, which imagers refuse
         return
     points_m = grid.spread(4)
     sine = sines(points_m, lines.phase_centres_m, along)
-    seen = ((sine > low) & (sine < high)).sum(axis=0)
+    seen = is_within(sine, beam.limits).sum(axis=0)
     if seen.any() and (usual := float(np.median(seen[seen > 0]))) < 2:
         yield Finding(
             "beam",
@@ -283,7 +283,7 @@ def _beam(
         pitch_m = max(abs(float(step @ course)) for step in grid.vectors_m[1:])
         range_m = float(np.median(pairwise_range_m(points_m, lines.tx_m[:1], lines.rx_m[:1])))
         aperture_m = float(np.ptp(lines.phase_centres_m @ course))
-        cell_m = wavelength_m / (2 * float(np.ptp(np.clip(beam.limits, -1, 1))))
+        cell_m = wavelength_m / (2 * sine_width(beam.limits))
         of_aperture_m = wavelength_m * range_m / (2 * aperture_m or 1.0)
         coarse = 0 < _COARSER * pitch_m < cell_m and cell_m > _NARROWED * of_aperture_m
         if coarse:

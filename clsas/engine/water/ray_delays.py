@@ -14,7 +14,7 @@ from clsas.engine.data.grid import Grid, spread_indices
 from clsas.engine.data.lines import RangeLines, some_channels
 from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.data.validate import ArgumentError
-from clsas.engine.data.visibility import sines
+from clsas.engine.data.visibility import is_within, sines
 from clsas.engine.water.rays import Rays, rays, shadow
 from clsas.engine.water.thinning import FEW, vertical_errors_s
 
@@ -132,7 +132,7 @@ def in_beam(
     """
     sine = sines(points_m, lines.phase_centres_m, along).T
     around = _BEYOND_BEAM + slack_m / np.maximum(straight_m(lines, points_m), 1e-30)
-    return (sine > beam.limits[0] - around) & (sine < beam.limits[1] + around)
+    return is_within(sine, beam.limits, around)
 
 
 @dataclass(frozen=True, eq=False)
