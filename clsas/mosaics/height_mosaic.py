@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import validate
-from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow, scale_to_all
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import holds_any
@@ -391,11 +391,8 @@ def measure_patch(
             except UnmeasurableError as error:
                 known["heights"] = {"reason": str(error)}
             else:
-                scale = 1.0
-                if request.beam is not None and request.beam.normalise:
-                    # The beam was normalised by the channels of this patch.
-                    scale = len(banks[0].members) / pair.a.channels
-                pixels = np.complex64(scale) * measured.heights.image.pixels[inside]
+                scale = scale_to_all(request.beam, pair.a.channels, len(banks[0].members))
+                pixels = scale * measured.heights.image.pixels[inside]
                 layers, known["heights"] = _results(measured, window.grid, inside)
             known["has_pixels"] = holds_any(pixels)
         record = Record(**known, seconds=time.perf_counter() - start)

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import reprs, validate
-from clsas.engine.data.beam import MOST_TRACK_PINGS, BeamWindow
+from clsas.engine.data.beam import MOST_TRACK_PINGS, BeamWindow, scale_to_all
 from clsas.engine.data.coverage import reaches, warn_unreached
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.digests import digest, grid_digest
@@ -785,10 +785,8 @@ def _image(
         return empty()
 
     image, how = _formed(request, memory_bytes, lines, grid, beam, device)
-    if beam is not None and beam.normalise:
-        # The beam was normalised by the number of channels of this patch instead of all channels.
-        scale = np.float32(survey.channels / lines.channels)
-        image = replace(image, pixels=scale * image.pixels) if scale != 1 else image
+    if (scale := scale_to_all(beam, lines.channels, survey.channels)) != 1:
+        image = replace(image, pixels=scale * image.pixels)
     fields |= how | {
         "has_pixels": holds_any(image.pixels),
         "seconds": time.perf_counter() - start,

@@ -496,6 +496,15 @@ def normalising(sums: NDArray[np.floating], channels: int) -> NDArray[np.floatin
     return (channels / np.maximum(sums, LEAST_WEIGHT_SUM)).astype(sums.dtype)
 
 
+def scale_to_all(beam: BeamWindow | None, channels: int, all_channels: int) -> np.float32:
+    """Return the factor for an image of some channels that is a part of the image of all.
+
+    It is 1 unless the beam normalises, which multiplies pixels by the number of their channels.
+    """
+    is_normalised = beam is not None and beam.normalise
+    return np.float32(all_channels / channels if is_normalised else 1.0)
+
+
 def track_directions(lines: RangeLines, pings: int | None = None) -> NDArray[np.float64]:
     """Return the unit direction of the track at every channel, float64 [channels, 3].
 

@@ -18,7 +18,7 @@ import scipy.special
 from numpy.typing import NDArray
 
 from clsas.engine.data import validate
-from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow, normalising
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.fourier import turned
 from clsas.engine.data.geometry import pairwise_range_m
@@ -394,7 +394,6 @@ _NOISE_CHANNELS = 256  # channels sampled in addition to the loudest; a beam pas
 # Terms sampled of the sums over channels and frequencies; twice as many change nothing.
 _TERMS = 256
 _KEPT = 0.995  # share of images that must meet their accuracy
-_LEAST_WEIGHT = 1e-3  # mean weight of channels down to which normalising beams amplify pixels
 
 
 def scatter(independent: float) -> float:
@@ -451,7 +450,7 @@ def independent_pixels(
     if beam is not None and along is not None:
         weights = _beam_weights(lines, some, points_m, beam, along)
         if beam.normalise:
-            weights /= np.maximum(weights.mean(axis=1, keepdims=True), _LEAST_WEIGHT)
+            weights *= normalising(weights.sum(axis=1, keepdims=True), len(some))
     seen = np.mean(weights**2, axis=0)
     held = np.cumsum(seen * factor.astype(np.float64) ** 2 * (energy[some] / (energy.max() or 1.0)))
     if not held[-1]:

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow, normalising
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.visibility import sines
@@ -96,7 +96,7 @@ def test_beams_that_normalise_change_which_pixels_count():
     along = np.tile([1.0, 0.0, 0.0], (60, 1))
     found = independent_pixels(lines, image, flat(), np.ones(60), beam, along)
     weights = beam.weights(sines(image.spread(40), lines.phase_centres_m, along).T, WAVELENGTH_M)
-    weights /= np.maximum(weights.mean(axis=1, keepdims=True), 1e-3)
+    weights *= normalising(weights.sum(axis=1, keepdims=True), lines.channels)
     measured = relative_variance(lines, image, weights, np.random.default_rng(7))
     assert found == pytest.approx(1 / measured, rel=0.35)
 
