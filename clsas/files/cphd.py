@@ -588,7 +588,6 @@ def _document(
         lxml.etree.Element(f"{{{_NAMESPACE}}}CPHD", nsmap={None: _NAMESPACE})
     )
     root = sarkit.ElementWrapper(tree.getroot())
-    monostatic = np.array_equal(lines.tx_m, lines.rx_m)
     own = {
         SPEED: repr(lines.sound_speed_m_s),
         ORIGIN: " ".join(repr(float(each)) for each in origin_m),
@@ -598,7 +597,7 @@ def _document(
     root["CollectionID"] = {
         "CollectorName": "clsas",
         "CoreName": "lines",
-        "CollectType": "MONOSTATIC" if monostatic else "BISTATIC",
+        "CollectType": "MONOSTATIC" if lines.is_monostatic else "BISTATIC",
         "RadarMode": {"ModeType": "DYNAMIC STRIPMAP"},
         "Classification": "UNCLASSIFIED",
         "ReleaseInfo": "UNRESTRICTED",

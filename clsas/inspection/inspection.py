@@ -127,7 +127,7 @@ def inspect(
     if pings.receivers.max() > 1:
         geometry = "array"
     else:
-        geometry = "monostatic" if np.array_equal(lines.tx_m, lines.rx_m) else "bistatic"
+        geometry = "monostatic" if lines.is_monostatic else "bistatic"
     speed_m_s = None
     if lines.rx_velocity_m_s is not None:
         speed_m_s = float(np.median(np.linalg.norm(lines.rx_velocity_m_s, axis=1)))

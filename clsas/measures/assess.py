@@ -311,7 +311,7 @@ class Inputs:
         lines = self.lines
         return {
             MOTION: lines.rx_velocity_m_s is not None,
-            APART: not np.array_equal(lines.tx_m, lines.rx_m),
+            APART: not lines.is_monostatic,
             RELIEF: not surface_of(self.grid).is_plane,
             REFRACTION: self.water is not None,
             SWAY: bool(track_errors_m(lines).any()),

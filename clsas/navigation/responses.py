@@ -212,8 +212,7 @@ def _gradient(
 
     `axes` are [unknowns, channels, 3].
     """
-    monostatic = np.array_equal(lines.tx_m, lines.rx_m)
-    ends_m = (lines.tx_m,) if monostatic else (lines.tx_m, lines.rx_m)
+    ends_m = (lines.tx_m,) if lines.is_monostatic else (lines.tx_m, lines.rx_m)
     total = np.zeros((*axes.shape[:2], len(points_m)))
     for end_m in ends_m:
         # Positions are relative to one of them, so that large coordinates do not cancel.

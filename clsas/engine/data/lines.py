@@ -210,6 +210,16 @@ class RangeLines:
         return len(banks_of(self.bank_numbers))
 
     @property
+    def is_monostatic(self) -> bool:
+        """True if every channel transmits and receives at one position, but for its motion."""
+        return np.array_equal(self.tx_m, self.rx_m)
+
+    @property
+    def paths_differ(self) -> bool:
+        """True if echoes return on other paths, because receivers lie elsewhere or move."""
+        return self.rx_velocity_m_s is not None or not self.is_monostatic
+
+    @property
     def phase_centres_m(self) -> NDArray[np.float64]:
         """Midpoints between transmitters and receivers, metres, shape [channels, 3]."""
         return (self.tx_m + self.rx_m) / 2

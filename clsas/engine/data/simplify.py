@@ -110,13 +110,12 @@ def simplify(
     their sum stays within `SHARE` of the allowed error power.
     """
     full = Model(lines, grid, beam)
-    apart = not np.array_equal(lines.tx_m, lines.rx_m)
     flat = grid.is_planar or len(grid.shape) != 2
-    if allowed_db is None or (flat and not apart and lines.rx_velocity_m_s is None):
+    if allowed_db is None or (flat and not lines.paths_differ):
         return full
     highest = lines.highest_cycles_per_m
     most = math.sqrt(SHARE * power(allowed_db))
-    if not flat and (apart or lines.rx_velocity_m_s is not None):
+    if not flat and lines.paths_differ:
         most /= 2  # because the amplitudes of antennas and relief add up
     model, amplitude = full, 0.0
     if grid.size >= LEAST_PIXELS:
@@ -170,7 +169,7 @@ def relief_of(grid: Grid) -> NDArray[np.float64]:
 def _removable(lines: RangeLines) -> list[tuple[str, ...]]:
     """Return the sets of antenna effects that may be left out, the simplest model first."""
     moving = (MOTION,) if lines.rx_velocity_m_s is not None else ()
-    if np.array_equal(lines.tx_m, lines.rx_m):
+    if lines.is_monostatic:
         # The position at rest fitted to a moving receiver differs from that of its transmitter.
         return [moving] if moving else []
     return [(*moving, APART), moving] if moving else [(APART,)]
@@ -219,7 +218,7 @@ class _SampledRanges:
         If `effects` include `APART`, both are one antenna. Otherwise the transmitter stays.
         """
         lines = self.lines
-        if APART in effects or np.array_equal(lines.tx_m, lines.rx_m):
+        if APART in effects or lines.is_monostatic:
             antenna_m = _fit_positions(
                 self.points_m, self.range_m, self.visible, lines.phase_centres_m
             )

@@ -150,7 +150,7 @@ def decide(
 
     # All positions from which ranges or aspect angles are measured.
     antennas_m = lines.tx_m
-    if not np.array_equal(lines.tx_m, lines.rx_m):
+    if not lines.is_monostatic:
         antennas_m = np.unique(np.concatenate([lines.tx_m, lines.rx_m]), axis=0)
     if beam is not None:
         antennas_m = np.concatenate([antennas_m, lines.phase_centres_m])

@@ -248,7 +248,7 @@ class _Backprojection:
         }
         options |= lookup_options(device, self.layout, lines, self.samples_per_m, taps)
         paths = {
-            "BISTATIC": int(is_bistatic(lines)),
+            "BISTATIC": int(lines.paths_differ),
             "MOVING": int(lines.rx_velocity_m_s is not None),
         }
         if isinstance(self.layout, Tiles):
@@ -274,7 +274,7 @@ class _Backprojection:
         )
         slot.fill("samples", samples)
         rows = [float_pairs(block.tx_m - self.origin_m)]
-        if is_bistatic(self.lines):
+        if self.lines.paths_differ:
             rows.append(float_pairs(block.rx_m - self.origin_m))
         if block.rx_velocity_m_s is not None:
             rows.append((block.rx_velocity_m_s / block.sound_speed_m_s).astype(np.float32))
@@ -477,7 +477,7 @@ def _windowed_ranges(
         )
     else:
         range_m = distance_m(lines.tx_m)
-        if not np.array_equal(lines.tx_m, lines.rx_m):
+        if not lines.is_monostatic:
             range_m += distance_m(lines.rx_m)
             range_m *= 0.5
     return range_m, window(lines.first_range_m)
@@ -586,7 +586,7 @@ def block_buffers(
         "geometry": geometry_buffer(
             channel_pitch(channels),
             beam,
-            bistatic=is_bistatic(lines),
+            bistatic=lines.paths_differ,
             moving=lines.rx_velocity_m_s is not None,
         ),
     }
@@ -614,8 +614,3 @@ def part_buffers(parts: int, part_pixels: int, channels: int, blocks: Blocks) ->
     if blocks.terms:
         return buffers | {"expansions": Buffer((*row, blocks.terms), np.float32)}
     return buffers | {"offsets": Buffer((3, parts * part_pixels), np.float32)}
-
-
-def is_bistatic(lines: RangeLines) -> bool:
-    """Return whether the paths to a point and back differ."""
-    return lines.rx_velocity_m_s is not None or not np.array_equal(lines.tx_m, lines.rx_m)

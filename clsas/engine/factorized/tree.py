@@ -250,8 +250,7 @@ def geometry_of(
     own = own_drift(lines)
     if own is not None:
         off_m += np.linalg.norm(own, axis=1).max() * np.abs(lines.last_range_m).max()
-    bistatic = lines.rx_velocity_m_s is not None or not np.array_equal(lines.tx_m, lines.rx_m)
-    ramps = factorization.aperture.aligns_phases and (bistatic or off_m > close_m)
+    ramps = factorization.aperture.aligns_phases and (lines.paths_differ or off_m > close_m)
     # The apparent coordinate of a channel off the track depends on the point.
     slowest_m = np.linalg.norm(track.sampled_m[1], axis=1).min()
     return Geometry(
