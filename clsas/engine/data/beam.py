@@ -25,6 +25,10 @@ from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import is_within, sine_width
 
 SHAPES = ("rectangular", "hann", "hamming", "taylor", "tukey", "inverse")
+"""Shapes of a beam. Each states its weights in `BeamWindow._inside`, whether they end with a step
+in `jumps`, how wide their edges are in `edge`, and what one cubic over a block of pixels misses in
+`block_error`. Weights must have a continuous slope between the limits, since tables of cubics and
+`wavenumber` differentiate them."""
 
 INTERVALS = 1024
 """Number of cubics in a table of weights: enough for the kinks of a Tukey window."""
@@ -457,6 +461,7 @@ class BeamWindow:
             assert self.element_length_m is not None  # as __post_init__ checked
             one_way = element_pattern(self.element_length_m, np.sin(angle), 1.0, wavelength_m)
             return 1 / np.maximum(one_way**2, 1e-30)
+        assert self.shape == "rectangular"
         return np.ones_like(q)
 
     def _from_axis(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
