@@ -26,6 +26,7 @@ from clsas.engine.data import reading, validate
 from clsas.engine.data.atomic import replacing
 from clsas.engine.data.extras import needed
 from clsas.engine.data.fourier import turned
+from clsas.engine.data.geometry import unit_vectors
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.reading import parse_json
@@ -398,11 +399,9 @@ def _look_direction(
         sides = [geometry["Bistatic"][name]["SideOfTrack"] for name in _PLATFORMS]
     looks = []
     for along, side in zip(velocity, sides, strict=True):
-        left = np.stack([-along[:, 1], along[:, 0], 0 * along[:, 0]], axis=1)
-        with np.errstate(invalid="ignore"):  # at rest
-            left /= np.linalg.norm(left, axis=1, keepdims=True)
+        left = unit_vectors(np.stack([-along[:, 1], along[:, 0], 0 * along[:, 0]], axis=1))
         looks.append(left if side == "L" else -left)
-    if not np.all(np.einsum("ci,ci->c", *looks) > _ALIKE):  # also if one is NaN
+    if not np.all(np.einsum("ci,ci->c", *looks) > _ALIKE):  # also at rest
         return None
     return looks[0] + looks[1]
 

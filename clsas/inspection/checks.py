@@ -22,7 +22,13 @@ from clsas.engine.data.coverage import behind
 from clsas.engine.data.findings import Finding
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import SAMPLED_PIXELS, Grid
-from clsas.engine.data.lines import RangeLines, banks_of, some_channels, wavelength_between_m
+from clsas.engine.data.lines import (
+    EQUAL_RANGE,
+    RangeLines,
+    banks_of,
+    some_channels,
+    wavelength_between_m,
+)
 from clsas.engine.data.pings import STILL, Transmissions
 from clsas.engine.data.reprs import measured
 from clsas.engine.device.device import Device
@@ -50,7 +56,6 @@ _BESIDE = 8  # frequencies on either side of a constant that it is compared with
 _LEAST_COUNT = 4 * _BESIDE  # samples or pings in which a constant can be measured
 _MAIN_LOBE = 2  # frequencies on either side of a constant that a Hann window fills
 _SPIKE = 2.0  # least power of a constant relative to the largest beside it; speckle reaches 1.2
-_EQUAL_RANGE = 1e-3  # steps by which the first ranges of pings may differ
 _BLOCK = 1 << 22  # samples processed at a time
 _GAP = 1.75
 """Advance relative to that of the pings around, above which pings are missing. One missing ping
@@ -174,7 +179,7 @@ class Recording:
             return 0.0
         shape = pings.count, int(pings.receivers[0])
         first_m = lines.first_range_m.reshape(shape)
-        if np.ptp(first_m, axis=0).max() > _EQUAL_RANGE * lines.range_step_m:
+        if np.ptp(first_m, axis=0).max() > EQUAL_RANGE * lines.range_step_m:
             return 0.0
         samples = lines.samples.reshape(*shape, lines.length)
         some = some_channels(shape[1], 8)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from clsas.engine.data.beam import BeamWindow, track_directions
+from clsas.engine.data.geometry import unit_vectors
 from clsas.engine.data.grid import Grid, without_heights
 from clsas.engine.data.lines import RangeLines, some_channels, wavelength_m
 from clsas.measures.elevation import Sight, sight_along
@@ -88,10 +89,9 @@ class Baseline:
         moves_m = np.cross(self.along, rx_m - self.a.rx_m[self.channels])
 
         def of(some_m: NDArray[np.float64]) -> NDArray[np.float64]:
-            sight_m = some_m[:, None] - rx_m
-            sight_m /= np.linalg.norm(sight_m, axis=2, keepdims=True)
+            sight = unit_vectors(some_m[:, None] - rx_m)
             # A receiver that approaches a point by 1 m shortens the range, half the path, by 0.5 m.
-            return np.einsum("pc,pci,ci->p", self._weights(some_m), sight_m, moves_m) / 2
+            return np.einsum("pc,pci,ci->p", self._weights(some_m), sight, moves_m) / 2
 
         parts = max(len(points_m) // _POINTS_AT_ONCE, 1)
         nearer_m = np.concatenate([of(some_m) for some_m in np.array_split(points_m, parts)])
@@ -111,9 +111,8 @@ class Baseline:
         self, points_m: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         def towards(antennas_m: NDArray[np.float64]) -> NDArray[np.float64]:
-            sight_m = points_m[:, None] - antennas_m[self.channels]
-            sight_m /= np.linalg.norm(sight_m, axis=2, keepdims=True)
-            return np.einsum("pc,pci->pi", weight, sight_m)
+            sight = unit_vectors(points_m[:, None] - antennas_m[self.channels])
+            return np.einsum("pc,pci->pi", weight, sight)
 
         of_a, of_b = ((towards(lines.tx_m) + towards(lines.rx_m)) / 2 for lines in (self.a, self.b))
         return of_a - of_b, (of_a + of_b) / 2

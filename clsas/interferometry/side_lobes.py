@@ -24,7 +24,7 @@ from scipy import fft
 
 from clsas.engine.data.beam import track_directions
 from clsas.engine.data.fourier import turned
-from clsas.engine.data.geometry import bistatic_range_m
+from clsas.engine.data.geometry import SAME_PLACE_M, bistatic_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, antennas_of, wavelength_m
 from clsas.engine.data.pings import channels_per_ping
@@ -38,8 +38,7 @@ from clsas.measures.density import usual_spacing_m
 # wreck 0.25 masks 2 % of the lit pixels that are right, 0.5 a quarter of a percent, and 1 leaves
 # twice as many wrong pixels in the shadow as 0.5.
 _MOST_FROM_ELSEWHERE = 0.5
-# Avoid divisions by zero if elements look along the track, or a point lies at a phase centre.
-_LEAST_ACROSS, _NEAREST_M = 1e-3, 1e-9
+_LEAST_ACROSS = 1e-3  # avoids a division by zero if elements look along the track
 
 
 def from_elsewhere(
@@ -159,7 +158,7 @@ def _two_way_pattern(
         along = along - np.einsum("ci,ci->c", along, look)[:, None] * look
         along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), _LEAST_ACROSS)
     sight_m = point_m - lines.phase_centres_m
-    distance_m = np.maximum(np.linalg.norm(sight_m, axis=1), _NEAREST_M)
+    distance_m = np.maximum(np.linalg.norm(sight_m, axis=1), SAME_PLACE_M)
     sine = np.einsum("ci,ci->c", sight_m, along) / distance_m
     length_m = 2 * usual_spacing_m(lines)
     one_way = element_pattern(length_m, sine, 1.0, wavelength_m(lines))

@@ -16,7 +16,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.atomic import replacing
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.extras import needed
-from clsas.engine.data.geometry import bistatic_range_m
+from clsas.engine.data.geometry import bistatic_range_m, unit_vectors
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at, wavelength_m
@@ -290,9 +290,7 @@ class Collection:
         channels = np.flatnonzero(weights)
         changes_m = np.zeros((2, len(channels)))
         for antenna_m in (lines.tx_m[channels], lines.rx_m[channels]):
-            way_m = point_m - antenna_m
-            unit = way_m / np.linalg.norm(way_m, axis=1, keepdims=True)
-            changes_m += steps_m @ unit.T / 2
+            changes_m += steps_m @ unit_vectors(point_m - antenna_m).T / 2
         return channels, weights[channels], changes_m
 
     def support(self, changes_m: NDArray[np.float64]) -> NDArray[np.float64]:

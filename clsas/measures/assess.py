@@ -21,7 +21,7 @@ from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.declared import Count, check_declared
-from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.geometry import pairwise_range_m, unit_vectors
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import (
@@ -556,8 +556,7 @@ def _pattern(
         (received_m, sonar.rx_length_m, sonar.rx_height_m),
     )
     for position_m, length_m, height_m in antennas:
-        look = points_m[:, None] - position_m
-        look /= np.maximum(np.linalg.norm(look, axis=-1, keepdims=True), 1e-30)
+        look = unit_vectors(points_m[:, None] - position_m)
         components = np.einsum("pci,cai->apc", look, axes)
         pattern *= components[1] > -_IN_FRONT
         for size_m, sine in ((length_m, components[0]), (height_m, components[2])):

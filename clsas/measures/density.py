@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import decibels, reprs, validate
+from clsas.engine.data.geometry import unit_vectors
 from clsas.engine.data.lines import RangeLines, banks_of
 from clsas.engine.data.pings import STILL, Transmissions, means
 from clsas.engine.data.validate import ArgumentError
@@ -236,8 +237,7 @@ def _courses(moves_m: NDArray[np.float64], numbers: NDArray[np.int64]) -> NDArra
         )
     between = mean_m / advance_m[:, None]
     courses = np.concatenate([between[:1], between[:-1] + between[1:], between[-1:]])
-    unit: NDArray[np.float64] = courses / np.linalg.norm(courses, axis=1, keepdims=True)
-    return unit
+    return unit_vectors(courses)
 
 
 def _lengths_m(along_m: NDArray[np.float64], advance_m: float) -> NDArray[np.float64]:

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.engine.data.geometry import unit_vectors
+
 _LEAST_RISE = 1e-3  # of the tangent; directly below a track, no scatterer changes its height
 
 
@@ -74,6 +76,6 @@ def phase_per_height(
     wavelength_m : float
     """
     ways_m = [points_m - each_m for each_m in (tx_m, low_m, high_m)]
-    w, u, v = (way_m / np.linalg.norm(way_m, axis=1, keepdims=True) for way_m in ways_m)
+    w, u, v = map(unit_vectors, ways_m)
     along = np.cross(ways_m[0], [0.0, 0.0, 1.0])
     return sight_along(along, (2 * w + u + v) / 4, (v - u) / 2, 4 * np.pi / wavelength_m).rad_m

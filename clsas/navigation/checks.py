@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import track_directions
+from clsas.engine.data.geometry import unit_vectors
 from clsas.engine.data.lines import RangeLines, band_wavelength_m, banks_of, is_about_zero
 from clsas.engine.data.pings import Transmissions
 from clsas.engine.data.validate import ArgumentError
@@ -46,8 +47,7 @@ def displacement_axes(lines: RangeLines, unknowns: tuple[str, ...]) -> NDArray[n
     They point to port, up, and along the track.
     """
     along = track_directions(lines)[lines.ping_starts]
-    sway = np.cross(np.array([0.0, 0.0, 1.0]), along)
-    sway /= np.maximum(np.linalg.norm(sway, axis=1, keepdims=True), 1e-9)
+    sway = unit_vectors(np.cross(np.array([0.0, 0.0, 1.0]), along))
     vectors = {"sway": sway, "heave": np.cross(along, sway), "surge": along}
     return np.stack([vectors[name] for name in unknowns])
 

@@ -23,7 +23,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import least_squares
 
 from clsas.engine.data.fourier import turned
-from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.geometry import pairwise_range_m, unit_vectors
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at, some_channels
 from clsas.engine.signal.interpolation import Readout
 from clsas.navigation.checks import range_cell_m
@@ -221,8 +221,7 @@ class Reflectors:
         shift_m = np.einsum("u,uci->ci", state[2:], axes)
         ray = np.zeros((axes.shape[1], len(self.points_m), 3))
         for antenna_m in (lines.tx_m, lines.rx_m):
-            leg_m = self.points_m - (antenna_m[channels] + shift_m)[:, None]
-            ray += leg_m / np.maximum(np.linalg.norm(leg_m, axis=-1, keepdims=True), 1e-9) / 2
+            ray += unit_vectors(self.points_m - (antenna_m[channels] + shift_m)[:, None]) / 2
         by_speed = -self.range_m(state, channels) / speed_m_s
         by_speed -= lines.sound_speed_m_s * state[0] / (2 * speed_m_s)
         by_time = np.full_like(by_speed, -lines.sound_speed_m_s / 2)

@@ -34,7 +34,7 @@ from scipy.spatial.distance import cdist
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import DEVIATION_PER_MEDIAN
 from clsas.engine.data.fourier import phasors, turned_single
-from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.geometry import SAME_PLACE_M, pairwise_range_m
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines, wavelength_m
 from clsas.engine.data.threads import in_threads
@@ -218,7 +218,7 @@ def _gradient(
         # Positions are relative to one of them, so that large coordinates do not cancel.
         along_m = axes @ (points_m - end_m[0]).T
         along_m -= np.sum(axes * (end_m - end_m[0]), axis=-1)[..., None]
-        total -= along_m / np.maximum(cdist(end_m, points_m), 1e-9)
+        total -= along_m / np.maximum(cdist(end_m, points_m), SAME_PLACE_M)
     return total / len(ends_m)
 
 

@@ -18,6 +18,7 @@ from scipy.ndimage import correlate1d
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.decibels import amplitude
 from clsas.engine.data.declared import Choice, Count, Flag, Number, check_fields
+from clsas.engine.data.geometry import unit_vectors
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.pings import PASS_JUMP
 from clsas.engine.data.system import element_pattern
@@ -172,9 +173,8 @@ class BeamWindow:
             largest = np.abs(along).max(axis=-1, keepdims=True)
             if not largest.all():
                 raise ArgumentError("along", "not have a direction of length zero")
-            along = along / largest  # avoids overflow and underflow in the norm
-            along /= np.linalg.norm(along, axis=-1, keepdims=True)
-            object.__setattr__(self, "along", along)
+            # Division by the largest part avoids overflow and underflow in the norm.
+            object.__setattr__(self, "along", unit_vectors(along / largest))
 
     @classmethod
     def of_element(
@@ -564,7 +564,7 @@ def _directions(lines: RangeLines, pings: int | None) -> NDArray[np.float64]:
     ahead_m = channels_m - centres_m[ping]
     at_m = travelled_m[ping] + np.einsum("ci,ci->c", ahead_m, tangent[ping])
     found = np.stack([np.interp(at_m, travelled_m, each) for each in tangent.T], axis=-1)
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+    return unit_vectors(found)
 
 
 def _along_track(lines: RangeLines) -> NDArray[np.int64] | None:

@@ -8,6 +8,14 @@ from scipy.spatial.distance import cdist
 
 from clsas.engine.data.validate import ArgumentError
 
+SAME_PLACE_M = 1e-9
+"""Distance up to which two points count as one, between which there is no direction."""
+
+
+def unit_vectors(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return vectors [..., 3] scaled to length 1; below `SAME_PLACE_M` they stay shorter."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), SAME_PLACE_M)
+
 
 def legs_m(
     points_m: ArrayLike,

@@ -35,8 +35,6 @@ STATISTICS = ("mean", "median")
 """Estimates of the background that all pings have in common."""
 
 _UNIT = 1e-12  # error of a unit vector's length, far above rounding
-# Steps by which the first ranges of pings may differ. The resulting error is -50 dB.
-_EQUAL_RANGE = 1e-3
 # Samples by which an interpolated line extends beyond its ends. With 8 taps, 4 samples are kept
 # there, and pixels up to 4 samples farther out read them.
 _REACH = 8
@@ -44,6 +42,8 @@ _MOST_BANKS = 1000  # far more than any sonar has: a plain choice
 _LEAST_CYCLES = 0.02  # per sample, at the middle of a band that shows the carrier
 _Number = TypeVar("_Number", float, NDArray[np.float64])
 
+EQUAL_RANGE = 1e-3
+"""Steps by which the first ranges of pings may differ. The resulting error is -50 dB."""
 SAMPLED_CHANNELS = 128
 """Number of channels that represent all in estimates of geometry and coverage. Half or twice as
 many change predicted errors by less than 0.2 dB (`scripts/bench sensitivity`)."""
@@ -479,7 +479,7 @@ class RangeLines:
             raise ArgumentError("receivers", "divide the channels into at least 2 pings", got)
         first_m = self.first_range_m.reshape(number, receivers)
         spread_m = float(np.ptp(first_m, axis=0).max())
-        if spread_m > _EQUAL_RANGE * self.range_step_m:
+        if spread_m > EQUAL_RANGE * self.range_step_m:
             raise ArgumentError(
                 "first_range_m",
                 "be the same in all pings of a receiver",

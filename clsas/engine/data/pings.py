@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.engine.data.geometry import unit_vectors
+
 STILL = 0.1
 """Share of the usual advance within which a platform counts as standing still."""
 PASS_JUMP = 8.0
@@ -141,14 +143,13 @@ class Transmissions:
         from scipy.ndimage import uniform_filter1d  # slow to import
 
         numbers = np.flatnonzero(self._beyond(STILL * self.usual_step_m))
-        moves_m = np.diff(self.places_m[numbers], axis=0)
-        if len(moves_m) < 2:
+        moves = unit_vectors(np.diff(self.places_m[numbers], axis=0))
+        if len(moves) < 2:
             return np.zeros(0, np.int64)
         # The local course is the mean direction of a few steps. A track may turn over many pings,
         # but not from one ping to the next.
-        moves_m /= np.linalg.norm(moves_m, axis=1, keepdims=True)
-        course = uniform_filter1d(moves_m, min(_LOCAL, len(moves_m)), axis=0)
-        return numbers[np.flatnonzero(np.einsum("pi,pi->p", moves_m, course) < 0)]
+        course = uniform_filter1d(moves, min(_LOCAL, len(moves)), axis=0)
+        return numbers[np.flatnonzero(np.einsum("pi,pi->p", moves, course) < 0)]
 
     @property
     def disordered(self) -> bool:

@@ -20,7 +20,7 @@ from scipy.spatial.distance import cdist
 
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import power
-from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.geometry import SAME_PLACE_M, pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, some_channels, wavelength_m
 from clsas.engine.data.visibility import is_within, sines
@@ -205,7 +205,7 @@ class _SampledRanges:
         step_m = float(np.ptp(points_m, axis=0).max() / max(math.sqrt(len(points_m)) - 1, 1.0))
         visible = np.ones(range_m.shape, bool)
         if beam is not None and along is not None:
-            around = _BEYOND_BEAM * step_m / np.maximum(range_m, 1e-30)
+            around = _BEYOND_BEAM * step_m / np.maximum(range_m, SAME_PLACE_M)
             sine = sines(points_m, lines.phase_centres_m, along).T
             visible = is_within(sine, beam.limits, around)
         return cls(lines, beam, along, points_m, step_m, range_m, visible)
@@ -311,7 +311,7 @@ def _fit_positions(
     for _ in range(_ITERATIONS):
         offset = [point[:, None] - each for point, each in zip(points_m.T, position_m, strict=True)]
         distance_m = np.sqrt(sum(each * each for each in offset))
-        over = weights / np.maximum(distance_m, 1e-30)
+        over = weights / np.maximum(distance_m, SAME_PLACE_M)
         unit = [each * over for each in offset]
         residual_m = distance_m - range_m
         normal = np.empty((len(start_m), 3, 3))
@@ -351,7 +351,7 @@ def _relief_m(lines: RangeLines, grid: Grid, most_m: float) -> float:
         for ends_m in (lines.tx_m[some], lines.rx_m[some]):
             down_m = np.abs(points_m[:, None, 2] - ends_m[:, 2])
             steepest = max(
-                steepest, float((down_m / np.maximum(cdist(points_m, ends_m), 1e-30)).max())
+                steepest, float((down_m / np.maximum(cdist(points_m, ends_m), SAME_PLACE_M)).max())
             )
         share[2] = min(1.1 * steepest + 1e-3, 1.0)  # with a margin for pixels between the points
     # A few pixels are enough to rule out most grids with relief.

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-_LEAST_DISTANCE_M = 1e-9
+from clsas.engine.data.geometry import SAME_PLACE_M
+
 _ANY_DIRECTION = 4.0  # larger than any difference of two sines
 # Pairs of boxes and runs that are tested together. With half as many the search takes a tenth
 # longer.
@@ -143,7 +144,7 @@ class Visibility:
         offset_m = np.subtract(points_m.T[..., None], position, out=position)
         sine = np.einsum("ipn,ipn->pn", offset_m, direction)
         distance_m = np.sqrt(np.einsum("ipn,ipn->pn", offset_m, offset_m))
-        sine /= np.maximum(distance_m, _LEAST_DISTANCE_M)
+        sine /= np.maximum(distance_m, SAME_PLACE_M)
         towards_m = np.subtract((axes_m @ points_m.T)[..., None], from_m, out=from_m)
         return cls._of(sine, distance_m, axes_m, towards_m, turning)
 
@@ -157,7 +158,7 @@ class Visibility:
         along_axes: NDArray[np.float64],
     ) -> Visibility:
         """Return the visibility, given lines of sight and track directions along the axes."""
-        inverse_m = 1 / np.maximum(distance_m, _LEAST_DISTANCE_M, out=distance_m)
+        inverse_m = 1 / np.maximum(distance_m, SAME_PLACE_M, out=distance_m)
         slopes = towards_m
         for slope, along in zip(slopes, along_axes, strict=True):
             slope *= inverse_m

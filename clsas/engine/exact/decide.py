@@ -17,6 +17,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import amplitude, in_db, power
 from clsas.engine.data.declared import Number
+from clsas.engine.data.geometry import SAME_PLACE_M
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import cycles_per_m_at, fastest, some_channels, wavelength_m
 from clsas.engine.data.validate import ArgumentError
@@ -214,7 +215,7 @@ def decide(
     _check_distances(antennas_m, layout)
     one_cubic = False
     if beam is not None:
-        nearest_m = max(layout.nearest_m(lines.phase_centres_m) - layout.radius_m, 1e-30)
+        nearest_m = max(layout.nearest_m(lines.phase_centres_m) - layout.radius_m, SAME_PLACE_M)
         error = layout.one_cubic_error(beam, nearest_m, wavelength_m(lines))
         one_cubic = error <= geometry_error * fullness
     return Decision(layout, interpolator, resampling, phase_terms, one_cubic)
@@ -270,7 +271,7 @@ def fitting_tiles(
     candidates = []
     for side in _SIDES:
         tiles = Tiles(grid, side, width)
-        radius_m, nearest_m = tiles.radius_m, max(tiles.nearest_m(antennas_m), 1e-30)
+        radius_m, nearest_m = tiles.radius_m, max(tiles.nearest_m(antennas_m), SAME_PLACE_M)
         remainder_m = _FOURTH_ORDER * radius_m**4 / nearest_m**3
         remainder_m += _MOTION * speed_ratio * radius_m**3 / nearest_m**2
         rounding = rounding_error(len(antennas_m)) * cycles_per_m * radius_m * tiles.eccentricity

@@ -37,6 +37,7 @@ HELD = 16
 (cl/lookup.h). With fewer lanes, samples are loaded tap by tap."""
 
 _LARGEST_ANGLE = 2.0  # largest ratio of a block's radius to its distance in bounds on weight errors
+_PERPENDICULAR = 1e-9  # cosine of the angle of sides, up to which they count as perpendicular
 _GROUPS_AT_ONCE = 1024  # groups whose offsets stay in a core's cache
 _MORE_THAN_ROUNDING = 1.00001  # factor that covers the rounding of float32 offsets
 _FLOAT32 = 0.05  # margin for the rounding of positions, samples
@@ -148,7 +149,7 @@ class Tiles:
             for n, step_m in zip(counts, self.grid.vectors_m[1:], strict=True)
         ]
         lengths_m = [float(np.linalg.norm(side)) for side in sides_m]
-        if abs(sides_m[0] @ sides_m[1]) > 1e-9 * lengths_m[0] * lengths_m[1]:
+        if abs(sides_m[0] @ sides_m[1]) > _PERPENDICULAR * lengths_m[0] * lengths_m[1]:
             return float(KDTree(antennas_m).query(self.centres_m(slice(None)))[0].min())
         # The distance of the rectangle around the centres is a lower bound and quickly computed.
         offset_m = antennas_m - self.centres_m(slice(0, 1))
@@ -257,7 +258,7 @@ class Tiles:
         """Return unit vectors from row to row and column to column; None unless perpendicular."""
         steps_m = np.stack(self.grid.vectors_m[1:])
         lengths_m = np.linalg.norm(steps_m, axis=1)
-        if abs(steps_m[0] @ steps_m[1]) > 1e-9 * lengths_m.prod() or not lengths_m.all():
+        if abs(steps_m[0] @ steps_m[1]) > _PERPENDICULAR * lengths_m.prod() or not lengths_m.all():
             return None
         return steps_m / lengths_m[:, None]
 

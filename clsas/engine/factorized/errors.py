@@ -187,7 +187,7 @@ def leaf_error(
     steps_m = np.linalg.norm(surface.steps_m, axis=1)
     radius_m = np.hypot(*(sides * steps_m).T)[:, None] / 2
     block_m = np.hypot(*(np.array(BLOCKS[device.info.width]) * steps_m)) / 2
-    distance_m = np.maximum(sampled.distances_m, 1e-6)
+    distance_m = sampled.distances_m
     remainder_m = 0.35 * radius_m**4 / (8 * distance_m**3)
     result = (2 * np.pi * sampled.highest_cycles_per_m * remainder_m) ** 2
     if beam is not None:

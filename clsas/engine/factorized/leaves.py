@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data.beam import INTERVALS, normalising
 from clsas.engine.data.decibels import power
-from clsas.engine.data.geometry import bistatic_range_m
+from clsas.engine.data.geometry import SAME_PLACE_M, bistatic_range_m
 from clsas.engine.data.lines import wavelength_m
 from clsas.engine.data.visibility import sines
 from clsas.engine.device.buffers import (
@@ -99,7 +99,8 @@ class Leaves:
         one_cubic = False
         if beam is not None and along is not None and nearest_m is not None:
             # Is one cubic of the beam's weights accurate enough for a block of pixels?
-            nearest_m = max(nearest_m - geometry.surface.radius_m(factorization.sides[0]), 1e-6)
+            radius_m = geometry.surface.radius_m(factorization.sides[0])
+            nearest_m = max(nearest_m - radius_m, SAME_PLACE_M)
             wave_m, on_track = wavelength_m(geometry.lines), geometry.track.on_track
             centres_m = geometry.tree.centres_m(0, geometry.tree.roots)
             sine = sines(centres_m, geometry.track.sampled_m[0][on_track], along[on_track])

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.geometry import SAME_PLACE_M, pairwise_range_m, unit_vectors
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.factorized.track import ACROSS_AT, ALONG_AT, MeanTrack, smooth_over_sheet
@@ -237,7 +237,7 @@ class DirectionsOnSheet:
         self, coordinate: NDArray[np.float64], across: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
         """Return directions at coordinates along and across, [..., 3]; by default in the middle."""
-        return _unit(self.smooth.positions_m(coordinate, across))
+        return unit_vectors(self.smooth.positions_m(coordinate, across))
 
 
 BeamDirections = DirectionsOnCurves | DirectionsOnSheet
@@ -272,18 +272,14 @@ def directions_of(
             beyond &= np.sign(samples - samples[end]) == np.sign(end - inner)
             slope = (sampled[end] - sampled[inner]) / (samples[end] - samples[inner])
             along[beyond] = sampled[end] + (samples[beyond] - samples[end])[:, None] * slope
-    return DirectionsOnCurves(samples, _unit(along))
+    return DirectionsOnCurves(samples, unit_vectors(along))
 
 
 def interpolated_directions(
     given: NDArray[np.float64], along: NDArray[np.float64], coordinate: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return unit directions at aperture coordinates, [..., 3], from those at ascending `given`."""
-    return _unit(np.stack([np.interp(coordinate, given, axis) for axis in along.T], axis=-1))
-
-
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
+    return unit_vectors(np.stack([np.interp(coordinate, given, axis) for axis in along.T], axis=-1))
 
 
 def beam_rate(
@@ -315,7 +311,7 @@ def beam_rate(
     for offset_m in offsets_m:
         sight = (centres_m + offset_m)[:, None] - line.sampled_m[0]
         distance_m = np.sqrt(np.einsum("psi,psi->ps", sight, sight))
-        sine = np.einsum("psi,si->ps", sight, along) / np.maximum(distance_m, 1e-9)
+        sine = np.einsum("psi,si->ps", sight, along) / np.maximum(distance_m, SAME_PLACE_M)
         np.maximum(rate, np.abs(np.gradient(sine, line.samples, axis=1)), out=rate)
     return rate / beam.edge
 
@@ -415,5 +411,4 @@ def stretches(
 
 def _sight(points_m: NDArray[np.float64], from_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return unit vectors to points from positions [channels, 3] or [points, channels, 3]."""
-    offset_m = points_m[:, None] - from_m
-    return offset_m / np.maximum(np.linalg.norm(offset_m, axis=-1, keepdims=True), 1e-30)
+    return unit_vectors(points_m[:, None] - from_m)

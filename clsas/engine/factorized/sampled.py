@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.geometry import SAME_PLACE_M, pairwise_range_m
 from clsas.engine.data.lines import (
     SAMPLED_CHANNELS,
     antennas_of,
@@ -156,7 +156,7 @@ class SampledScene:
     def distance_m(self) -> NDArray[np.float64]:
         """Distance from every track sample to every point, [points, samples]."""
         away_m = self.points_m[:, None] - self.track.sampled_m[0]
-        return np.maximum(np.linalg.norm(away_m, axis=-1), 1e-9)
+        return np.maximum(np.linalg.norm(away_m, axis=-1), SAME_PLACE_M)
 
     @cached_property
     def sight(self) -> NDArray[np.float64]:
@@ -696,7 +696,7 @@ def _distances_m(scene: Scene, track: MeanTrack) -> NDArray[np.float64]:
     if track.is_dense:
         centres_m = centres_m[some_channels(len(centres_m), _NEAREST_CHANNELS)]
     distances_m = np.sort(KDTree(centres_m).query(dense_m)[0])[::_DENSE] - between_m
-    return np.maximum(distances_m, 1e-9)
+    return np.maximum(distances_m, SAME_PLACE_M)
 
 
 def mean_over_points(values: NDArray[np.float64]) -> NDArray[np.float64]:

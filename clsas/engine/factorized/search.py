@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data.decibels import in_db, power
+from clsas.engine.data.geometry import unit_vectors
 from clsas.engine.device.buffers import GUARD
 from clsas.engine.device.device import Device
 from clsas.engine.factorized.buffers import LEAST_BATCH
@@ -338,8 +339,8 @@ def half_range_extents_m(roots: SampledRoots, sides: Sequence[Side]) -> NDArray[
     visible, slopes = roots.visible(roots.small), np.abs(sampled.sight @ steps_m.T)
     if sampled.track.is_sheet:
         edges = [sampled.track.line_along(across) for across in (0.0, 1.0)]
-        sight = sampled.points_m[:, None] - np.concatenate([each.sampled_m[0] for each in edges])
-        sight /= np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-9)
+        edges_m = np.concatenate([each.sampled_m[0] for each in edges])
+        sight = unit_vectors(sampled.points_m[:, None] - edges_m)
         more = np.abs(sight @ steps_m.T)[:, np.tile(sampled.track.on_track, 2)]
         slope = 1.02 * np.maximum(slopes[visible].max(axis=0), more.max(axis=(0, 1)))
     else:

@@ -22,6 +22,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from clsas.engine.data.geometry import SAME_PLACE_M
 from clsas.engine.data.lines import RangeLines, some_channels
 from clsas.engine.data.pings import PASS_JUMP
 
@@ -41,7 +42,6 @@ ACROSS_AT = tuple(np.linspace(0, 1, 9))
 """Aperture coordinates of the lines across a sheet at which rates are evaluated."""
 APART = 16.0
 """Difference of aperture coordinates between strips; samples past their ends must not overlap."""
-_SAME_PLACE_M = 1e-9  # channels that are closer to the mean track lie on it
 
 # One curve
 _CHANNELS_PER_KNOT = 16
@@ -248,7 +248,7 @@ class MeanTrack:
             Coordinates across a sheet.
         """
         off_m = self.offsets_m(phase_centres_m)[None]
-        if own_drift is None and not np.abs(off_m).max() > _SAME_PLACE_M:
+        if own_drift is None and not np.abs(off_m).max() > SAME_PLACE_M:
             return self.coordinates_everywhere(len(points_m))
         sight = points_m[:, None] - phase_centres_m
         square = np.maximum(np.einsum("pci,pci->pc", sight, sight), 1e-30)

@@ -19,7 +19,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.coverage import behind
 from clsas.engine.data.findings import Finding, warn_of
 from clsas.engine.data.fourier import turned
-from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.geometry import pairwise_range_m, unit_vectors
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, band_wavelength_m, banks_of, some_channels
 from clsas.engine.data.lines import wavelength_m as carrier_wavelength_m
@@ -471,7 +471,7 @@ def _focused(
         return None
     # An error along the track adds a linear phase over the directions; search all that are likely.
     looks_m = np.stack([best_m - lines.tx_m[near], best_m - lines.rx_m[near]])
-    directions = (looks_m / np.linalg.norm(looks_m, axis=2, keepdims=True)).sum(axis=0) @ course
+    directions = unit_vectors(looks_m).sum(axis=0) @ course
     extent = float(np.ptp(directions))
     if not extent:
         return None

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.geometry import SAME_PLACE_M, unit_vectors
 from clsas.engine.data.lines import RangeLines, wavelength_m
 from clsas.engine.water.ray_delays import RaySample
 from clsas.engine.water.rays import rays
@@ -78,12 +79,10 @@ def apparent_beam(
     along = beam.directions(lines)
     point, channel = np.nonzero(sample.visible)
     of_rays = _directions_of_rays(sample, point, channel)
-    apparent = points_m[point] - straight.phase_centres_m[channel]
-    apparent /= np.maximum(np.linalg.norm(apparent, axis=1, keepdims=True), 1e-30)
+    apparent = unit_vectors(points_m[point] - straight.phase_centres_m[channel])
     faster = float(profile.at(lines.phase_centres_m[:, 2]).mean()) / straight.sound_speed_m_s
     ratio = _ratio(of_rays[:, :2], apparent[:, :2], faster)
-    turned = along * [1, 1, _ratio(of_rays[:, 2], apparent[:, 2], ratio) / ratio]
-    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    turned = unit_vectors(along * [1, 1, _ratio(of_rays[:, 2], apparent[:, 2], ratio) / ratio])
     values = {each.name: getattr(beam, each.name) for each in fields(BeamWindow)}
     if beam.element_length_m is not None:  # wavelengths at the antennas are longer
         values["element_length_m"] = beam.element_length_m / faster
@@ -145,6 +144,6 @@ def _directions_of_rays(
     offset_m = sample.points_m[point] - centres_m
     distance_m = np.hypot(offset_m[:, 0], offset_m[:, 1])
     found = rays(profile, distance_m, centres_m[:, 2], sample.points_m[point, 2])
-    level = offset_m[:, :2] * (found.slowness_s_m / np.maximum(distance_m, 1e-30))[:, None]
+    level = offset_m[:, :2] * (found.slowness_s_m / np.maximum(distance_m, SAME_PLACE_M))[:, None]
     speed_m_s = profile.at(centres_m[:, 2])
     return np.column_stack([level, -found.one_slope_s_m]) * speed_m_s[:, None]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.geometry import SAME_PLACE_M, pairwise_range_m
 from clsas.engine.data.grid import Grid, spread_indices
 from clsas.engine.data.lines import RangeLines, some_channels
 from clsas.engine.data.sound_speed import SoundSpeed
@@ -131,7 +131,7 @@ def in_beam(
         Distance from a point within which pixels count as well.
     """
     sine = sines(points_m, lines.phase_centres_m, along).T
-    around = _BEYOND_BEAM + slack_m / np.maximum(straight_m(lines, points_m), 1e-30)
+    around = _BEYOND_BEAM + slack_m / np.maximum(straight_m(lines, points_m), SAME_PLACE_M)
     return is_within(sine, beam.limits, around)
 
 
