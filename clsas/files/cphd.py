@@ -26,7 +26,7 @@ from clsas.engine.data import reading, validate
 from clsas.engine.data.atomic import replacing
 from clsas.engine.data.extras import needed
 from clsas.engine.data.fourier import turned
-from clsas.engine.data.geometry import unit_vectors
+from clsas.engine.data.geometry import course, unit_vectors
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.reading import parse_json
@@ -563,7 +563,7 @@ def _reference(
     """
     centres_m = (tx_m + rx_m) / 2
     middle_m = centres_m.mean(axis=0)
-    along = np.linalg.svd(centres_m - middle_m, full_matrices=False)[2][0]
+    along = course(centres_m)
     along[2] = 0
     length = float(np.linalg.norm(along))
     along = along / length if length > 0.1 else np.array([1.0, 0.0, 0.0])

@@ -11,7 +11,7 @@ from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
 from clsas.engine.data import validate
-from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.geometry import course, pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, some_channels
 from clsas.engine.device.device import Device
@@ -140,7 +140,7 @@ def _beside_track(lines: RangeLines, cell_m: float) -> list[tuple[NDArray[np.flo
     searched = some_channels(lines.channels, _SEARCHED_CHANNELS)
     level = np.abs(lines.samples[searched])
     centres_m = lines.phase_centres_m
-    along = _course(centres_m)
+    along = course(centres_m)
     across = np.cross([0.0, 0.0, 1.0], along)
     if np.linalg.norm(across) < 0.1:  # the course is vertical
         across = np.cross([1.0, 0.0, 0.0], along)
@@ -181,7 +181,7 @@ def _on_grid(lines: RangeLines, grid: Grid, cell_m: float) -> list[tuple[NDArray
     level = np.abs(part.samples)
     power = (level / (level.max() or np.float32(1))) ** 2
     centres_m = lines.phase_centres_m
-    along = _course(centres_m)
+    along = course(centres_m)
 
     points_m = grid.spread(_GRID_POINTS)
     pitch_m = 0.0  # the largest distance from a point to its nearest neighbour
@@ -265,7 +265,7 @@ def _patch(
     part = lines.select(near[some_channels(len(near), _MOST_CHANNELS)])
     # Sums of very large samples would overflow float32.
     part = replace(part, samples=part.samples / (np.abs(part.samples).max() or np.float32(1)))
-    along = _course(part.phase_centres_m)
+    along = course(part.phase_centres_m)
     across = _across(look_m, along)
     if across is None:
         raise _UndeterminedError("the track leads straight to the brightest echoes")
@@ -297,10 +297,3 @@ def _across(look_m: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[
     across = look_m - along * (look_m @ along)
     size, least = float(np.linalg.norm(across)), 0.1 * float(np.linalg.norm(look_m))
     return across / size if size > least else None
-
-
-def _course(centres_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit vector along which phase centres spread most."""
-    away_m = centres_m - centres_m.mean(axis=0)
-    direction: NDArray[np.float64] = np.linalg.eigh(away_m.T @ away_m)[1][:, -1]
-    return direction

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.findings import Finding
-from clsas.engine.data.geometry import bistatic_range_m
+from clsas.engine.data.geometry import bistatic_range_m, course
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, banks_of
 from clsas.engine.data.lines import wavelength_m as carrier_wavelength_m
@@ -268,11 +268,6 @@ def grating_lobe_m(wavelength_m: float, spacing_m: float, range_m: float) -> flo
     wavelength = validate.positive("wavelength_m", wavelength_m, "m")
     spacing = validate.positive("spacing_m", spacing_m, "m")
     return validate.positive("range_m", range_m, "m") * wavelength / (2 * spacing)
-
-
-def course(centres_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit vector along which phase centres extend farthest."""
-    return np.linalg.svd(centres_m - centres_m.mean(axis=0), full_matrices=False)[2][0]
 
 
 def corners_of(grid: Grid) -> NDArray[np.float64]:

@@ -21,7 +21,7 @@ from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.declared import Count, check_declared
-from clsas.engine.data.geometry import pairwise_range_m, unit_vectors
+from clsas.engine.data.geometry import course, pairwise_range_m, unit_vectors
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import (
@@ -519,9 +519,8 @@ def track_errors_m(lines: RangeLines) -> NDArray[np.float64]:
     centres_m = lines.phase_centres_m
     counts = channels_per_ping(lines.ping_starts, lines.channels)
     pings_m = lines.ping_centres_m
-    middle_m = pings_m.mean(axis=0)
-    direction = np.linalg.svd(pings_m - middle_m, full_matrices=False)[2][0]
-    away_m = centres_m - middle_m
+    direction = course(pings_m)
+    away_m = centres_m - pings_m.mean(axis=0)
     away_m = away_m - np.outer(away_m @ direction, direction)
     if (counts == counts[0]).all():
         by_ping = away_m.reshape(-1, counts[0], 3)

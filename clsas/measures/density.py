@@ -12,14 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import decibels, reprs, validate
-from clsas.engine.data.geometry import unit_vectors
+from clsas.engine.data.geometry import course, unit_vectors
 from clsas.engine.data.lines import RangeLines, banks_of
-from clsas.engine.data.pings import STILL, Transmissions, means
+from clsas.engine.data.pings import COURSE_STEPS, STILL, Transmissions, means
 from clsas.engine.data.validate import ArgumentError
-from clsas.inspection.sampling import course
 
-_LOCAL = 11  # steps that are averaged to find the local course, as for turns of a track
-# Advance over `_LOCAL` steps, relative to the length of these steps, below which a track has no
+# Advance over `COURSE_STEPS`, relative to the length of these steps, below which a track has no
 # course. If positions err by half a step rms, along and across, it is 0.6 or more among 400 pings;
 # by a whole step, down to 0.3. At turns by 180 degrees it is 0.
 _LEAST_STRAIGHT = 0.5
@@ -220,7 +218,7 @@ def _courses(moves_m: NDArray[np.float64], numbers: NDArray[np.int64]) -> NDArra
     """
     from scipy.ndimage import uniform_filter1d  # slow to import
 
-    local = min(_LOCAL, len(moves_m))
+    local = min(COURSE_STEPS, len(moves_m))
     mean_m = uniform_filter1d(moves_m, local, axis=0, mode="nearest")
     path_m = uniform_filter1d(np.linalg.norm(moves_m, axis=1), local, mode="nearest")
     advance_m = np.linalg.norm(mean_m, axis=1)

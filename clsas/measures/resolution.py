@@ -20,7 +20,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db
 from clsas.engine.data.declared import check_declared
-from clsas.engine.data.geometry import bistatic_range_m, pairwise_range_m
+from clsas.engine.data.geometry import bistatic_range_m, course, pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, some_channels
 from clsas.engine.data.system import Sonar, element_pattern
@@ -28,7 +28,7 @@ from clsas.engine.data.track import Pointing, Track, channels
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.visibility import is_within, sines
 from clsas.engine.signal.compression import Window, band_window, compress
-from clsas.inspection.sampling import corners_of, course, grating_lobe_m
+from clsas.inspection.sampling import corners_of, grating_lobe_m
 
 _CHANNELS = 1024  # channels whose ranges to the grid are computed, beside the first and last ping
 _STRAIGHT = 0.9  # length of a track over the path along it, below which the track is too curved

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.findings import Finding
-from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.geometry import STRAIGHT, pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, antennas_of, reached_m, some_channels
 from clsas.engine.data.visibility import BeamTrack, Boxes, is_within, sines
@@ -38,7 +38,6 @@ _CHANNELS = 64  # sampled channels that reach the grid
 _SEARCHED = 4096  # channels among which those that reach the grid are searched
 _HEADINGS = 100  # least pings of a track over the pings that a heading is averaged over
 _LEAST_ACROSS = 0.1  # part of the look direction across the track, below which it has no side
-_STRAIGHT = 0.1  # width of a track over its length, or over its distance from the grid
 _NARROW_M = 1e-6  # width of a track that only rounding makes wider than zero
 _ALIGNED = 0.05  # sine of the angle of a track to x or y up to which a mirrored plane is aligned
 
@@ -273,7 +272,7 @@ def _mirror(lines: RangeLines, some: NDArray[np.int64], range_m: float) -> _Mirr
     _, sizes_m, axes = np.linalg.svd(offsets_m, full_matrices=True)
     long_m = float(sizes_m[0])
     across = look
-    if long_m > 0 and (len(sizes_m) < 2 or sizes_m[1] <= _STRAIGHT * long_m):
+    if long_m > 0 and (len(sizes_m) < 2 or sizes_m[1] <= STRAIGHT * long_m):
         across = np.array([-axes[0, 1], axes[0, 0]])
         across = across * (look @ across)
     length = float(np.linalg.norm(across))
@@ -281,7 +280,7 @@ def _mirror(lines: RangeLines, some: NDArray[np.int64], range_m: float) -> _Mirr
         return None
     across = across / length
     width_m = float(np.ptp(offsets_m @ across))
-    if width_m > _STRAIGHT * max(float(np.ptp(offsets_m @ axes[0])), range_m):
+    if width_m > STRAIGHT * max(float(np.ptp(offsets_m @ axes[0])), range_m):
         return None
     return _Mirror(point_m, np.append(across, 0.0), width_m)
 

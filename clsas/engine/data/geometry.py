@@ -11,6 +11,14 @@ from clsas.engine.data.validate import ArgumentError
 SAME_PLACE_M = 1e-9
 """Distance up to which two points count as one, between which there is no direction."""
 
+STRAIGHT = 0.1
+"""Width of a track over its length up to which the track counts as straight."""
+
+
+def course(positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit vector, of either sign, along which positions extend farthest."""
+    return np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=False)[2][0]
+
 
 def unit_vectors(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return vectors [..., 3] scaled to length 1; below `SAME_PLACE_M` they stay shorter."""

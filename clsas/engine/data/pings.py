@@ -20,13 +20,14 @@ STILL = 0.1
 """Share of the usual advance within which a platform counts as standing still."""
 PASS_JUMP = 8.0
 """Step over the median step from which on another pass, or leg, of the track begins."""
+COURSE_STEPS = 11
+"""Steps that are averaged to find the local course."""
 # Pings of the shortest halt. Noise in positions brings two or three pings together without a halt.
 _LEAST_HALT = 5
 # Share of pings after which the track turns back. If it is larger, the pings are out of order, and
 # the steps between them show neither halts nor gaps.
 _DISORDER = 0.03
 _UNEVEN = 0.25  # interquartile range of steps over their median, above which they are uneven
-_LOCAL = 11  # steps that are averaged to find the local course
 # Quantile of the steps that represents a step of a moving platform. Up to 5 % of the steps may be
 # gaps, and up to 95 % may be taken standing still.
 _USUAL_QUANTILE = 0.95
@@ -148,7 +149,7 @@ class Transmissions:
             return np.zeros(0, np.int64)
         # The local course is the mean direction of a few steps. A track may turn over many pings,
         # but not from one ping to the next.
-        course = uniform_filter1d(moves, min(_LOCAL, len(moves)), axis=0)
+        course = uniform_filter1d(moves, min(COURSE_STEPS, len(moves)), axis=0)
         return numbers[np.flatnonzero(np.einsum("pi,pi->p", moves, course) < 0)]
 
     @property

@@ -21,7 +21,7 @@ from clsas.engine.data.fourier import (
     taps_for,
     turned_single,
 )
-from clsas.engine.data.geometry import bistatic_range_m, pairwise_range_m
+from clsas.engine.data.geometry import bistatic_range_m, course, pairwise_range_m
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Formed, Image
@@ -271,17 +271,17 @@ def straighten(
     offset_m = centres_m - middle_m
 
     # The line runs along the rows of the grid, which must run along the track and the beam.
-    course = np.linalg.svd(offset_m, full_matrices=False)[2][0]
-    if not np.ptp(offset_m @ course) > 0:
+    of_track = course(centres_m)
+    if not np.ptp(offset_m @ of_track) > 0:
         raise ArgumentError("lines", "have phase centres at two positions or more", "one")
-    direction = column_step_m if columns > 1 else course
+    direction = column_step_m if columns > 1 else of_track
     direction = direction / np.linalg.norm(direction)
-    courses = {"track": course}
+    courses = {"track": of_track}
     if beam is not None:
         courses["beam's along"] = beam.directions(lines).mean(axis=0)
         direction = direction * np.copysign(1, direction @ courses["beam's along"])
     for name, other in courses.items():
-        turn = math.acos(min(abs(other @ direction) / np.linalg.norm(other), 1))
+        turn = math.acos(min(float(abs(other @ direction) / np.linalg.norm(other)), 1.0))
         name = f"the angle between the grid's rows and the {name}"
         validate.number(name, math.degrees(turn), "degrees", most=_MOST_TURN_DEG)
 

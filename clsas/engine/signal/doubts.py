@@ -19,7 +19,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.coverage import behind
 from clsas.engine.data.findings import Finding, warn_of
 from clsas.engine.data.fourier import turned
-from clsas.engine.data.geometry import pairwise_range_m, unit_vectors
+from clsas.engine.data.geometry import STRAIGHT, pairwise_range_m, unit_vectors
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, band_wavelength_m, banks_of, some_channels
 from clsas.engine.data.lines import wavelength_m as carrier_wavelength_m
@@ -51,7 +51,6 @@ _DECIMALS = (1e-4, 1e-3, 1e-2, 0.1, 1.0)
 # degrees make 57 times the resolution that was meant.
 _RADIANS, _COARSER, _NARROWED = 3.2, 30.0, 4.0
 _END_FIRE = math.cos(math.radians(20))  # no sonar squints by more than 60 degrees from broadside
-_STRAIGHT = 0.1  # width of a straight aperture over its length
 _CHANNELS = 32  # channels whose samples are looked at
 _CHIRPED = 0.15
 """Part of the phase steps along a line that grow evenly. Chirps of one point have 0.54, of three
@@ -340,7 +339,7 @@ def _end_fire(lines: RangeLines, grid: Grid, last_m: NDArray[np.float64]) -> Ite
     centres_m = lines.phase_centres_m[some]
     away_m = centres_m - centres_m.mean(axis=0)
     _, sizes_m, axes = np.linalg.svd(away_m, full_matrices=False)
-    if len(sizes_m) < 2 or not sizes_m[0] or sizes_m[1] > _STRAIGHT * sizes_m[0]:
+    if len(sizes_m) < 2 or not sizes_m[0] or sizes_m[1] > STRAIGHT * sizes_m[0]:
         return
     points_m = grid.spread(8)
     ahead_m, passed_m = (
@@ -448,7 +447,7 @@ def _focused(
     _, sizes_m, axes = np.linalg.svd(
         centres_m[near] - centres_m[near].mean(axis=0), full_matrices=False
     )
-    if sizes_m[1] > _STRAIGHT * sizes_m[0]:  # an error across the track would blur the point, too
+    if sizes_m[1] > STRAIGHT * sizes_m[0]:  # an error across the track would blur the point, too
         return None
     course = axes[0]
     best_m = arc_m[:1]
