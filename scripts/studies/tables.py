@@ -23,6 +23,7 @@ from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.forming import form
 from clsas.engine.scene import Scene
+from clsas.engine.signal.interpolation import TAPS
 from clsas.measures.quality import dark_level_db
 from clsas.selftest import bench, cases, wreck
 from clsas.simulation import seabeds
@@ -140,7 +141,7 @@ def taps(devices: list[str]) -> None:
     for _ in range(5):
         for name in devices:
             device = open_device(name)
-            for count in (2, 4, 6, 8):
+            for count in TAPS:
                 method = ExactImage(ACCURACY_DB, taps=count, upsampling=3.0)
                 with device.profile() as times:
                     form(Scene.of(lines, grid, None, None), method, device)
