@@ -13,7 +13,6 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from clsas.engine.data.declared import (
     Choice,
     Count,
-    Declared,
     Flag,
     Names,
     Number,
@@ -81,8 +80,11 @@ def keys_of(
     def decorate(table: type[_Table]) -> type[_Table]:
         fields = {}
         for name in names or known:
-            kind = types.get(name) or _type_of(known[name])
-            fields[name] = Annotated[kind, known[name]], _default_of(source, name)
+            what = known[name]
+            kind = types.get(name) or (
+                type(what.allowed[0]) if isinstance(what, Choice) else _TYPES[type(what)]
+            )
+            fields[name] = Annotated[kind, what], _value_if_left_out(source, name)
         made: type[_Table] = create_model(
             table.__name__, __base__=table, __doc__=table.__doc__, __module__=table.__module__,
             **fields,
@@ -92,12 +94,8 @@ def keys_of(
     return decorate
 
 
-def _type_of(what: Declared) -> Any:
-    return type(what.allowed[0]) if isinstance(what, Choice) else _TYPES[type(what)]
-
-
-def _default_of(source: Callable[..., Any], name: str) -> Any:
-    """Return the default of a key; ... if it must be given."""
+def _value_if_left_out(source: Callable[..., Any], name: str) -> Any:
+    """Return the value of a key that is left out; ... if it must be given."""
     default = default_of(source, name)
     if default is not inspect.Parameter.empty:
         return default

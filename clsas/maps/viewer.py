@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 from clsas.engine.data import validate
 from clsas.engine.data.atomic import check_writable, replacing_folder
 from clsas.engine.data.decibels import DYNAMIC_RANGE, largest_amplitude
-from clsas.engine.data.geometry import unit_vectors
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid, check_one_grid, without_heights
 from clsas.engine.data.image import Image
@@ -272,9 +271,13 @@ def steps_of(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     row_step_m = row_step_m if row_step_m.any() else np.array([0.0, 1.0, 0.0])
     column_step_m = column_step_m if column_step_m.any() else np.array([1.0, 0.0, 0.0])
     return (
-        row_step_m if given_m[0].any() else length_m * unit_vectors(row_step_m),
-        column_step_m if given_m[1].any() else length_m * unit_vectors(column_step_m),
+        row_step_m if given_m[0].any() else length_m * _unit(row_step_m),
+        column_step_m if given_m[1].any() else length_m * _unit(column_step_m),
     )
+
+
+def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    return vector / np.linalg.norm(vector)
 
 
 def factors_of_scales(
@@ -328,8 +331,8 @@ def frame_of(grid: Grid) -> dict[str, list[Any]]:
     ``screen_`` the same along these axes.
     """
     row_step_m, column_step_m = steps_of(grid)
-    along = unit_vectors(column_step_m)
-    across = unit_vectors(row_step_m - (row_step_m @ along) * along)
+    along = _unit(column_step_m)
+    across = _unit(row_step_m - (row_step_m @ along) * along)
     normal = np.cross(along, across)
     directions = [along, across, -along, -across]
     if abs(normal[2]) >= _LEVEL:
