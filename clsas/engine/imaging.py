@@ -667,4 +667,7 @@ def check_accumulate(image: Image, grid: Grid, beam: BeamWindow | None) -> None:
 
 def _added(image: Image, accumulate: Image | None) -> Image:
     """Return an image to which another one on the same grid is added."""
-    return image if accumulate is None else Image(image.pixels + accumulate.pixels, image.grid)
+    if accumulate is None:
+        return image
+    grid = accumulate.grid if image.grid.georeference is None else image.grid
+    return Image(image.pixels + accumulate.pixels, grid)

@@ -32,8 +32,8 @@ def load(path: str | os.PathLike) -> Saved:
     Parameters
     ----------
     path : path-like
-        The file, of one of the `FORMATS`: HDF5 from clsas or AirSAS, CPHD, or a MATLAB file with a
-        phase history or a full matrix capture.
+        The file: HDF5 from clsas or AirSAS, CPHD, or a MATLAB file with a phase history or a full
+        matrix capture.
 
     Returns
     -------

@@ -159,18 +159,18 @@ def interferogram(a: Image, b: Image, window_m: float) -> Interferogram:
     window_m = validate.positive("window_m", window_m, "m")
     if a.grid.points_m is not None or b.grid.points_m is not None:
         raise ArgumentError("a and b", "lie on a plane or a height map", "arbitrary points")
-    check_one_grid("a and b", a.grid, b.grid)
-    window = window_within(a.grid, window_m)
+    grid = check_one_grid("a and b", a.grid, b.grid)
+    window = window_within(grid, window_m)
     most = effective_looks((a.pixels, b.pixels), window)
     check_looks(window_m, most)
-    _check_share(window, a.grid)
+    _check_share(window, grid)
     looks = most * window.fullness(a.shape)
     found = Moments.of(a.pixels, b.pixels, window).coherence
     coherence = debiased(found, looks)
     deviation = phase_sd_rad(coherence, looks)
     parts = np.angle(found), coherence, looks, deviation
     phase, magnitude, independent, noise = (each.astype(np.float32) for each in parts)
-    return Interferogram(phase, magnitude, independent, noise, a.grid, window_m)
+    return Interferogram(phase, magnitude, independent, noise, grid, window_m)
 
 
 def _check_share(window: Window, grid: Grid) -> None:

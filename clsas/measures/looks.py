@@ -79,7 +79,7 @@ def multilook(images: Image | Sequence[Image], *, window_m: float | None = None)
 
     grid = looks[0].grid
     for look in looks[1:]:
-        check_one_grid("images", look.grid, grid)
+        grid = check_one_grid("images", grid, look.grid)
     size = []  # rows and columns of the window, both odd
     if window_m is not None:
         if grid.points_m is not None:

@@ -411,8 +411,8 @@ class Record:
     missing_channels : int
         Number of `channels` without samples.
     gap_m : float
-        Longest distance between consecutive pings that contribute to the patch, if it exceeds
-        three median steps; else 0.
+        Longest distance along the track between phase centres that contribute to the patch, if it
+        exceeds three median distances; else 0.
     predicted_error_db : float or None
         Predicted relative rms error against the exact image, dB; None for an empty patch.
     predicted_seconds, plan_seconds, read_seconds, seconds : float
@@ -459,7 +459,7 @@ class Record:
         elif self.missing_channels:
             found.append(f"{self.missing_channels} of {self.channels} channels have no samples")
         if self.gap_m:
-            found.append(f"a gap of {self.gap_m:.3g} m between pings")
+            found.append(f"a gap of {self.gap_m:.3g} m along the track")
         if self.heights is not None and "reason" in self.heights:
             found.append(f"no heights: {self.heights['reason']}")
         elif self.heights is not None and not self.heights["converged"]:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from clsas.engine.data import validate
-from clsas.engine.data.beam import MOST_TRACK_PINGS, BeamWindow
+from clsas.engine.data.beam import MOST_TRACK_PINGS, SHORTEST_LEG, BeamWindow
 from clsas.engine.data.declared import Number
 from clsas.engine.data.digests import Without, digest
 from clsas.engine.data.grid import Grid
@@ -417,10 +417,30 @@ class SurveyVisibility:
         """Return how many leading channels of `channels` later ones cannot turn."""
         if self.beam is None or self.beam.along is not None:
             return channels
-        pings = self.survey.geometry.ping_starts
-        pings = pings[pings < channels]
-        later = (self.beam.track_pings or MOST_TRACK_PINGS) // 2 + 1
-        return int(pings[-later]) if len(pings) > 2 * later else 0
+        found = self._settled_by_channels.get(channels)
+        if found is None:
+            found = self._settled_by_channels[channels] = self._settled_pings(channels, self.beam)
+        return found
+
+    def _settled_pings(self, channels: int, beam: BeamWindow) -> int:
+        """Return the first channel of those that pings after the first `channels` may turn."""
+        geometry = self.survey.geometry
+        starts, centres_m = geometry.ping_starts, geometry.ping_centres_m
+        pings = int(np.searchsorted(starts, channels))
+        # A jump begins a leg, over which nothing is smoothed, once enough pings have followed it.
+        later = (beam.track_pings or MOST_TRACK_PINGS) // 2 + SHORTEST_LEG
+        if pings <= 2 * later:
+            return 0
+        steps_m = np.linalg.norm(np.diff(centres_m[: pings - later], axis=0), axis=1)
+        travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+        # Channels ahead of their ping's centre take the directions of later pings.
+        ahead_m = geometry.phase_centres_m - centres_m[geometry.ping_numbers]
+        reach_m = np.linalg.norm(ahead_m, axis=1).max()
+        return int(starts[np.searchsorted(travelled_m, travelled_m[-1] - reach_m)])
+
+    @functools.cached_property
+    def _settled_by_channels(self) -> dict[int, int]:
+        return {}
 
     def ranges_m(self, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return between which ranges every channel may contribute to a grid, metres."""

@@ -437,7 +437,7 @@ def test_lines_without_complex_samples_are_refused(file, samples, says):
 def test_lost_pings_are_flagged():
     lines = LINES.select(np.delete(np.arange(160), slice(70, 80)))
     flags = {patch.record.flags for patch in clsas.mosaic(lines, GRID, **REQUEST)}
-    assert ("a gap of 0.55 m between pings",) in flags
+    assert ("a gap of 0.55 m along the track",) in flags
 
 
 class TestOnceMore:

@@ -136,6 +136,32 @@ def test_gaps_between_pings():
     assert largest_gap_m(dropped, np.zeros(116, bool)) == pytest.approx(0.25)
 
 
+def growing_track(case):
+    """Positions of channels, and how many of them are there before the survey grows."""
+    if case == "a jump just before the end":
+        x_m = np.concatenate([np.arange(60), 300 + np.arange(44)]) * 0.1
+        sway_m = 0.05 * np.sin(np.arange(104) / 3)
+        return np.stack([x_m, sway_m, 0 * x_m], axis=1)[:, None], 64
+    ping_m = np.stack([0.1 * np.arange(104), 0.1 * np.sin(np.arange(104) / 5), np.zeros(104)], 1)
+    return ping_m[:, None] + np.outer(np.linspace(-1, 1, 9), [1.0, 0, 0]), 9 * 64
+
+
+@pytest.mark.parametrize("case", ["a jump just before the end", "an array of many steps"])
+def test_later_pings_do_not_turn_the_beam_of_settled_channels(case):
+    rx_m, count = growing_track(case)
+    tx_m = np.repeat(rx_m.mean(axis=1), rx_m.shape[1], axis=0)
+    samples = np.ones((len(tx_m), 4), np.complex64)
+    lines = RangeLines(samples, 20.0, 0.1, tx_m, rx_m.reshape(-1, 3), 100e3, 1500.0)
+    beam = BeamWindow(10.0, "hann", track_pings=21)
+    before, after = (
+        SurveyVisibility.of(open_survey(each), beam)
+        for each in (lines.select(slice(0, count)), lines)
+    )
+    assert before.settled > 0
+    settled = slice(0, before.settled)
+    np.testing.assert_allclose(after.along[settled], before.along[settled], atol=1e-9)
+
+
 def test_a_digest_changes_with_what_it_is_of():
     digest = open_survey(LINES).digests()
     assert digest == open_survey(replace(LINES)).digests()

@@ -34,6 +34,9 @@ in `jumps`, how wide their edges are in `edge`, and what one cubic over a block 
 INTERVALS = 1024
 """Number of cubics in a table of weights: enough for the kinks of a Tukey window."""
 
+SHORTEST_LEG = 5
+"""Pings of the shortest leg of a track: those that a cubic needs, and one more."""
+
 LEAST_WEIGHT_SUM = 0.01
 """Normalised pixels whose weights sum to less than this fade to 0."""
 
@@ -50,7 +53,6 @@ _STEEP_TAPER = 0.1  # largest taper with which the errors of "tukey" are those o
 
 # Of the direction of the track
 _SMOOTHED_SHARE = 4  # by default a cubic is fitted to a quarter of the pings
-_SHORTEST_LEG = 5  # pings: those that a cubic needs, and one more
 _JUMPS = 0.05  # share of steps to other places from which on pings are out of order; of legs of 20
 _WINDING = 4.0  # length of a track over its extent up to which the order is not questioned
 _MOST_SORTED = 20_000  # pings, which take 2 s
@@ -574,7 +576,7 @@ def _along_track(lines: RangeLines) -> NDArray[np.int64] | None:
     if steps_m.sum() <= _WINDING * np.linalg.norm(np.ptp(centres_m, axis=0)):
         return None
     pings_m, ping = np.unique(lines.tx_m, axis=0, return_inverse=True)
-    if not 2 * _SHORTEST_LEG < len(pings_m) <= _MOST_SORTED:
+    if not 2 * SHORTEST_LEG < len(pings_m) <= _MOST_SORTED:
         return None
     ping = ping.ravel()
     from scipy.spatial import cKDTree  # slow to import
@@ -600,7 +602,7 @@ def _legs(centres_m: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     median_m = np.median(steps_m)
     starts = [0]
     for start in np.flatnonzero(steps_m > PASS_JUMP * median_m) + 1 if median_m else ():
-        if min(start - starts[-1], len(centres_m) - start) >= _SHORTEST_LEG:
+        if min(start - starts[-1], len(centres_m) - start) >= SHORTEST_LEG:
             starts.append(int(start))
     return np.split(centres_m, starts[1:])
 

@@ -515,11 +515,13 @@ def without_heights(grid: Grid) -> Grid:
     return replace(grid, height_m=None)
 
 
-def check_one_grid(names: str, grid: Grid, other: Grid) -> None:
-    """Raise ValueError unless two grids have the same pixel positions, up to rounding.
+def check_one_grid(names: str, grid: Grid, other: Grid) -> Grid:
+    """Return the first grid, or the other one if only that has a georeference.
 
-    A georeference that only one of them has counts for both.
+    Raise ValueError unless both have the same pixel positions, up to rounding.
     """
+    if grid is other:
+        return grid
     allowed = "lie on one grid"
     if grid.shape != other.shape:
         raise ArgumentError(names, allowed, f"shapes {grid.shape} and {other.shape}")
@@ -535,3 +537,4 @@ def check_one_grid(names: str, grid: Grid, other: Grid) -> None:
     if apart_m > 1e-9 + 1e-14 * np.abs(positions_m).max():
         got = f"pixel positions that differ by up to {apart_m:g} m"
         raise ArgumentError(names, allowed, got)
+    return other if grid.georeference is None else grid

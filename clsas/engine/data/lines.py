@@ -35,9 +35,9 @@ STATISTICS = ("mean", "median")
 """Estimates of the background that all pings have in common."""
 
 _UNIT = 1e-12  # error of a unit vector's length, far above rounding
-# Samples by which an interpolated line extends beyond its ends. With 8 taps, 4 samples are kept
-# there, and pixels up to 4 samples farther out read them.
-_REACH = 8
+REACH = 8
+"""Samples by which an interpolated line extends beyond its ends. With 8 taps, 4 samples are kept
+there, and pixels up to 4 samples farther out read them."""
 _MOST_BANKS = 1000  # far more than any sonar has: a plain choice
 _LEAST_CYCLES = 0.02  # per sample, at the middle of a band that shows the carrier
 _Number = TypeVar("_Number", float, NDArray[np.float64])
@@ -721,7 +721,7 @@ def reached_m(
     """Return between which ranges lines must have samples to contribute to a ball, [channels]."""
     antennas = lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
     range_m = pairwise_range_m(centre_m[None], *antennas)[0]
-    beyond_m = radius_m * steepest(lines) + _REACH * lines.range_step_m
+    beyond_m = radius_m * steepest(lines) + REACH * lines.range_step_m
     return range_m - beyond_m, range_m + beyond_m
 
 

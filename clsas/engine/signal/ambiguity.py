@@ -450,7 +450,8 @@ def independent_pixels(
     if beam is not None and along is not None:
         weights = _beam_weights(lines, some, points_m, beam, along)
         if beam.normalise:
-            weights *= normalising(weights.sum(axis=1, keepdims=True), len(some))
+            mean = weights.mean(axis=1, keepdims=True)
+            weights *= normalising(mean * lines.channels, lines.channels)
     seen = np.mean(weights**2, axis=0)
     held = np.cumsum(seen * factor.astype(np.float64) ** 2 * (energy[some] / (energy.max() or 1.0)))
     if not held[-1]:

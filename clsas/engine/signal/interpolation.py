@@ -27,7 +27,8 @@ _Complex = TypeVar("_Complex", np.complex64, np.complex128)
 
 TAPS = (2, 4, 6, 8)
 """Taps of filters that look up single samples: those of exact images, and of leaves. Kernels take
-any even number (`cl/lookup.h`); each needs its time in `COST`."""
+any even number (`cl/lookup.h`). Each needs its time in `COST`, and the largest is at most `REACH`
+of `clsas.engine.data.lines`."""
 
 STAGE_TAPS = (2, 4, 6, 8)
 """Taps of filters that slide along lines, for which stages have kernels (`cl/sliding_filter.h`)."""

@@ -56,3 +56,22 @@ def test_lines_place_the_grid():
     assert placed(replace(lines, georeference=None), on_utm) is on_utm
     with pytest.raises(ValueError, match=r"grid must have the georeference of the lines \(lat"):
         placed(lines, on_utm)
+
+
+@pytest.mark.parametrize("first_is_placed", [True, False])
+def test_results_of_two_images_lie_where_either_does(first_is_placed):
+    """A georeference that only one image has counts for both, in either order."""
+    random = np.random.default_rng(5)
+    plain = clsas.Grid.plane((0, 1, 32), (20, 21, 32))
+    grids = [replace(plain, georeference=BERGEN), plain]
+    a, b = (
+        clsas.Image(random.standard_normal((32, 32, 2)) @ [1, 1j], grid)
+        for grid in (grids if first_is_placed else grids[::-1])
+    )
+    assert clsas.multilook([a, b]).grid.georeference == BERGEN
+    assert clsas.interferogram(a, b, window_m=0.3).grid.georeference == BERGEN
+    track_m = np.outer(np.linspace(-1, 1, 33), [1, 0, 0])
+    point = clsas.PointTargets([[0.5, 20.5, 0.0]])
+    lines = clsas.simulate_lines(track_m, track_m, point, carrier_hz=30e3, bandwidth_hz=10e3)
+    image = clsas.backproject(lines, b.grid, accumulate=a, accuracy_db=-30)
+    assert image.grid.georeference == BERGEN

@@ -15,7 +15,7 @@ from clsas.engine.data.threads import cores, in_threads, uninterrupted, wait
 # Ctrl-C at the n-th line that the main thread executes in Python's own locks and pools.
 EVERYWHERE = """
 import faulthandler, signal, sys, threading, time
-from clsas.engine.data.threads import cores, in_threads
+from clsas.engine.data.threads import in_threads
 
 faulthandler.dump_traceback_later(50, exit=True)
 OURS = ("threading.py", "_base.py", "thread.py")
