@@ -554,11 +554,12 @@ class Mosaic:
 
                 # A patch that is running is checked when it is finished.
                 has_news = survey.update()
-                waiting = todo.keys() | set(running.values())
+                busy = set(running.values())
                 outdated = [
                     index
                     for index in (records if survey.channels > checked else latest)
-                    if index not in waiting
+                    if index not in todo
+                    and index not in busy
                     and _is_outdated(records[index], layout, index, survey.visibility)
                 ]
                 checked = survey.channels
