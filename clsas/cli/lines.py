@@ -14,7 +14,7 @@ from clsas.cli.inputs import check_levels, load, load_lines, read_scene, warn_of
 from clsas.cli.outputs import printable, progress_bar, report
 from clsas.cli.parameters import HDF5, INPUT, Output
 from clsas.cli.wording import command
-from clsas.files.formats import FORMATS, SUFFIXES
+from clsas.files.formats import SUFFIXES, format_named
 from clsas.measures.density import noise_penalty_db
 from clsas.simulation.simulator import check_size
 
@@ -156,11 +156,9 @@ def convert(
     """
     start = time.perf_counter()
     of_lines = bool(of_bank or without_still_pings or background or high_pass or taper)
+    named = format_named(output)
     obj: Any
-    of_lines |= any(
-        each.has_only_lines and output.suffix.lower() in each.suffixes for each in FORMATS
-    )
-    if of_lines or compensate_density:
+    if of_lines or compensate_density or (named is not None and named.has_only_lines):
         obj = load_lines(recording, **of_bank)
     else:
         obj = clsas.load(recording)

@@ -54,9 +54,6 @@ def step_bar() -> Iterator[Callable[[str, int, int | None], None] | None]:
         yield show
 
 
-_LISTED = 3  # patches that are listed for each flag; arbitrary
-
-
 def report(as_json: bool, text: str, **results: Any) -> None:
     """Print results as JSON, or as text in the words of the command line."""
     if as_json:
@@ -87,6 +84,9 @@ def warn(message: str) -> None:
 def print_json(results: Any, indent: int | None = 2) -> None:
     """Print results as JSON, on a single line if `indent` is None."""
     click.echo(json.dumps(json_able(results), indent=indent, allow_nan=False))
+
+
+_LISTED = 3  # patches that are listed for each flag; arbitrary
 
 
 def described_flags(flagged: dict[tuple[int, int], tuple[str, ...]]) -> list[str]:

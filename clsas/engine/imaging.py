@@ -16,7 +16,7 @@ from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.digests import lines_digest
 from clsas.engine.data.georeference import placed
-from clsas.engine.data.grid import Grid, check_one_grid
+from clsas.engine.data.grid import Grid, check_one_grid, one_placed
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
@@ -669,5 +669,4 @@ def _added(image: Image, accumulate: Image | None) -> Image:
     """Return an image to which another one on the same grid is added."""
     if accumulate is None:
         return image
-    grid = accumulate.grid if image.grid.georeference is None else image.grid
-    return Image(image.pixels + accumulate.pixels, grid)
+    return Image(image.pixels + accumulate.pixels, one_placed(image.grid, accumulate.grid))

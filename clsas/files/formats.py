@@ -109,14 +109,19 @@ def save(path: str | os.PathLike, obj: Saved) -> None:
     """
     path = validate.path("path", path)
     validate.suffix("path", path, *SUFFIXES)
-    for each in FORMATS:
-        if path.suffix.lower() in each.suffixes:
-            if each.has_only_lines:
-                validate.instance("obj", obj, RangeLines)
-            assert each.write is not None
-            each.write(path, obj)
-            return
-    hdf5.save(path, obj)
+    named = format_named(path)
+    if named is None:
+        hdf5.save(path, obj)
+        return
+    if named.has_only_lines:
+        validate.instance("obj", obj, RangeLines)
+    assert named.write is not None  # as the format has a suffix
+    named.write(path, obj)
+
+
+def format_named(path: Path) -> Format | None:
+    """Return the format that the suffix of a path selects; None without a suffix."""
+    return next((each for each in FORMATS if path.suffix.lower() in each.suffixes), None)
 
 
 def format_of(path: Path) -> Format | None:

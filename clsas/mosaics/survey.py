@@ -417,30 +417,25 @@ class SurveyVisibility:
         """Return how many leading channels of `channels` later ones cannot turn."""
         if self.beam is None or self.beam.along is not None:
             return channels
-        found = self._settled_by_channels.get(channels)
-        if found is None:
-            found = self._settled_by_channels[channels] = self._settled_pings(channels, self.beam)
-        return found
-
-    def _settled_pings(self, channels: int, beam: BeamWindow) -> int:
-        """Return the first channel of those that pings after the first `channels` may turn."""
-        geometry = self.survey.geometry
-        starts, centres_m = geometry.ping_starts, geometry.ping_centres_m
-        pings = int(np.searchsorted(starts, channels))
+        starts, travelled_m, reach_m = self._pings
         # A jump begins a leg, over which nothing is smoothed, once enough pings have followed it.
-        later = (beam.track_pings or MOST_TRACK_PINGS) // 2 + SHORTEST_LEG
-        if pings <= 2 * later:
+        later = (self.beam.track_pings or MOST_TRACK_PINGS) // 2 + SHORTEST_LEG
+        kept = int(np.searchsorted(starts, channels)) - later
+        if kept <= later:
             return 0
-        steps_m = np.linalg.norm(np.diff(centres_m[: pings - later], axis=0), axis=1)
-        travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
         # Channels ahead of their ping's centre take the directions of later pings.
-        ahead_m = geometry.phase_centres_m - centres_m[geometry.ping_numbers]
-        reach_m = np.linalg.norm(ahead_m, axis=1).max()
-        return int(starts[np.searchsorted(travelled_m, travelled_m[-1] - reach_m)])
+        farthest_m = travelled_m[kept - 1] - reach_m
+        return int(starts[np.searchsorted(travelled_m[:kept], farthest_m)])
 
     @functools.cached_property
-    def _settled_by_channels(self) -> dict[int, int]:
-        return {}
+    def _pings(self) -> tuple[NDArray[np.int64], NDArray[np.float64], float]:
+        """First channels of pings, their distances along the track, and the reach of channels."""
+        geometry = self.survey.geometry
+        centres_m = geometry.ping_centres_m
+        steps_m = np.linalg.norm(np.diff(centres_m, axis=0), axis=1)
+        ahead_m = geometry.phase_centres_m - centres_m[geometry.ping_numbers]
+        reach_m = float(np.linalg.norm(ahead_m, axis=1).max())
+        return geometry.ping_starts, np.concatenate([[0.0], np.cumsum(steps_m)]), reach_m
 
     def ranges_m(self, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return between which ranges every channel may contribute to a grid, metres."""

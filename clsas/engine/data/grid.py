@@ -516,7 +516,7 @@ def without_heights(grid: Grid) -> Grid:
 
 
 def check_one_grid(names: str, grid: Grid, other: Grid) -> Grid:
-    """Return the first grid, or the other one if only that has a georeference.
+    """Return `one_placed` of two grids.
 
     Raise ValueError unless both have the same pixel positions, up to rounding.
     """
@@ -537,4 +537,9 @@ def check_one_grid(names: str, grid: Grid, other: Grid) -> Grid:
     if apart_m > 1e-9 + 1e-14 * np.abs(positions_m).max():
         got = f"pixel positions that differ by up to {apart_m:g} m"
         raise ArgumentError(names, allowed, got)
+    return one_placed(grid, other)
+
+
+def one_placed(grid: Grid, other: Grid) -> Grid:
+    """Return the first of two grids, or the other one if only that has a georeference."""
     return other if grid.georeference is None else grid
