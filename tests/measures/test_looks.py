@@ -85,7 +85,7 @@ def test_a_bright_point_leaves_no_trail():
         ([], 0.1, ValueError, "images must have at least one"),
         ([speckle(0), 3], 0.1, TypeError, "every entry of images must be"),
         ([speckle(0), speckle(0, clsas.Grid.plane((0, 3, 9), (0, 1, 9)))], None, ValueError,
-         r"images must lie on one grid, got shapes \(9, 9\) and"),
+         r"images must lie on one grid, got shapes \(101, 151\) and \(9, 9\)"),
         (speckle(0), 2.5, ValueError, "at most the extent of the grid, 2.02 m"),
         (speckle(0), -1.0, ValueError, "window_m must be"),
         (clsas.Image(np.ones(3, complex), clsas.Grid.points(np.eye(3))), 0.1, ValueError,
