@@ -1,7 +1,9 @@
 """Public names of clsas, and the modules that have them: imported when they are first used."""
 
 from . import plot as plot
+from .engine.certificate import certify as certify
 from .engine.data.beam import BeamWindow as BeamWindow
+from .engine.data.certificate import Certificate as Certificate
 from .engine.data.contrast import contrast as contrast
 from .engine.data.contrast import entropy as entropy
 from .engine.data.findings import Finding as Finding
@@ -27,6 +29,7 @@ from .engine.imaging import Imager as Imager
 from .engine.imaging import backproject as backproject
 from .engine.imaging import factorize as factorize
 from .engine.imaging import plan as plan
+from .engine.promise import ToleranceError as ToleranceError
 from .engine.signal.band_parts import sub_bands as sub_bands
 from .engine.signal.compression import compress as compress
 from .engine.signal.echoes import Echoes as Echoes
@@ -58,8 +61,6 @@ from .measures.assess import Assessment as Assessment
 from .measures.assess import Effect as Effect
 from .measures.assess import assess as assess
 from .measures.assess import survey_lines as survey_lines
-from .measures.certificate import Certificate as Certificate
-from .measures.certificate import certify as certify
 from .measures.density import density_compensated as density_compensated
 from .measures.density import density_weights as density_weights
 from .measures.limits import Limit as Limit

@@ -13,12 +13,13 @@ import numpy as np
 from exactly import execute, prepare
 from families import Scene
 
+from clsas.engine.certificate import certify
+from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.image_error import relative_error_db
 from clsas.engine.factorized.costs import Costs
 from clsas.engine.imaging import factorize, plan
-from clsas.measures.certificate import Certificate, certify
 
 REFERENCE_DB = -85.0  # of the exact image with which others are compared everywhere
 FLOOR_DB = -90.0  # below which sums of these large phases do not agree

@@ -7,13 +7,17 @@ factorization of the plan.
 
 from __future__ import annotations
 
+import time
 import weakref
 from collections.abc import Callable, Sequence
+from functools import partial
 from types import TracebackType
+from typing import Annotated
 
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.decibels import in_db, power
+from clsas.engine.data.declared import check_declared
 from clsas.engine.data.digests import lines_digest
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid, check_one_grid, one_placed
@@ -21,11 +25,12 @@ from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.engine.device.device import Device, open_device
-from clsas.engine.exact.decide import ACCURACY, ACCURACY_DB
+from clsas.engine.exact.decide import ACCURACY, ACCURACY_DB, BEST_ACCURACY_DB
 from clsas.engine.factorized.costs import Costs
 from clsas.engine.factorized.plan import ExactImage, Plan
-from clsas.engine.factorized.planner import TOLERANCE, Request, planned
+from clsas.engine.factorized.planner import BEST_TOLERANCE_DB, TOLERANCE, Request, planned
 from clsas.engine.forming import Progress, SceneImager, form, scene_of_plan
+from clsas.engine.promise import CERTIFICATE, LEAST_SECONDS, ON_MISS, FormAgain, kept
 from clsas.engine.scene import Scene
 from clsas.engine.signal.spectrum import (
     FEW_CHANNELS,
@@ -188,6 +193,8 @@ def factorize(
     *,
     beam: BeamWindow | None = None,
     device: Device | str | int | None = None,
+    certificate: Annotated[bool | None, CERTIFICATE] = None,
+    on_miss: Annotated[str, ON_MISS] = "refine",
     accumulate: Image | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Image:
@@ -208,6 +215,12 @@ def factorize(
         own.
     device : Device, str or int, optional
         See `clsas.engine.device.device.choose`.
+    certificate : bool, optional
+        Whether the error of the image is measured, as by `clsas.certify`. By default it is if the
+        image is formed to a tolerance, and planning and forming it take 0.1 s or more.
+    on_miss : {"refine", "warn", "raise"}
+        What to do if the measured error exceeds the tolerance beyond doubt: form the image again by
+        a better plan, and then exactly, with a warning; warn; or raise ToleranceError.
     accumulate : Image, optional
         Image on the same grid to which this one is added, so that data may arrive in pieces. The
         tolerance applies to the new image alone, and `Image.formed` of the sum is None.
@@ -226,13 +239,15 @@ def factorize(
         given with a plan, or `accumulate` is on another grid or given with a beam that normalises.
     DeviceError
         If the device does not exist.
+    ToleranceError
+        If the image misses its tolerance, and `on_miss` is "raise".
 
     Warns
     -----
     ClsasWarning
-        If the lines have power outside the band that the plan was made for, or are too large for
-        the half precision that it chose; if no line adds anything to the image; and, with a
-        tolerance, for the reasons of `clsas.plan`.
+        If the image missed its tolerance; if the lines have power outside the band that the plan
+        was made for, or are too large for the half precision that it chose; if no line adds
+        anything to the image; and, with a tolerance, for the reasons of `clsas.plan`.
 
     See Also
     --------
@@ -292,7 +307,9 @@ def factorize(
         validate.progress(progress)
         tolerance_db = TOLERANCE.check("plan_or_tolerance", plan_or_tolerance)
         imager = Imager(lines, grid, tolerance_db=tolerance_db, beam=beam, device=device)
-    return imager(lines, accumulate=accumulate, progress=progress)
+    return imager(
+        lines, certificate=certificate, on_miss=on_miss, accumulate=accumulate, progress=progress
+    )
 
 
 def backproject(
@@ -304,6 +321,8 @@ def backproject(
     taps: int | None = None,
     upsampling: float | None = None,
     beam: BeamWindow | None = None,
+    certificate: Annotated[bool | None, CERTIFICATE] = None,
+    on_miss: Annotated[str, ON_MISS] = "refine",
     accumulate: Image | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Image:
@@ -330,6 +349,12 @@ def backproject(
     beam : BeamWindow, optional
         Weights of the channels by aspect angle. Pixels outside the beam of a channel take no time.
         Without a beam every channel has the weight 1 everywhere.
+    certificate : bool, optional
+        Whether the error of the image is measured, as by `clsas.certify`. By default it is if the
+        image takes 0.1 s or more, and not both `taps` and `upsampling` are given.
+    on_miss : {"refine", "warn", "raise"}
+        What to do if the measured error exceeds `accuracy_db` beyond doubt: warn, or raise
+        ToleranceError. Nothing is better than an exact image, so that "refine" only warns.
     accumulate : Image, optional
         Image on the same grid to which this one is added, so that data may arrive in pieces.
         `Image.formed` of the sum is None.
@@ -350,15 +375,17 @@ def backproject(
         speed, or numbers are too large or too small for float32 sums or float64 phases.
     DeviceError
         If there is no such device.
+    ToleranceError
+        If the error exceeds `accuracy_db`, and `on_miss` is "raise".
 
     Warns
     -----
     ClsasWarning
-        If no pixel lies in the beam and within the range of any line, so that the image is zero. If
-        pixels lie behind the elements, where they can only show mirror images. If lines, grid or
-        beam cannot be right, such as positions in millimetres. If the image may miss `accuracy_db`,
-        because the grid reaches ends of lines that do not fade, or because the band of the lines
-        fills the whole sampled band.
+        If the measured error exceeds `accuracy_db`. If no pixel lies in the beam and within the
+        range of any line, so that the image is zero. If pixels lie behind the elements, where they
+        can only show mirror images. If lines, grid or beam cannot be right, such as positions in
+        millimetres. If the image may miss `accuracy_db`, because the grid reaches ends of lines
+        that do not fade, or because the band of the lines fills the whole sampled band.
 
     See Also
     --------
@@ -411,14 +438,17 @@ def backproject(
     validate.memory("grid", 8 * grid.size)
     validate.progress(progress)
     accuracy_db = ACCURACY.check("accuracy_db", accuracy_db)
+    asked = check_declared(backproject, {"certificate": certificate, "on_miss": on_miss})
     is_fixed = taps is not None and upsampling is not None
-    device = open_device(device)
+    device, started = open_device(device), time.perf_counter()
     scene = Scene.of(lines, grid, beam, None if is_fixed else accuracy_db)
     if accumulate is not None:
         check_accumulate(accumulate, scene.given_grid, beam)
     scene.warn("accuracy_db", 0.0 if is_fixed else accuracy_db)
     method = ExactImage(accuracy_db, taps=taps, upsampling=upsampling)
-    return _added(form(scene, method, device, progress=progress), accumulate)
+    image = form(scene, method, device, progress=progress)
+    image = _kept(image, lines, device, started, not is_fixed, **asked)
+    return _added(image, accumulate)
 
 
 class Imager:
@@ -526,7 +556,7 @@ class Imager:
                 ", ".join(map(validate.shown, given)),
             )
         validate.memory("grid", 8 * grid.size)
-        self.device = open_device(device)
+        self.device, started = open_device(device), time.perf_counter()
         method: Plan | ExactImage
         track, warned = None, False
         if plan is not None:
@@ -555,11 +585,16 @@ class Imager:
         self._checked = weakref.ref(lines)
         if plan is not None and tolerance_db is None and not plan.is_exact:
             self._check_band(lines)
+        # Whether the next image is certified by default
+        self._is_certified = tolerance_db is not None or accuracy_db is not None
+        self._planning_s = time.perf_counter() - started
 
     def __call__(
         self,
         lines: RangeLines,
         *,
+        certificate: Annotated[bool | None, CERTIFICATE] = None,
+        on_miss: Annotated[str, ON_MISS] = "refine",
         accumulate: Image | None = None,
         progress: Progress | None = None,
     ) -> Image:
@@ -568,6 +603,14 @@ class Imager:
         Parameters
         ----------
         lines : RangeLines
+        certificate : bool, optional
+            Whether the error of the image is measured, as by `clsas.certify`. By default it is for
+            the first image, if the imager was not made from a plan, and planning and forming the
+            image take 0.1 s or more.
+        on_miss : {"refine", "warn", "raise"}
+            What to do if the measured error exceeds the tolerance beyond doubt: form the image
+            again by a better plan, and then exactly, with a warning; warn; or raise ToleranceError.
+            A better plan replaces that of the imager.
         accumulate : Image, optional
             Image on the same grid to which this one is added, so that data may arrive in pieces.
             `Image.formed` of the sum is None.
@@ -584,14 +627,18 @@ class Imager:
         TypeError, ValueError
             If an argument is not allowed, the lines have another geometry, or the imager was
             closed.
+        ToleranceError
+            If the image misses its tolerance, and `on_miss` is "raise".
 
         Warns
         -----
         ClsasWarning
-            If the lines have power outside the band that the imager was made for, so that the
-            error may be larger; or if no line adds anything to the image.
+            If the image missed its tolerance; if the lines have power outside the band that the
+            imager was made for, so that the error may be larger; or if no line adds anything to the
+            image.
         """
         validate.instance("lines", lines, RangeLines)
+        asked = check_declared(Imager.__call__, {"certificate": certificate, "on_miss": on_miss})
         validate.progress(progress)
         placed(lines, self.grid)  # raises if the georeferences differ
         if self._imager is None:
@@ -608,7 +655,33 @@ class Imager:
                 )
             self._check_band(lines)
             self._checked = weakref.ref(lines)
-        return _added(self._imager.form(lines, progress), accumulate)
+        started = time.perf_counter() - self._planning_s
+        image = self._imager.form(lines, progress)
+        is_certified, self._is_certified, self._planning_s = self._is_certified, False, 0.0
+        again = partial(self._form_again, lines, progress), partial(self._exactly, lines, progress)
+        is_exact = self._imager.decision is not None
+        image = _kept(
+            image, lines, self.device, started, is_certified, () if is_exact else again, **asked
+        )
+        return _added(image, accumulate)
+
+    def _form_again(
+        self, lines: RangeLines, progress: Progress | None, tolerance_db: float
+    ) -> Image:
+        """Return the image by a plan for another tolerance, which replaces that of the imager."""
+        tolerance_db = max(tolerance_db, BEST_TOLERANCE_DB)
+        request = Request(lines, self.grid, tolerance_db=tolerance_db, beam=self.beam)
+        scene, self.plan, track = planned(request, self.device, doubts=False)
+        self._imager = SceneImager(scene, self.plan, self.device, track=track, warned=True)
+        return self._imager.form(lines, progress)
+
+    def _exactly(self, lines: RangeLines, progress: Progress | None, accuracy_db: float) -> Image:
+        """Return the exact image; the imager forms the next ones exactly, too."""
+        accuracy_db = max(accuracy_db, BEST_ACCURACY_DB)
+        scene = Scene.of(lines, self.grid, self.beam, accuracy_db)
+        self.plan = None
+        self._imager = SceneImager(scene, ExactImage(accuracy_db), self.device, warned=True)
+        return self._imager.form(lines, progress)
 
     def _check_band(self, lines: RangeLines) -> None:
         """Warn once if lines have power outside the band that the imager was made for."""
@@ -654,6 +727,28 @@ class Imager:
         """Return the grid, the method and the device."""
         how = "exact" if self.plan is None else repr(self.plan)
         return reprs.summary(self, reprs.by(self.grid.shape), how, self.device.info.label)
+
+
+def _kept(
+    image: Image,
+    lines: RangeLines,
+    device: Device,
+    started: float,
+    by_default: bool,
+    again: Sequence[FormAgain] = (),
+    *,
+    certificate: bool | None,
+    on_miss: str,
+) -> Image:
+    """Return an image that was just formed, with its certificate if it is to have one.
+
+    It was begun at the time `started`. Without a request, it is certified `by_default` if it took
+    long enough.
+    """
+    seconds = time.perf_counter() - started
+    if certificate is None:
+        certificate = by_default and seconds >= LEAST_SECONDS
+    return kept(image, lines, device, seconds, on_miss, again) if certificate else image
 
 
 def check_accumulate(image: Image, grid: Grid, beam: BeamWindow | None) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 from clsas.engine.data import reading, validate
 from clsas.engine.data.atomic import replacing
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Formed, Image
@@ -38,6 +39,7 @@ _KINDS = {
     "range_lines": RangeLines,
     "image": Image,
     "formed": Formed,
+    "certificate": Certificate,
     "beam": BeamWindow,
     "echoes": Echoes,
     "pulse": Pulse,

@@ -103,6 +103,8 @@ class Flag:
     """True or false."""
 
     help: str = ""
+    _: KW_ONLY
+    default: str = ""
 
     def check(self, name: str, value: object) -> bool:
         """Return a value as `validate.flag` does."""

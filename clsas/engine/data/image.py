@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.decibels import level_db
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
@@ -51,6 +52,11 @@ class Formed:
         Digest of the range lines: of all positions and ranges, and of up to 4096 samples, which are
         spread over all lines. Images of the same lines have the same digest. That of a mosaic
         depends on its patches, too.
+    certificate : Certificate, optional
+        Measured error of the image; None if it was not measured.
+    misses : sequence of str
+        Predicted and measured errors of earlier images of the same lines, which missed the
+        tolerance, so that this one was formed.
     """
 
     method: str
@@ -62,6 +68,8 @@ class Formed:
     device: str
     version: str
     lines_digest: str
+    certificate: Certificate | None = None
+    misses: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""
@@ -70,19 +78,28 @@ class Formed:
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, validate.number(name, value, "dB"))
         validate.instance("beam", self.beam, BeamWindow, type(None))
-        effects = validate.entries("left_out", self.left_out, "names of effects")
-        effects = [validate.text("every entry of left_out", each) for each in effects]
-        object.__setattr__(self, "left_out", tuple(effects))
+        for name, what in (("left_out", "names of effects"), ("misses", "texts")):
+            texts = validate.entries(name, getattr(self, name), what)
+            texts = [validate.text(f"every entry of {name}", each) for each in texts]
+            object.__setattr__(self, name, tuple(texts))
+        validate.instance("certificate", self.certificate, Certificate, type(None))
         for name in ("plan", "device", "version", "lines_digest"):
             validate.text(name, getattr(self, name))
+
+    @property
+    def prediction(self) -> str:
+        """The predicted error in words."""
+        if self.predicted_error_db is None:
+            return "no predicted error"
+        return f"predicted error {self.predicted_error_db:.1f} dB"
 
     def describe(self) -> str:
         """Return everything but the digest as one line of text."""
         parts = [self.method]
         if self.tolerance_db is not None:
             parts.append(f"tolerance {reprs.quantity(self.tolerance_db, 'dB')}")
-        if self.predicted_error_db is not None:
-            parts.append(f"predicted error {self.predicted_error_db:.1f} dB")
+        parts += [self.prediction] if self.predicted_error_db is not None else []
+        parts += [self.certificate.describe()] if self.certificate is not None else []
         parts += [self.plan] if self.plan else []
         if self.beam is not None:
             parts.append(repr(self.beam))

@@ -529,6 +529,11 @@ class Device:
         flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
         return cl.Buffer(self.context, flags, hostbuf=np.ascontiguousarray(array))
 
+    def read(self, buffer: cl.Buffer, into: np.ndarray) -> None:
+        """Copy a buffer into an array, after everything that was enqueued before."""
+        _check_process()
+        cl.enqueue_copy(self.queue, into, buffer)
+
     def zeros(self, bytes_: int) -> cl.Buffer:
         """Return a buffer of zeros."""
         if self.info.kind == "cpu":

@@ -8,6 +8,7 @@ from families import draw
 from judging import SLOW
 
 import clsas
+from clsas.engine.data.certificate import of_parts
 from clsas.selftest import extremes
 
 ALL = 10**6  # more pixels than any image here has
@@ -193,25 +194,87 @@ def test_bright_pixels_are_drawn_wherever_they_are():
     pixels = np.full((400, 500), 1e-3 + 0j)
     pixels[399, 499] = 100
     pixels[200, 3] = 50j
-    tx_m = np.zeros((2, 3))
-    lines = clsas.RangeLines(np.ones((2, 9), complex), 1.0, 1.0, tx_m, tx_m, 0.0, 1500.0)
-    grid = clsas.Grid.plane((100, 200, 500), (100, 200, 400))  # beyond the lines
+    tx_m = np.array([[0.0, 0, 0], [100, 0, 0]])
+    samples = np.ones((2, 1000)) * np.hanning(1000)
+    lines = clsas.RangeLines(samples.astype(complex), 90.0, 0.2, tx_m, tx_m, 0.0, 1500.0)
+    grid = clsas.Grid.plane((0, 100, 500), (100, 200, 400))
     found = clsas.certify(clsas.Image(pixels, grid), lines, seed=0)
     assert found.worst[:2].tolist() == [[399, 499], [200, 3]]
-    assert found.error_db == np.inf
 
 
-def test_images_of_no_echo_are_right_if_they_are_zero(speckle):
+def test_images_of_no_echo_have_no_error(speckle):
+    """Neither zeros, which are right, nor other pixels, which are all wrong."""
     grid, silent = speckle.grid, speckle.lines.weighted(np.zeros(speckle.lines.channels))
-    zero = clsas.certify(clsas.Image(np.zeros(grid.shape, complex), grid), silent)
-    assert zero.error_db == zero.upper_db == -np.inf
-    other = clsas.certify(clsas.Image(np.ones(grid.shape, complex), grid), silent)
-    assert other.error_db == other.upper_db == np.inf
+    for value in (0, 1):
+        image = clsas.Image(np.full(grid.shape, value, complex), grid)
+        with pytest.raises(ValueError, match="lines must have echoes at the pixels of the image"):
+            clsas.certify(image, silent)
+    beyond = clsas.Grid.plane((-1, 1, 9), (200, 201, 9))
+    with pytest.raises(ValueError, match="lines must have echoes at the pixels of the image"):
+        clsas.certify(clsas.Image(np.zeros(beyond.shape, complex), beyond), speckle.lines)
+
+
+def test_a_band_that_fills_everything_has_no_certificate():
+    """Without a guard band, values between samples may be any."""
+    rng = np.random.default_rng(0)
+    tx_m = np.c_[np.arange(32) * 0.02, np.zeros((32, 2))]
+    noise = rng.normal(size=(32, 400, 2)) @ [1, 1j]
+    lines = clsas.RangeLines(noise, 10.0, 0.01, tx_m, tx_m, 1e5, 1500.0)
+    grid = clsas.Grid.plane((0, 0.6, 20), (11, 12, 20))
+    image = clsas.Image(np.ones(grid.shape, complex), grid)
+    with pytest.raises(ValueError, match="lines must leave a part of the sampled band empty"):
+        clsas.certify(image, lines)
+
+
+def test_a_complex_factor_is_fitted(speckle):
+    """As between programs with other units and another phase of the carrier."""
+    pixels = speckle.ideal * (1 + 0.01 * np.random.default_rng(0).normal(size=speckle.ideal.shape))
+    known_db = certified_db(pixels, speckle)
+    found = clsas.certify(
+        clsas.Image(pixels * 3e-4j, speckle.grid), speckle.lines, pixels=ALL, scale=True
+    )
+    assert found.error_db == pytest.approx(known_db, abs=0.1)
+    assert certified_db(pixels * 3e-4j, speckle) > -1
+
+
+def test_the_beam_is_that_of_the_image(speckle):
+    """Without it, an image under a beam gives no number."""
+    lines, grid, beam = speckle.lines, speckle.grid, clsas.BeamWindow(2.0, "hann", along=[1, 0, 0])
+    image = clsas.backproject(lines, grid, beam=beam, accuracy_db=-60)
+    assert clsas.certify(image, lines, seed=0).upper_db < -60
+    assert clsas.certify(clsas.Image(image.pixels, grid), lines, seed=0).error_db > -10
+    with pytest.raises(ValueError, match=r"beam must be that of `image\.formed`, or be left out"):
+        clsas.certify(image, lines, beam=None)
+
+
+def test_parts_add_up_to_the_whole():
+    rng = np.random.default_rng(0)
+    parts = [
+        clsas.Certificate(10, 100 * (n + 1), 0.1, 2.0 + n, *rng.uniform(1e-6, 1e-5, 3) ** [1, 2, 3])
+        for n in range(3)
+    ]
+    whole = of_parts(parts)
+    pixels = np.array([part.of_pixels for part in parts])
+    power = sum(pixels * [part.power for part in parts]) / pixels.sum()
+    error = sum(pixels * [part.power * part.error for part in parts]) / pixels.sum() / power
+    assert (whole.pixels, whole.of_pixels) == (30, 600)
+    assert (whole.power, whole.error) == pytest.approx((power, error))
+    alone = of_parts(parts[:1])
+    assert (alone.lower_db, alone.error_db, alone.upper_db) == pytest.approx(
+        (parts[0].lower_db, parts[0].error_db, parts[0].upper_db)
+    )
+    assert of_parts([parts[0]] * 9).upper_db < parts[0].upper_db
 
 
 def test_a_certificate_describes_itself():
-    found = clsas.Certificate(-52.31, -51.7, 256, 0.21, np.zeros((5, 2), int), np.zeros(5))
+    found = clsas.Certificate(256, 10**6, 0.21, 1.0, 10**-5.231, 2e-13, 1e-20)
     assert repr(found) == "Certificate(error -52.3 dB, at most -51.7 dB, 256 pixels in 210 ms)"
+    assert found.describe(-50) == (
+        "error -52.3 dB (below -51.7 dB with 95 % confidence, measured at 256 pixels); -50 dB "
+        "requested"
+    )
+    assert "between -52.9 and -51.7 dB with 90 % confidence" in found.describe(-52)
+    assert [found.verdict(each) for each in (-51, -52, -54)] == ["met", "undecided", "missed"]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,166 @@
+"""The promise of a tolerance: errors of images are measured, and images that miss formed again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from clsas.engine.certificate import PIXELS, Measurement
+from clsas.engine.data import validate
+from clsas.engine.data.certificate import Certificate
+from clsas.engine.data.declared import Choice, Flag
+from clsas.engine.data.image import Formed, Image, holds_any
+from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.validate import ArgumentError
+from clsas.engine.device.device import Device
+
+LEAST_SECONDS = 0.1
+"""Images that take less are certified only if that is requested."""
+
+CERTIFICATE = Flag("Measure the error of the image.", default="if the image takes 0.1 s or more")
+ON_MISS = Choice(
+    ("refine", "warn", "raise"),
+    help="What to do if the measured error exceeds the tolerance: form the image again, warn of "
+    "it, or end with an error.",
+)
+
+_FIRST, _MOST = 64, 1024  # pixels that are drawn at first, and in all
+_LEAST_MORE = 16  # pixels for which another round is worth its overhead
+_SHARE, _LARGEST_SHARE = 0.03, 0.05  # of the time of an image
+
+FormAgain = Callable[[float], Image]
+"""Forms the image to another tolerance, dB."""
+
+
+class ToleranceError(RuntimeError):
+    """The measured error of an image exceeds its tolerance.
+
+    Attributes
+    ----------
+    certificate : Certificate
+    tolerance_db : float
+    """
+
+    def __init__(self, certificate: Certificate, tolerance_db: float) -> None:
+        super().__init__(certificate, tolerance_db)
+        self.certificate, self.tolerance_db = certificate, tolerance_db
+
+    def __str__(self) -> str:
+        """Return the message."""
+        return f"the image misses its tolerance: {self.certificate.describe(self.tolerance_db)}"
+
+
+def kept(
+    image: Image,
+    lines: RangeLines,
+    device: Device,
+    seconds: float,
+    on_miss: str,
+    again: Sequence[FormAgain] = (),
+) -> Image:
+    """Return an image with the certificate of its error, formed again if it misses its tolerance.
+
+    Parameters
+    ----------
+    image : Image
+        Image that was just formed from `lines`.
+    lines : RangeLines
+    device : Device
+    seconds : float
+        Time that the image took.
+    on_miss : {"refine", "warn", "raise"}
+    again : sequence of callable
+        Better and better ways to form the image, which are tried in turn with "refine". Each gets
+        the tolerance, tightened by the miss.
+
+    Raises
+    ------
+    ToleranceError
+        If the image misses its tolerance, and `on_miss` is "raise".
+
+    Warns
+    -----
+    ClsasWarning
+        If the error cannot be measured, or the image misses its tolerance.
+    """
+    tolerance_db = _formed(image).tolerance_db
+    certificate = _measured_if_possible(image, lines, device, seconds, tolerance_db)
+    misses: list[str] = []
+    for form_again in again if on_miss == "refine" else ():
+        if certificate is None or tolerance_db is None:
+            break
+        if certificate.verdict(tolerance_db) != "missed":
+            break
+        misses.append(f"{_formed(image).prediction}, {certificate.describe()}")
+        image = form_again(2 * tolerance_db - certificate.error_db)
+        certificate = _measured_if_possible(image, lines, device, seconds, tolerance_db)
+    formed = replace(
+        _formed(image), tolerance_db=tolerance_db, certificate=certificate, misses=tuple(misses)
+    )
+    if certificate is not None and tolerance_db is not None:
+        if certificate.verdict(tolerance_db) == "missed" and on_miss == "raise":
+            raise ToleranceError(certificate, tolerance_db)
+        _warn(formed, certificate, tolerance_db)
+    return Image(image.pixels, image.grid, formed)
+
+
+def measured(
+    image: Image, lines: RangeLines, device: Device, seconds: float, tolerance_db: float | None
+) -> Certificate:
+    """Return the error of an image, measured in a small part of the time that the image took.
+
+    It is measured at 64 pixels, and at up to 256 if these take no more than 3 % of the time. While
+    it is undecided whether the image keeps its tolerance, more are drawn, up to 1024 in all: within
+    5 % of the time, or in any case if the image seems to miss.
+    """
+    measurement = Measurement(image, lines, _formed(image).beam, device, tolerance_db=tolerance_db)
+    measurement.draw(_FIRST)
+    first_s = measurement.seconds / _FIRST  # more than others take
+
+    def affordable(share: float) -> int:
+        return int((share * seconds - measurement.seconds) / first_s)
+
+    more = min(affordable(_SHARE), PIXELS - _FIRST)
+    while True:
+        if more >= _LEAST_MORE and not measurement.is_complete:
+            measurement.draw(more)
+        found = measurement.certificate()
+        if tolerance_db is None or found.verdict(tolerance_db) != "undecided":
+            return found
+        more = min(found.pixels, _MOST - found.pixels)
+        if found.error_db <= tolerance_db:
+            more = min(more, affordable(_LARGEST_SHARE))
+        if more < _LEAST_MORE or measurement.is_complete:
+            return found
+
+
+def _measured_if_possible(
+    image: Image, lines: RangeLines, device: Device, seconds: float, tolerance_db: float | None
+) -> Certificate | None:
+    """Return the error of an image, or None with a warning if it cannot be measured."""
+    try:
+        return measured(image, lines, device, seconds, tolerance_db)
+    except ArgumentError as error:
+        if holds_any(image.pixels):  # else there has been a warning
+            validate.warn(f"the error of the image is not known: {error}")
+        return None
+
+
+def _formed(image: Image) -> Formed:
+    """Return how an image was formed, which all imagers state."""
+    assert image.formed is not None
+    return image.formed
+
+
+def _warn(formed: Formed, certificate: Certificate, tolerance_db: float) -> None:
+    """Warn if an image missed its tolerance, and say what was done about it."""
+    is_missed = certificate.verdict(tolerance_db) == "missed"
+    now, tolerance = certificate.describe(), f"its tolerance of {tolerance_db:g} dB"
+    if formed.misses:
+        result = "still misses it" if is_missed else "keeps it"
+        validate.warn(
+            f"the image missed {tolerance} ({'; then '.join(formed.misses)}), was formed again "
+            f"({formed.plan}), and {result}: {now}"
+        )
+    elif is_missed:
+        validate.warn(f"the image misses {tolerance}: {now}")

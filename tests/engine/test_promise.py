@@ -1,0 +1,141 @@
+"""Images to a tolerance: their errors are measured, and images that miss are formed again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from judging import SLOW
+
+import clsas
+from clsas.engine.device.device import open_device
+from clsas.engine.promise import LEAST_SECONDS, kept
+from clsas.selftest import extremes
+
+
+@pytest.fixture(scope="module")
+def known():
+    return extremes.ultrasonic(64, targets=20)
+
+
+@pytest.fixture(scope="module")
+def optimist(known):
+    """A plan of a coarse image that says that it keeps a fine tolerance."""
+    coarse = clsas.plan(known.lines, known.grid, tolerance_db=-25, costs=SLOW)
+    return replace(coarse, tolerance_db=-37.0)
+
+
+@pytest.mark.parametrize("form", [
+    lambda known, **asked: clsas.factorize(known.lines, known.grid, -40, **asked),
+    lambda known, **asked: clsas.backproject(known.lines, known.grid, **asked),
+    lambda known, **asked: clsas.Imager(known.lines, known.grid, tolerance_db=-40)(
+        known.lines, **asked
+    ),
+])  # fmt: skip
+def test_images_say_how_wrong_they_are(form, known):
+    image = form(known, certificate=True)
+    found = image.formed.certificate
+    assert found.lower_db <= known.error_db(image.pixels) + 0.5
+    assert found.upper_db >= known.error_db(image.pixels) - 0.5
+    assert found.describe() in image.formed.describe()
+    assert form(known, certificate=False).formed.certificate is None
+
+
+def test_images_that_take_long_are_certified_by_default():
+    """And only the first one of an imager."""
+    lines, grid = extremes.ultrasonic(64, targets=3).lines, clsas.Grid.plane(
+        (0.2, 0.4, 1200), (42.4, 42.6, 1200)
+    )  # fmt: skip
+    with clsas.Imager(lines, grid, accuracy_db=-80) as imager:
+        first, second = imager(lines), imager(lines)
+    assert first.formed.certificate.pixels >= 64
+    assert first.formed.certificate.seconds < LEAST_SECONDS
+    assert second.formed.certificate is None
+    few = clsas.Grid.plane((0.2, 0.4, 12), (42.4, 42.6, 12))
+    assert clsas.backproject(lines, few).formed.certificate is None
+
+
+def test_a_miss_is_refined(known, optimist):
+    imager = clsas.Imager(known.lines, known.grid, optimist)
+    with pytest.warns(clsas.ClsasWarning, match="missed its tolerance of -37 dB .*and keeps it"):
+        image = imager(known.lines, certificate=True)
+    assert known.error_db(image.pixels) < -37
+    formed = image.formed
+    assert formed.tolerance_db == -37
+    assert formed.certificate.upper_db < -37
+    (miss,) = formed.misses
+    assert miss.startswith(f"predicted error {optimist.predicted_error_db:.1f} dB, error -3")
+    with pytest.warns(clsas.ClsasWarning, match="missed"):
+        one = clsas.factorize(known.lines, known.grid, optimist, certificate=True)
+    assert known.error_db(one.pixels) < -37
+    assert known.error_db(imager(known.lines).pixels) < -37  # the imager has learnt from it
+
+
+def test_a_miss_is_left_as_it_is_on_request(known, optimist):
+    with pytest.warns(clsas.ClsasWarning, match="the image misses its tolerance of -37 dB: error"):
+        image = clsas.factorize(
+            known.lines, known.grid, optimist, certificate=True, on_miss="warn"
+        )  # fmt: skip
+    assert image.formed.certificate.verdict(-37) == "missed"
+    assert image.formed.misses == ()
+    plain = clsas.factorize(known.lines, known.grid, optimist)
+    np.testing.assert_array_equal(image.pixels, plain.pixels)
+    with pytest.raises(clsas.ToleranceError, match="misses its tolerance") as caught:
+        clsas.factorize(known.lines, known.grid, optimist, certificate=True, on_miss="raise")
+    assert caught.value.certificate.error_db > -37
+
+
+def test_what_is_added_to_another_image_is_certified_alone(known, optimist):
+    before = clsas.Image(1e3 * known.ideal, known.grid)
+    with pytest.raises(clsas.ToleranceError):
+        clsas.factorize(
+            known.lines, known.grid, optimist, certificate=True, on_miss="raise", accumulate=before
+        )
+
+
+def test_the_best_that_can_be_had_is_returned_with_one_warning(known, recwarn):
+    """When every attempt misses, each gets the tolerance tightened by the miss before."""
+    asked_db = []
+
+    def image(error):
+        how = clsas.backproject(known.lines, known.grid).formed
+        return clsas.Image((1 + error) * known.ideal, known.grid, replace(how, tolerance_db=-60))
+
+    def again(tolerance_db):
+        asked_db.append(tolerance_db)
+        return image(1e-2)
+
+    found = kept(image(1e-1), known.lines, open_device(), 1.0, "refine", [again, again])
+    assert asked_db == pytest.approx([-100, -80], abs=0.5)
+    assert found.formed.certificate.error_db == pytest.approx(-40, abs=0.3)
+    assert len(found.formed.misses) == 2
+    (warning,) = recwarn.list
+    assert "still misses it: error -" in str(warning.message)
+
+
+def test_images_without_a_tolerance_are_measured_when_asked(known, recwarn):
+    stages = clsas.plan(known.lines, known.grid, stages=[(4, 4)])
+    image = clsas.factorize(known.lines, known.grid, stages, certificate=True)
+    assert image.formed.certificate.error_db > -55
+    assert not recwarn.list
+
+
+def test_files_keep_certificates(known, tmp_path):
+    image = clsas.backproject(known.lines, known.grid, certificate=True)
+    clsas.save(tmp_path / "image.h5", image)
+    found = clsas.load(tmp_path / "image.h5").formed
+    assert found.describe() == image.formed.describe()
+    np.testing.assert_array_equal(found.certificate.worst, image.formed.certificate.worst)
+
+
+@pytest.mark.parametrize(
+    ("asked", "error", "message"),
+    [
+        ({"certificate": "yes"}, TypeError, "certificate must be of type bool"),
+        ({"on_miss": "ignore"}, ValueError, "on_miss must be one of 'refine', 'warn', 'raise'"),
+    ],
+)
+def test_wrong_requests_are_refused(known, asked, error, message):
+    with pytest.raises(error, match=message):
+        clsas.backproject(known.lines, known.grid, **asked)
+    with pytest.raises(error, match=message):
+        clsas.factorize(known.lines, known.grid, -40, **asked)
