@@ -1,70 +1,67 @@
-/* Sums the samples of channels at some pixels, to measure the error of an image (clsas/engine/certificate.py). Ranges,
- * phases and weights of all pairs come from the host. Nothing is shared with the kernels that form images.
+/* Sums the samples of channels at some pixels, to measure the error of an image (clsas/engine/certificate.py). Positions
+ * and factors of all pairs come from the host. Nothing is shared with the kernels that form images.
  *
- *     sums[group][point] = sum over the channels of a group of  weight * exp(j 2 pi cycles) * sample at position,
+ *     sums[group][point] = sum over the channels of a group of  factor * sample at position,
  *
  * where the position in the line is `whole` + `fraction`, and lines are 0 beyond their ends. The filters are complex, for
  * PHASES fractions; between them they are interpolated linearly.
  *
  * Build options
- *   TAPS    taps of the filters, a multiple of 4
  *   PHASES  fractions of a sample for which there are filters
- *   GROUP   channels that a work-item adds up
+ *   GROUP, POINTS  channels that a work-item adds up, and for how many points; neighbours read the same part of a line
  *
  * samples  float2 [channels][length].
- * taps     float [PHASES + 2][2][TAPS][2]: the real parts, each twice, and then the imaginary parts, each twice.
- * whole, fraction, cycles, weight  [channels][points]. Pairs of weight 0 are skipped.
+ * filters  float [PHASES + 2][2][taps][2], with an even number of taps: the real parts, each twice, and then the
+ *          imaginary parts, each twice.
+ * whole, fraction, factors  [channels][points]. Pairs whose factor is 0 are skipped.
  *
- * Global size: (points, groups).
+ * Global size: (groups of points, groups of channels).
  */
 
-#define VECTORS (TAPS / 4) /* of 4 complex samples; longer vectors are passed wrongly where registers are shorter */
-
-/* 4 samples, of which those outside the line are 0. */
-inline float8 samples_near_end(__global const float2 *line, int first, int length)
+/* 2 samples, of which those outside the line are 0. */
+inline float4 samples_near_end(__global const float2 *line, int first, int length)
 {
-    float2 sample[4];
-    for (int k = 0; k < 4; k++)
-        sample[k] = first + k >= 0 && first + k < length ? line[first + k] : (float2)(0.0f);
-    return (float8)(sample[0], sample[1], sample[2], sample[3]);
+    const float2 none = 0.0f;
+    return (float4)(first >= 0 && first < length ? line[first] : none,
+                    first + 1 >= 0 && first + 1 < length ? line[first + 1] : none);
 }
 
-inline float sum_of(float4 terms)
+__kernel void sum_pixels(__global const float2 *samples, int length, __global const float *filters, int taps,
+                         __global const int *whole, __global const float *fraction, __global const float2 *factors,
+                         int channels, int points, __global float2 *sums)
 {
-    return terms.x + terms.y + (terms.z + terms.w);
-}
-
-__kernel void sum_pixels(__global const float2 *samples, int length, __global const float *taps,
-                         __global const int *whole, __global const float *fraction, __global const float *cycles,
-                         __global const float *weight, int channels, __global float2 *sums)
-{
-    const int point = get_global_id(0), points = get_global_size(0), group = get_global_id(1);
-    const int last = min((group + 1) * GROUP, channels);
-    float2 sum = 0.0f;
-    for (int channel = group * GROUP; channel < last; channel++) {
-        const size_t pair = (size_t)channel * points + point;
-        if (weight[pair] == 0.0f)
-            continue;
+    const int first_point = get_global_id(0) * POINTS, group = get_global_id(1);
+    const int last_point = min(first_point + POINTS, points), last_channel = min((group + 1) * GROUP, channels);
+    float2 sum[POINTS];
+    for (int p = 0; p < POINTS; p++)
+        sum[p] = 0.0f;
+    for (int channel = group * GROUP; channel < last_channel; channel++) {
         __global const float2 *line = samples + (size_t)channel * length;
-        const int first = whole[pair] - (TAPS / 2 - 1);
-        const bool inside = first >= 0 && first + TAPS <= length;
-        const float phase = fraction[pair] * PHASES;
-        const int entry = clamp((int)phase, 0, PHASES);
-        const float share = phase - entry;
-        __global const float *row = taps + (size_t)entry * 4 * TAPS;
-        float8 by_real = 0.0f, by_imaginary = 0.0f;
-        for (int v = 0; v < VECTORS; v++) {
-            const float8 sample = inside ? vload8(0, (__global const float *)(line + first + 4 * v))
-                                          : samples_near_end(line, first + 4 * v, length);
-            const float8 real = vload8(v, row), imaginary = vload8(v + VECTORS, row);
-            const float8 next_real = vload8(v + 2 * VECTORS, row), next_imaginary = vload8(v + 3 * VECTORS, row);
-            by_real += sample * (real + share * (next_real - real));
-            by_imaginary += sample * (imaginary + share * (next_imaginary - imaginary));
+        for (int point = first_point; point < last_point; point++) {
+            const size_t pair = (size_t)channel * points + point;
+            const float2 factor = factors[pair];
+            if (factor.x == 0.0f && factor.y == 0.0f)
+                continue;
+            const int first = whole[pair] - (taps / 2 - 1);
+            const bool inside = first >= 0 && first + taps <= length;
+            const float phase = fraction[pair] * PHASES;
+            const int entry = clamp((int)phase, 0, PHASES);
+            const float share = phase - entry;
+            __global const float *row = filters + (size_t)entry * 4 * taps;
+            float4 by_real = 0.0f, by_imaginary = 0.0f;
+            for (int v = 0; v < taps / 2; v++) {
+                const float4 sample = inside ? vload4(0, (__global const float *)(line + first + 2 * v))
+                                             : samples_near_end(line, first + 2 * v, length);
+                const float4 real = vload4(v, row), imaginary = vload4(v + taps / 2, row);
+                const float4 next_real = vload4(v + taps, row), next_imaginary = vload4(v + 3 * taps / 2, row);
+                by_real += sample * (real + share * (next_real - real));
+                by_imaginary += sample * (imaginary + share * (next_imaginary - imaginary));
+            }
+            const float x = by_real.x + by_real.z - (by_imaginary.y + by_imaginary.w);
+            const float y = by_real.y + by_real.w + (by_imaginary.x + by_imaginary.z);
+            sum[point - first_point] += (float2)(x * factor.x - y * factor.y, x * factor.y + y * factor.x);
         }
-        const float x = sum_of(by_real.even) - sum_of(by_imaginary.odd);
-        const float y = sum_of(by_real.odd) + sum_of(by_imaginary.even);
-        const float cosine = cospi(2.0f * cycles[pair]) * weight[pair], sine = sinpi(2.0f * cycles[pair]) * weight[pair];
-        sum += (float2)(x * cosine - y * sine, x * sine + y * cosine);
     }
-    sums[(size_t)group * points + point] = sum;
+    for (int point = first_point; point < last_point; point++)
+        sums[(size_t)group * points + point] = sum[point - first_point];
 }

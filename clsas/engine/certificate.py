@@ -41,7 +41,7 @@ WORST = 5
 _PIXELS_AT_ONCE = 1 << 12  # formed again together; these three bound memory
 _PAIRS_AT_ONCE = 1 << 15  # of pixels and channels
 _SAMPLES_AT_ONCE = 1 << 22  # of the lines in a block
-_POWERS_AT_ONCE = 1 << 12  # pixels whose power is summed together
+_POWERS_AT_ONCE = 1 << 10  # pixels whose power is summed together
 
 # Filters are sincs under a Kaiser window. They need the longer a window, the less they may leave,
 # and the narrower the guard band is. Interpolation between phases leaves -115 dB.
@@ -51,10 +51,10 @@ _DENSE_TAPS = 20  # enough for -120 dB if lines are twice as dense
 _STOPBANDS_DB = (70.0, 110.0)  # least and most
 _BELOW_TOLERANCE_DB = 25.0  # by which filters are better than an image may be
 _SLACK_DB = 5.0  # by which the error of a filter may exceed that of its stop band
-_GROUP = 16  # channels that a work-item adds up in single precision
+_GROUP, _POINTS = 16, 16  # channels that a work-item adds up in single precision, and points
 _PADDING = 64  # zeros at either end of a line that is made denser, beyond the reach of the taps
 
-_SPECTRA, _SPECTRUM_SAMPLES = 1024, 256  # pieces of lines that show where the band lies
+_SPECTRA, _SPECTRUM_SAMPLES = 512, 256  # pieces of lines that show where the band lies
 _OUTSIDE = (1e-6, 1e-4, 1e-3, 1e-2, 5e-2)  # shares of the power that may lie outside the band
 _WIDEST = 0.95  # width of a band beside which there is a guard band, cycles per sample
 _QUIET = 2.0  # by which the guard band must have less power than a mean band of its width
@@ -286,15 +286,14 @@ def _check(image: Image, lines: RangeLines, beam: BeamWindow | None) -> None:
 def _power_until(formed: NDArray[np.complex64]) -> NDArray[np.float64]:
     """Return the power of all pixels up to the end of each block of `_POWERS_AT_ONCE`."""
     parts = np.ascontiguousarray(formed).view(np.float32)
-    starts = range(0, len(parts), 2 * _POWERS_AT_ONCE)
-    blocks = [parts[first : first + 2 * _POWERS_AT_ONCE] for first in starts]
+    step = 2 * _POWERS_AT_ONCE
+    whole = parts[: len(parts) // step * step].reshape(-1, step)
+    rest = parts[whole.size :][None]
     with np.errstate(over="ignore"):
-        until = np.cumsum([float(block @ block) for block in blocks])
-    if 1e-20 < until[-1] < math.inf:
-        return until
-    largest = max(max(block.max(), -block.min()) for block in blocks)  # squares over- or underflow
-    scaled = (block / (largest or 1) for block in blocks)
-    return np.cumsum([float(block @ block) for block in scaled]) * float(largest) ** 2
+        power = np.append(*(np.einsum("bn,bn->b", each, each) for each in (whole, rest)))
+    if not 1e-20 < power.sum() < 1e38:  # squares may over- or underflow
+        power = np.append(*((each.astype(np.float64) ** 2).sum(axis=1) for each in (whole, rest)))
+    return np.cumsum(power, dtype=np.float64)
 
 
 def _draw(
@@ -363,8 +362,8 @@ class IdealImage:
         self._middle = _middle_of_band(power)
         self._taps, self._denser = _filter_for(power, self._middle, stopband_db)
         middle = 0.0 if self._denser > 1 else self._middle
-        self._table = device.upload(_complex_taps(self._taps, stopband_db, middle))
-        self._kernel = device.kernel("sum_pixels", TAPS=self._taps, PHASES=_PHASES, GROUP=_GROUP)
+        self._filters = device.upload(_complex_taps(self._taps, stopband_db, middle))
+        self._kernel = device.kernel("sum_pixels", PHASES=_PHASES, GROUP=_GROUP, POINTS=_POINTS)
 
     def at(self, points_m: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the pixels at some points [points, 3], metres; complex128 [points]."""
@@ -403,15 +402,12 @@ class IdealImage:
         fraction = position - whole
         if self._denser == 1:
             cycles += self._middle * fraction
-        cycles -= np.floor(cycles)
-        return _Pairs(
-            samples=samples,
-            whole=whole,
-            fraction=fraction.astype(np.float32),
-            cycles=cycles.astype(np.float32),
-            factor=np.where(counts, weight, 0).astype(np.float32),
-            weight=weight,
-        )
+        cycles -= np.rint(cycles)
+        phase = (2 * np.pi * cycles).astype(np.float32)
+        factors = np.empty(phase.shape, np.complex64)
+        factors.real, factors.imag = np.cos(phase), np.sin(phase)
+        factors *= np.where(counts, weight, 0).astype(np.float32)
+        return _Pairs(samples, whole, fraction.astype(np.float32), factors, weight)
 
     def _summed(self, pairs: _Pairs) -> NDArray[np.complex128]:
         """Return the sums over the channels of pairs, [points]."""
@@ -421,15 +417,16 @@ class IdealImage:
         result = device.share(sums)
         device.run(
             self._kernel,
-            (points, len(sums)),
+            (-(-points // _POINTS), len(sums)),
             samples=device.share(pairs.samples),
             length=pairs.samples.shape[1],
-            taps=self._table,
+            filters=self._filters,
+            taps=self._taps,
             whole=device.share(pairs.whole),
             fraction=device.share(pairs.fraction),
-            cycles=device.share(pairs.cycles),
-            weight=device.share(pairs.factor),
+            factors=device.share(pairs.factors),
             channels=channels,
+            points=points,
             sums=result,
         )
         device.read(result, sums)
@@ -440,14 +437,13 @@ class IdealImage:
 class _Pairs:
     """Where channels receive from points, and how they add up; all but samples [channels, points].
 
-    `factor` is the weight, or 0 where the line does not reach the point.
+    Factors turn phases and weigh. They are 0 where a line does not reach a point.
     """
 
     samples: NDArray[np.complex64]
     whole: NDArray[np.int32]
     fraction: NDArray[np.float32]
-    cycles: NDArray[np.float32]
-    factor: NDArray[np.float32]
+    factors: NDArray[np.complex64]
     weight: NDArray[np.float64]
 
 
