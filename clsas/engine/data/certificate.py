@@ -69,7 +69,8 @@ class Certificate:
         object.__setattr__(self, "error_third", validate.number("error_third", self.error_third))
         if self.worst is not None:
             worst = validate.array("worst", self.worst, np.int64, (None, None))
-            worst_db = validate.array("worst_db", self.worst_db, np.float64, (len(worst),))
+            errors_db = np.zeros(0) if self.worst_db is None else self.worst_db
+            worst_db = validate.array("worst_db", errors_db, np.float64, (len(worst),))
             object.__setattr__(self, "worst", worst)
             object.__setattr__(self, "worst_db", worst_db)
 
