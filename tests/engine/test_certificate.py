@@ -247,6 +247,49 @@ def test_the_beam_is_that_of_the_image(speckle):
         clsas.certify(image, lines, beam=None)
 
 
+def test_an_image_that_is_dark_under_its_beam(speckle):
+    """Its error is relative to its own power, far below that of the lines."""
+    beam = clsas.BeamWindow(2.0, "hann", squint_deg=1.9, along=[1, 0, 0])
+    right = clsas.backproject(speckle.lines, speckle.grid, beam=beam, accuracy_db=-85)
+    assert np.abs(right.pixels).max() < 0.1 * np.abs(speckle.ideal).max()
+    image = clsas.Image(1.01 * right.pixels, speckle.grid, right.formed)
+    found = clsas.certify(image, speckle.lines, pixels=ALL)
+    assert found.error_db == pytest.approx(-40, abs=0.2)
+
+
+def test_a_single_pixel(speckle):
+    grid = clsas.Grid.points(speckle.grid.at(np.array([1000])))
+    image = clsas.Image(1.01 * speckle.ideal.reshape(-1)[[1000]], grid)
+    found = clsas.certify(image, speckle.lines)
+    assert (found.pixels, found.worst.tolist()) == (1, [[0]])
+    assert found.error_db == found.upper_db == pytest.approx(-40, abs=0.01)
+
+
+@pytest.mark.slow
+def test_a_million_channels():
+    """A Gaussian pulse from one point, on lines of few samples."""
+    channels, length, step_m, cycles_per_m = 10**6, 16, 0.01, 2 * 100e3 / 1500
+    tx_m = np.c_[np.linspace(-5, 5, channels), np.zeros((channels, 2))]
+    distance_m = np.hypot(tx_m[:, 0], 20.0)
+    first_m = distance_m - length / 2 * step_m
+
+    def pulse(late_m):
+        return np.exp(-((late_m / 0.025) ** 2))
+
+    samples = np.empty((channels, length), np.complex64)
+    for n in range(length):
+        samples[:, n] = pulse(first_m + n * step_m - distance_m)
+    samples *= np.exp(-2j * np.pi * np.mod(cycles_per_m * distance_m, 1))[:, None]
+    lines = clsas.RangeLines(samples, first_m, step_m, tx_m, tx_m, 100e3, 1500.0)
+    grid = clsas.Grid.plane((-0.01, 0.01, 2), (19.98, 20.02, 2))
+    ideal = np.empty(grid.shape, complex)
+    for index in np.ndindex(grid.shape):
+        late_m = np.linalg.norm(grid.positions_m()[index] - tx_m, axis=1) - distance_m
+        ideal[index] = (pulse(late_m) * np.exp(2j * np.pi * cycles_per_m * late_m)).sum()
+    found = clsas.certify(clsas.Image(1.001 * ideal, grid), lines)
+    assert found.error_db == pytest.approx(-60, abs=0.1)
+
+
 def test_parts_add_up_to_the_whole():
     rng = np.random.default_rng(0)
     parts = [
