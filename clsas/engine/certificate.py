@@ -354,7 +354,7 @@ class IdealImage:
         device: Device,
         points_m: NDArray[np.float64],
         random: np.random.Generator,
-        stopband_db: float,
+        stopband_db: float = _STOPBANDS_DB[1],
     ) -> None:
         self._lines, self._beam, self._device = lines, beam, device
         self._along = None if beam is None else beam.directions(lines)
