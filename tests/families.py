@@ -27,6 +27,7 @@ from clsas.engine.data.sound_speed import STEEPEST_PER_S, SoundSpeed
 from clsas.selftest import oracle
 
 SAMPLED = 70  # random pixels at which the ideal image is known, besides those around the points
+_AT_ONCE = 256  # which bounds memory
 AROUND = 6  # pixels around every point, besides the one where it is
 
 
@@ -175,8 +176,8 @@ class _Parts:
         return cls(*(each[rng.integers(len(each))] for each in choices))
 
 
-def draw(name: str, seed: int) -> Scene:
-    """Return a random scene of a family."""
+def draw(name: str, seed: int, sampled: int = SAMPLED) -> Scene:
+    """Return a random scene of a family, whose ideal image is known at `sampled` random pixels."""
     family = FAMILIES[name]
     rng = np.random.default_rng([seed, *name.encode()])  # families differ in what a seed draws
     parts = _Parts.of(rng, family)
@@ -203,16 +204,20 @@ def draw(name: str, seed: int) -> Scene:
         sampling.mixed * SPEED_M_S / 2, SPEED_M_S, channels.velocity_m_s,
         sound_speed=_profile(channels),
     )  # fmt: skip
-    some = rng.choice(len(pixels_m), min(SAMPLED, len(pixels_m)), replace=False)
+    some = rng.choice(len(pixels_m), min(sampled, len(pixels_m)), replace=False)
     some = np.unique(np.append(some, near))
     if beam is not None and beam.jumps:
         # Rounding decides whether a channel counts whose beam ends at a pixel.
         sine = channels.sines(pixels_m[some])[..., None]
         apart = np.abs(sine - beam.limits).min(axis=(0, 2))
         some = some[apart > ROUNDED_SINE] if (apart > ROUNDED_SINE).any() else some
-    values = echoes.received(channels.ranges_m(pixels_m[some]))
-    if beam is not None:
-        values *= weights(beam, channels.sines(pixels_m[some]))
+    ideal = np.zeros(len(some), np.complex128)
+    for first in range(0, len(some), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        values = echoes.received(channels.ranges_m(pixels_m[some[part]]))
+        if beam is not None:
+            values *= weights(beam, channels.sines(pixels_m[some[part]]))
+        ideal[part] = values.sum(axis=0)
     said = [
         *dataclasses.astuple(parts),
         f"band {fraction:.1%} of {carrier_hz / 1e3:.0f} kHz{', on carrier' * on_carrier}",
@@ -227,7 +232,7 @@ def draw(name: str, seed: int) -> Scene:
         said.append(f"beam {beam.width_deg:.0f} deg, squint {beam.squint_deg:.0f}")
         said.append("normalised" * beam.normalise)
     words = ", ".join(each for each in said if each and each not in _ORDINARY)
-    return Scene(words, lines, grid, beam, some, values.sum(axis=0))
+    return Scene(words, lines, grid, beam, some, ideal)
 
 
 _ORDINARY = ("monostatic", "at rest", "no beam", "equal gains", "one speed", "whole band")
