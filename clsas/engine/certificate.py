@@ -216,9 +216,9 @@ class Measurement:
         return len(self._drawn) == len(self._formed)
 
     def draw(self, count: int) -> None:
-        """Form `count` more pixels again, or all of them if the image has no more."""
+        """Form `count` more pixels again, or all of them if the image has no more in all."""
         started = time.perf_counter()
-        if count >= len(self._formed):
+        if len(self._drawn) + count >= len(self._formed):
             self._drawn, self._weight = np.arange(len(self._formed)), np.ones(len(self._formed))
             self._values, some = np.zeros(0, np.complex128), self._drawn
         else:
@@ -226,13 +226,17 @@ class Measurement:
             self._drawn = np.append(self._drawn, some)
             self._weight = np.append(self._weight, weight)
         different, of_different = np.unique(some, return_inverse=True)
-        points_m = self._image.grid.at(different)
+        self._values = np.append(self._values, self.ideal(different)[of_different])
+        self.seconds += time.perf_counter() - started
+
+    def ideal(self, numbers: NDArray[np.int64]) -> NDArray[np.complex128]:
+        """Return pixels of the ideal image, whose flat numbers are given."""
+        points_m = self._image.grid.at(numbers)
         if self._ideal is None:
             self._ideal = IdealImage(
                 self._lines, self._beam, self._device, points_m, self._random, self._stopband_db
             )
-        self._values = np.append(self._values, self._ideal.at(points_m)[of_different])
-        self.seconds += time.perf_counter() - started
+        return self._ideal.at(points_m)
 
     def certificate(self, *, scale: bool = False) -> Certificate:
         """Return the error measured at the pixels drawn so far."""

@@ -24,7 +24,7 @@ ON_MISS = Choice(
     "it, or end with an error.",
 )
 
-_FIRST, _MOST = 64, 1024  # pixels that are drawn at first, and in all
+FIRST, MOST = 64, 1024  # pixels that are drawn at first, and in all
 _LEAST_MORE = 16  # pixels for which another round is worth its overhead
 _SHARE, _LARGEST_SHARE = 0.03, 0.05  # of the time of an image
 
@@ -114,24 +114,35 @@ def measured(
     5 % of the time, or in any case if the image seems to miss.
     """
     measurement = Measurement(image, lines, _formed(image).beam, device, tolerance_db=tolerance_db)
-    measurement.draw(_FIRST)
-    first_s = measurement.seconds / _FIRST  # more than others take
+    measurement.draw(FIRST)
+    first_s = measurement.seconds / FIRST  # more than others take
 
-    def affordable(share: float) -> int:
-        return int((share * seconds - measurement.seconds) / first_s)
+    def affordable(share: float) -> float:
+        return (share * seconds - measurement.seconds) / first_s
 
-    more = min(affordable(_SHARE), PIXELS - _FIRST)
     while True:
-        if more >= _LEAST_MORE and not measurement.is_complete:
-            measurement.draw(more)
         found = measurement.certificate()
-        if tolerance_db is None or found.verdict(tolerance_db) != "undecided":
+        more = more_pixels(found, tolerance_db, affordable)
+        if not more or measurement.is_complete:
             return found
-        more = min(found.pixels, _MOST - found.pixels)
+        measurement.draw(more)
+
+
+def more_pixels(
+    found: Certificate, tolerance_db: float | None, affordable: Callable[[float], float]
+) -> int:
+    """Return how many more pixels to draw after those of a certificate, 0 if they are enough.
+
+    `affordable` returns how many more a share of the image's time pays for.
+    """
+    more = min(affordable(_SHARE), PIXELS - found.pixels)
+    if more < _LEAST_MORE:
+        if tolerance_db is None or found.verdict(tolerance_db) != "undecided":
+            return 0
+        more = min(found.pixels, MOST - found.pixels)
         if found.error_db <= tolerance_db:
             more = min(more, affordable(_LARGEST_SHARE))
-        if more < _LEAST_MORE or measurement.is_complete:
-            return found
+    return int(more) if more >= _LEAST_MORE else 0
 
 
 def _measured_if_possible(

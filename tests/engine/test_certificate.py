@@ -8,7 +8,9 @@ from families import draw
 from judging import SLOW
 
 import clsas
+from clsas.engine.certificate import Measurement
 from clsas.engine.data.certificate import of_parts
+from clsas.engine.device.device import open_device
 from clsas.selftest import extremes
 
 ALL = 10**6  # more pixels than any image here has
@@ -176,6 +178,18 @@ def test_all_pixels_leave_nothing_to_chance(speckle):
     assert found.upper_db == found.error_db
     assert (np.diff(found.worst_db) <= 0).all()
     assert np.abs(image.pixels[tuple(found.worst[0])]) == pytest.approx(np.abs(image.pixels).max())
+
+
+def test_more_draws_than_pixels_form_all_of_them(speckle):
+    image = clsas.Image(1.01 * speckle.ideal[0], clsas.Grid.points(speckle.grid.positions_m()[0]))
+    measurement = Measurement(image, speckle.lines, None, open_device())
+    measurement.draw(30)
+    assert measurement.certificate().upper_db > measurement.certificate().error_db
+    measurement.draw(30)
+    assert measurement.is_complete
+    found = measurement.certificate()
+    assert found.pixels == image.pixels.size
+    assert found.upper_db == found.error_db == pytest.approx(-40, abs=0.05)
 
 
 def test_seeds_repeat_draws(speckle):

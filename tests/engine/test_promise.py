@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from families import draw
 from judging import SLOW
 
 import clsas
 from clsas.engine import imaging
 from clsas.engine.device.device import open_device
-from clsas.engine.promise import kept
+from clsas.engine.promise import MOST, kept, more_pixels
 from clsas.selftest import extremes
 
 
@@ -112,6 +113,28 @@ def test_the_best_that_can_be_had_is_returned_with_one_warning(known, recwarn):
     assert "still misses it: error -" in str(warning.message)
 
 
+@pytest.mark.parametrize(
+    ("pixels", "tolerance_db", "affordable", "more"),
+    [
+        (64, None, 0, 0),
+        (64, None, 100, 100),
+        (64, None, 1000, 192),
+        (256, None, 1000, 0),
+        (64, -45, 1000, 192),  # though it is met
+        (64, -45, 10, 0),
+        (64, -49.5, 0, 0),  # undecided
+        (64, -50.5, 0, 64),  # undecided, and seems to miss
+        (256, -49.5, 100, 100),
+        (512, -50.5, 0, 512),
+        (MOST, -50.5, 1000, 0),
+        (64, -60, 0, 0),  # missed
+    ],
+)
+def test_more_pixels_are_drawn_while_they_may_decide(pixels, tolerance_db, affordable, more):
+    found = clsas.Certificate(pixels, 10**6, 0.1, 1.0, 1e-5, 4e-12, 0.0)
+    assert more_pixels(found, tolerance_db, lambda share: affordable) == more
+
+
 def test_images_without_a_tolerance_are_measured_when_asked(known, recwarn):
     stages = clsas.plan(known.lines, known.grid, stages=[(4, 4)])
     image = clsas.factorize(known.lines, known.grid, stages, certificate=True)
@@ -139,3 +162,18 @@ def test_wrong_requests_are_refused(known, asked, error, message):
         clsas.backproject(known.lines, known.grid, **asked)
     with pytest.raises(error, match=message):
         clsas.factorize(known.lines, known.grid, -40, **asked)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::clsas.ClsasWarning")
+@pytest.mark.parametrize(
+    ("family", "seed"), [("headings with beam", 8), ("moving", 28), ("bands", 25)]
+)
+def test_images_keep_their_tolerances(family, seed):
+    """By the certificates alone, which find the faults of scripts/faults.toml that name this."""
+    scene = draw(family, seed, sampled=0)
+    lines, grid, asked = scene.lines, scene.grid, {"certificate": True, "on_miss": "warn"}
+    plan = clsas.plan(lines, grid, tolerance_db=-50, beam=scene.beam, costs=SLOW)
+    exact = clsas.backproject(lines, grid, beam=scene.beam, accuracy_db=-70, **asked)
+    for image in (exact, clsas.factorize(lines, grid, plan, **asked)):
+        assert image.formed.certificate.verdict(image.formed.tolerance_db) == "met"
