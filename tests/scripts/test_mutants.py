@@ -1,6 +1,7 @@
 """Every fault of scripts/faults.toml can be planted."""
 
 import sys
+from dataclasses import replace
 from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
@@ -35,3 +36,5 @@ def test_what_is_likely_to_find_a_fault_runs_first(mutants):
     assert last == ("change", ["tests"])
     near = [tests for _, tests in mutants.runs(kernel, ROOT, None)]
     assert near[0][0] == "tests/imagers"
+    named = replace(kernel, by="tests/engine/test_promise.py::test_x")
+    assert list(mutants.runs(named, ROOT, before)) == [("change", [named.by])]
