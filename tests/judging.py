@@ -18,6 +18,7 @@ from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.image_error import relative_error_db
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.factorized.costs import Costs
 from clsas.engine.imaging import factorize, plan
 
@@ -42,7 +43,7 @@ SLOW = dataclasses.replace(
 class Formed:
     """One image: what was asked, predicted and measured, dB, or the exception it raised.
 
-    Below `floor_db` the measured error is not known.
+    Below `floor_db` the measured error is not known. `refusal` says why there is no certificate.
     """
 
     kind: str
@@ -51,6 +52,7 @@ class Formed:
     measured_db: float = 0.0
     certificate: Certificate | None = None
     floor_db: float = FLOOR_DB
+    refusal: str = ""
     warned: bool = False
     failure: str = ""
 
@@ -81,6 +83,7 @@ class Formed:
             f"{self.kind}: asked {self.asked_db:g} predicted {self.predicted_db:.1f} "
             f"measured {self.measured_db:.1f}{' (warned)' if self.warned else ''}"
             f"{f', by {self.certificate}' if self.disagrees else ''}"
+            f"{f', no certificate: {self.refusal}' if self.refusal else ''}"
         )
 
 
@@ -122,7 +125,8 @@ def _factorized(scene: Scene, asked_db: float, reference: Image | None, device) 
             )  # fmt: skip
             if chosen.is_exact:
                 return None
-            image = factorize(scene.lines, scene.grid, chosen, device=device)
+            # Certified, it would be formed again where the plan is wrong.
+            image = factorize(scene.lines, scene.grid, chosen, certificate=False, device=device)
         measured = _measured(scene, image, reference, asked_db)
         warned = _says_an_error(caught)
         return Formed("factorized", asked_db, chosen.predicted_error_db, *measured, warned)
@@ -132,29 +136,35 @@ def _factorized(scene: Scene, asked_db: float, reference: Image | None, device) 
 
 def _measured(
     scene: Scene, image: Image, reference: Image | None, asked_db: float
-) -> tuple[float, Certificate | None, float]:
+) -> tuple[float, Certificate | None, float, str]:
     """Return the error of an image, a certificate of the same pixels, and the floor of the error.
+
+    Where there can be no certificate, the last result says why.
 
     The sums judge the reference, and the reference judges other images at all pixels: at few of
     them one bright point may decide. The sums judge these too where the reference is no better.
     """
     if not np.isfinite(image.pixels).all():
-        return np.nan, None, FLOOR_DB
+        return np.nan, None, FLOOR_DB, ""
     if scene.is_dark:  # at all known pixels; elsewhere it may be anything
-        return asked_db, None, FLOOR_DB
+        return asked_db, None, FLOOR_DB, ""
     of_reference_db = np.inf if reference is None else scene.error_db(reference.pixels)
     if reference is not None and of_reference_db < asked_db - 10:
         floor_db = max(of_reference_db, REFERENCE_DB - 10.0) + REFERENCE_SLACK_DB
-        measured_db = relative_error_db(image, reference)
-        for pixels in (256, 4096):  # one bound in twenty is too low: measure again, more closely
+        measured_db, counts = relative_error_db(image, reference), (256, 4096)
+    else:
+        known = Grid.points(scene.grid.at(scene.pixels))
+        floor_db, measured_db = FLOOR_DB, scene.error_db(image.pixels)
+        image, counts = Image(image.pixels.ravel()[scene.pixels], known), (known.size,)
+    certificate = None
+    try:
+        for pixels in counts:  # one bound in twenty is too low: measure again, more closely
             certificate = certify(image, scene.lines, beam=scene.beam, pixels=pixels, seed=0)
             if measured_db <= certificate.upper_db + APART_DB:
                 break
-        return measured_db, certificate, floor_db
-    known = Grid.points(scene.grid.at(scene.pixels))
-    part = Image(image.pixels.ravel()[scene.pixels], known)
-    certificate = certify(part, scene.lines, beam=scene.beam, pixels=known.size)
-    return scene.error_db(image.pixels), certificate, FLOOR_DB
+    except ArgumentError as error:  # there are lines whose images have no errors
+        return measured_db, None, floor_db, str(error)
+    return measured_db, certificate, floor_db, ""
 
 
 def _says_an_error(caught: list[warnings.WarningMessage]) -> bool:
