@@ -41,7 +41,7 @@ WORST = 5
 _PIXELS_AT_ONCE = 1 << 12  # formed again together; these three bound memory
 _PAIRS_AT_ONCE = 1 << 15  # of pixels and channels
 _SAMPLES_AT_ONCE = 1 << 22  # of the lines in a block
-_POWERS_AT_ONCE = 1 << 10  # pixels whose power is summed together
+_SUMMED_AT_ONCE = 1 << 11  # pixels whose amplitude and power are summed together
 
 # Filters are sincs under a Kaiser window. They need the longer a window, the less they may leave,
 # and the narrower the guard band is. Interpolation between phases leaves -115 dB.
@@ -51,10 +51,10 @@ _DENSE_TAPS = 20  # enough for -120 dB if lines are twice as dense
 _STOPBANDS_DB = (70.0, 110.0)  # least and most
 _BELOW_TOLERANCE_DB = 25.0  # by which filters are better than an image may be
 _SLACK_DB = 5.0  # by which the error of a filter may exceed that of its stop band
-_GROUP, _POINTS = 16, 16  # channels that a work-item adds up in single precision, and points
+_GROUP = 16  # channels that a work-item adds up in single precision
 _PADDING = 64  # zeros at either end of a line that is made denser, beyond the reach of the taps
 
-_SPECTRA, _SPECTRUM_SAMPLES = 512, 256  # pieces of lines that show where the band lies
+_SPECTRA, _SPECTRUM_SAMPLES = 1024, 256  # pieces of lines that show where the band lies
 _OUTSIDE = (1e-6, 1e-4, 1e-3, 1e-2, 5e-2)  # shares of the power that may lie outside the band
 _WIDEST = 0.95  # width of a band beside which there is a guard band, cycles per sample
 _QUIET = 2.0  # by which the guard band must have less power than a mean band of its width
@@ -123,9 +123,10 @@ def certify(
     half a cycle per sample of the middle of the band that the lines occupy. It contributes only
     between its first and its last sample.
 
-    Half of the pixels are drawn uniformly, and half in proportion to their power. With q(x) the
-    mean of the two probabilities and N the number of pixels, |error|^2/(N q) is an unbiased
-    estimate of the mean error power, whether a few pixels are bright or all are speckle.
+    A quarter of the pixels is drawn uniformly, half in proportion to their amplitude, and a quarter
+    in proportion to their power. With q(x) the mean probability of a pixel and N the number of
+    pixels, |error|^2/(N q) is an unbiased estimate of the mean error power, whether a few pixels
+    are bright or all are speckle.
 
     A fault in a single pixel of a large image is usually not found.
 
@@ -201,7 +202,7 @@ class Measurement:
         self._image, self._lines, self._beam, self._device = image, lines, beam, device
         self._random = np.random.default_rng(seed)
         self._formed = image.pixels.reshape(-1)
-        self._until = _power_until(self._formed)
+        self._until = _sums_until(self._formed)
         self._ideal: IdealImage | None = None
         self._drawn = np.zeros(0, np.int64)
         self._weight = np.zeros(0)
@@ -247,7 +248,7 @@ class Measurement:
             ideal = ideal * ((weight * ideal.conj() * given).sum() / energy)
         error = _power(given - ideal)
         # The mean power of the ideal image differs little from that of the image, which is known.
-        known = self._until[-1] / size
+        known = float(self._until[1, -1]) / size
         power = known + float((weight * (_power(ideal) - _power(given))).mean())
         if not power > known / 4:  # far from ideal, so that the difference says nothing
             power = float((weight * _power(ideal)).mean())
@@ -287,17 +288,24 @@ def _check(image: Image, lines: RangeLines, beam: BeamWindow | None) -> None:
         check_reaches(lines.sound_speed, [each[2] for each in image.grid.bounds_m], "pixels")
 
 
-def _power_until(formed: NDArray[np.complex64]) -> NDArray[np.float64]:
-    """Return the power of all pixels up to the end of each block of `_POWERS_AT_ONCE`."""
-    parts = np.ascontiguousarray(formed).view(np.float32)
-    step = 2 * _POWERS_AT_ONCE
-    whole = parts[: len(parts) // step * step].reshape(-1, step)
-    rest = parts[whole.size :][None]
+def _sums_until(formed: NDArray[np.complex64]) -> NDArray[np.float64]:
+    """Return amplitude and power of all pixels up to the end of each block, [2, blocks]."""
+
+    def until(pixels: NDArray[np.complex64]) -> NDArray[np.float64]:
+        sums = []
+        for first in range(0, len(pixels), _SUMMED_AT_ONCE):
+            block = np.ascontiguousarray(pixels[first : first + _SUMMED_AT_ONCE])
+            parts = block.view(np.float32)
+            sums.append((float(np.abs(block).sum(dtype=np.float64)), float(parts @ parts)))
+        return np.cumsum(sums, axis=0).T
+
     with np.errstate(over="ignore"):
-        power = np.append(*(np.einsum("bn,bn->b", each, each) for each in (whole, rest)))
-    if not 1e-20 < power.sum() < 1e38:  # squares may over- or underflow
-        power = np.append(*((each.astype(np.float64) ** 2).sum(axis=1) for each in (whole, rest)))
-    return np.cumsum(power, dtype=np.float64)
+        found = until(formed)
+    if 1e-20 < found[1, -1] < math.inf:
+        return found
+    largest = max(np.abs(formed.real).max(), np.abs(formed.imag).max()) or np.float32(1)
+    scale = float(largest)  # squares over- or underflow
+    return until(formed / largest) * [[scale], [scale**2]]
 
 
 def _draw(
@@ -308,27 +316,29 @@ def _draw(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the numbers of the pixels drawn, and their weights 1/(N q).
 
-    Both halves are stratified: each draw has an equal part of all pixels, or of all power, of its
-    own.
+    Draws are stratified: each has an equal part of all pixels, or of all amplitude, or of all
+    power, of its own.
     """
-    size, total = len(formed), float(until[-1])
-    by_power = count // 2 if total else 0
-    uniform = count - by_power
-    drawn = np.empty(count, np.int64)
-    drawn[:uniform] = (np.arange(uniform) + random.random(uniform)) * (size / uniform)
-    wanted = (np.arange(by_power) + random.random(by_power)) * (total / max(by_power, 1))
-    part = np.minimum(np.searchsorted(until, wanted, side="right"), len(until) - 1)
-    for number in np.unique(part):
-        first, here = number * _POWERS_AT_ONCE, part == number
-        sums = np.cumsum(_power(formed[first : first + _POWERS_AT_ONCE]))
-        sums += until[number] - sums[-1]
-        index = np.searchsorted(sums, wanted[here], side="right")
-        drawn[uniform:][here] = first + np.minimum(index, len(sums) - 1)
-    np.minimum(drawn, size - 1, out=drawn)
+    size = len(formed)
+    counts = (count // 2, count // 4) if until[1, -1] else (0, 0)
+    uniform = count - sum(counts)
+    drawn = [((np.arange(uniform) + random.random(uniform)) * (size / uniform)).astype(np.int64)]
+    for order, (number, sums_until) in enumerate(zip(counts, until, strict=True), start=1):
+        wanted = (np.arange(number) + random.random(number)) * (sums_until[-1] / max(number, 1))
+        part = np.minimum(np.searchsorted(sums_until, wanted, side="right"), len(sums_until) - 1)
+        for block in np.unique(part):
+            first = block * _SUMMED_AT_ONCE
+            sums = np.cumsum(_amplitude(formed[first : first + _SUMMED_AT_ONCE], order))
+            sums += sums_until[block] - sums[-1]
+            index = np.searchsorted(sums, wanted[part == block], side="right")
+            drawn.append(first + np.minimum(index, len(sums) - 1))
+    some = np.minimum(np.concatenate(drawn), size - 1)
 
-    share = uniform / count
-    of_power = _power(formed[drawn]) * (size / total) if total else np.zeros(count)
-    return drawn, 1 / (share + (1 - share) * of_power)
+    density = np.full(count, uniform / count)
+    for order, (number, sums_until) in enumerate(zip(counts, until, strict=True), start=1):
+        if number:
+            density += number / count * _amplitude(formed[some], order) * (size / sums_until[-1])
+    return some, 1 / density
 
 
 class IdealImage:
@@ -358,7 +368,7 @@ class IdealImage:
         device: Device,
         points_m: NDArray[np.float64],
         random: np.random.Generator,
-        stopband_db: float = _STOPBANDS_DB[1],
+        stopband_db: float,
     ) -> None:
         self._lines, self._beam, self._device = lines, beam, device
         self._along = None if beam is None else beam.directions(lines)
@@ -366,8 +376,8 @@ class IdealImage:
         self._middle = _middle_of_band(power)
         self._taps, self._denser = _filter_for(power, self._middle, stopband_db)
         middle = 0.0 if self._denser > 1 else self._middle
-        self._filters = device.upload(_complex_taps(self._taps, stopband_db, middle))
-        self._kernel = device.kernel("sum_pixels", PHASES=_PHASES, GROUP=_GROUP, POINTS=_POINTS)
+        self._table = device.upload(_complex_taps(self._taps, stopband_db, middle))
+        self._kernel = device.kernel("sum_pixels", TAPS=self._taps, PHASES=_PHASES, GROUP=_GROUP)
 
     def at(self, points_m: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the pixels at some points [points, 3], metres; complex128 [points]."""
@@ -406,12 +416,15 @@ class IdealImage:
         fraction = position - whole
         if self._denser == 1:
             cycles += self._middle * fraction
-        cycles -= np.rint(cycles)
-        phase = (2 * np.pi * cycles).astype(np.float32)
-        factors = np.empty(phase.shape, np.complex64)
-        factors.real, factors.imag = np.cos(phase), np.sin(phase)
-        factors *= np.where(counts, weight, 0).astype(np.float32)
-        return _Pairs(samples, whole, fraction.astype(np.float32), factors, weight)
+        cycles -= np.floor(cycles)
+        return _Pairs(
+            samples=samples,
+            whole=whole,
+            fraction=fraction.astype(np.float32),
+            cycles=cycles.astype(np.float32),
+            factor=np.where(counts, weight, 0).astype(np.float32),
+            weight=weight,
+        )
 
     def _summed(self, pairs: _Pairs) -> NDArray[np.complex128]:
         """Return the sums over the channels of pairs, [points]."""
@@ -421,16 +434,15 @@ class IdealImage:
         result = device.share(sums)
         device.run(
             self._kernel,
-            (-(-points // _POINTS), len(sums)),
+            (points, len(sums)),
             samples=device.share(pairs.samples),
             length=pairs.samples.shape[1],
-            filters=self._filters,
-            taps=self._taps,
+            taps=self._table,
             whole=device.share(pairs.whole),
             fraction=device.share(pairs.fraction),
-            factors=device.share(pairs.factors),
+            cycles=device.share(pairs.cycles),
+            weight=device.share(pairs.factor),
             channels=channels,
-            points=points,
             sums=result,
         )
         device.read(result, sums)
@@ -441,13 +453,14 @@ class IdealImage:
 class _Pairs:
     """Where channels receive from points, and how they add up; all but samples [channels, points].
 
-    Factors turn phases and weigh. They are 0 where a line does not reach a point.
+    `factor` is the weight, or 0 where the line does not reach the point.
     """
 
     samples: NDArray[np.complex64]
     whole: NDArray[np.int32]
     fraction: NDArray[np.float32]
-    factors: NDArray[np.complex64]
+    cycles: NDArray[np.float32]
+    factor: NDArray[np.float32]
     weight: NDArray[np.float64]
 
 
@@ -645,6 +658,11 @@ def _complex_taps(taps: int, stopband_db: float, middle: float) -> NDArray[np.fl
     filters = _taps(taps, stopband_db) * turns
     parts = np.stack([filters.real, filters.imag], axis=1).astype(np.float32)
     return np.repeat(parts[..., None], 2, axis=-1)
+
+
+def _amplitude(values: NDArray, order: int) -> NDArray[np.float64]:
+    """Return amplitudes, or of order 2 their squares."""
+    return np.sqrt(_power(values)) if order == 1 else _power(values)
 
 
 def _power(values: NDArray) -> NDArray[np.float64]:

@@ -36,8 +36,8 @@ def optimist(known):
 def test_images_say_how_wrong_they_are(form, known):
     image = form(known, certificate=True)
     found = image.formed.certificate
-    assert found.lower_db <= known.error_db(image.pixels) + 0.5
-    assert found.upper_db >= known.error_db(image.pixels) - 0.5
+    assert found.lower_db <= known.error_db(image.pixels) + 1.5
+    assert found.upper_db >= known.error_db(image.pixels) - 1.5
     assert found.describe() in image.formed.describe()
     assert form(known, certificate=False).formed.certificate is None
 
