@@ -362,15 +362,16 @@ def bounded(shares: Shares, where: str, column: str, each: Certificate) -> None:
 def odds() -> list[list[str]]:
     """Return rows of the odds that a single wrong pixel of a large image is drawn.
 
-    It adds its own power to the image's, by which half of the pixels are drawn.
+    It adds to the power and amplitude by which pixels are drawn; the others have equal power.
     """
-    rows = []
+    found = []
     for wrong_db in WRONG_DB:
-        power = 10 ** (wrong_db / 10)
-        share = (1 / OF_PIXELS + power / (OF_PIXELS - 1 + power)) / 2
-        cells = [f"{100 * min(count * share, 1):.3g}" for count in FIXED]
-        rows.append([f"one wrong pixel of 10⁶ is drawn, {wrong_db:+g} dB", *cells, "", ""])
-    return rows
+        amplitude, others = 10 ** (wrong_db / 20), OF_PIXELS - 1
+        by_power = amplitude**2 / (others + amplitude**2)
+        share = (1 / OF_PIXELS + 2 * amplitude / (others + amplitude) + by_power) / 4
+        cells = [f"{float(f'{100 * min(count * share, 1):.2g}'):g}" for count in FIXED]
+        found.append([f"one wrong pixel of 10⁶ is drawn, {wrong_db:+g} dB", *cells, "", ""])
+    return found
 
 
 def drawn(images: list[Judged], shares: Shares) -> Figure:
@@ -396,8 +397,8 @@ def drawn(images: list[Judged], shares: Shares) -> Figure:
     for column, style, label in (
         ("64 pixels", ":", "64 pixels"),
         ("256 pixels", "--", "256 pixels"),
-        ("64 to 1024", "-.", "64 to 1024 pixels, as of fast images"),
-        ("256 to 1024", "-", "256 to 1024 pixels, as of slow images"),
+        ("64 to 1024", "-.", "64 to 1024, fast images"),
+        ("256 to 1024", "-", "256 to 1024, slow images"),
     ):
         called = [100 * shares.of(called_missed(each), column) for each in EXCESS_DB]
         right.plot(EXCESS_DB, called, style, label=label)
