@@ -41,7 +41,8 @@ WORST = 5
 _PIXELS_AT_ONCE = 1 << 12  # formed again together; these three bound memory
 _PAIRS_AT_ONCE = 1 << 15  # of pixels and channels
 _SAMPLES_AT_ONCE = 1 << 22  # of the lines in a block
-_SUMMED_AT_ONCE = 1 << 11  # pixels whose amplitude and power are summed together
+_BLOCK = 1 << 10  # pixels whose power is summed together
+_DRAWN_AT_ONCE = 1 << 11  # bounds memory for the blocks of the pixels drawn
 
 # Filters are sincs under a Kaiser window. They need the longer a window, the less they may leave,
 # and the narrower the guard band is. Interpolation between phases leaves -115 dB.
@@ -51,10 +52,10 @@ _DENSE_TAPS = 20  # enough for -120 dB if lines are twice as dense
 _STOPBANDS_DB = (70.0, 110.0)  # least and most
 _BELOW_TOLERANCE_DB = 25.0  # by which filters are better than an image may be
 _SLACK_DB = 5.0  # by which the error of a filter may exceed that of its stop band
-_GROUP = 16  # channels that a work-item adds up in single precision
+_GROUP, _POINTS = 16, 16  # channels that a work-item adds up in single precision, and points
 _PADDING = 64  # zeros at either end of a line that is made denser, beyond the reach of the taps
 
-_SPECTRA, _SPECTRUM_SAMPLES = 1024, 256  # pieces of lines that show where the band lies
+_SPECTRA, _SPECTRUM_SAMPLES = 512, 256  # pieces of lines that show where the band lies
 _OUTSIDE = (1e-6, 1e-4, 1e-3, 1e-2, 5e-2)  # shares of the power that may lie outside the band
 _WIDEST = 0.95  # width of a band beside which there is a guard band, cycles per sample
 _QUIET = 2.0  # by which the guard band must have less power than a mean band of its width
@@ -123,9 +124,9 @@ def certify(
     half a cycle per sample of the middle of the band that the lines occupy. It contributes only
     between its first and its last sample.
 
-    A quarter of the pixels is drawn uniformly, half in proportion to their amplitude, and a quarter
-    in proportion to their power. With q(x) the mean probability of a pixel and N the number of
-    pixels, |error|^2/(N q) is an unbiased estimate of the mean error power, whether a few pixels
+    A quarter of the pixels is drawn uniformly, half about in proportion to their amplitude, and a
+    quarter in proportion to their power. With q(x) the mean probability of a pixel and N the number
+    of pixels, |error|^2/(N q) is an unbiased estimate of the mean error power, whether a few pixels
     are bright or all are speckle.
 
     A fault in a single pixel of a large image is usually not found.
@@ -202,7 +203,7 @@ class Measurement:
         self._image, self._lines, self._beam, self._device = image, lines, beam, device
         self._random = np.random.default_rng(seed)
         self._formed = image.pixels.reshape(-1)
-        self._until = _sums_until(self._formed)
+        self._power = _power_of_blocks(self._formed)
         self._ideal: IdealImage | None = None
         self._drawn = np.zeros(0, np.int64)
         self._weight = np.zeros(0)
@@ -223,7 +224,11 @@ class Measurement:
             self._drawn, self._weight = np.arange(len(self._formed)), np.ones(len(self._formed))
             self._values, some = np.zeros(0, np.complex128), self._drawn
         else:
-            some, weight = _draw(self._formed, self._until, count, self._random)
+            rounds = [
+                _draw(self._formed, self._power, min(_DRAWN_AT_ONCE, count - first), self._random)
+                for first in range(0, count, _DRAWN_AT_ONCE)
+            ]
+            some, weight = (np.concatenate(each) for each in zip(*rounds, strict=True))
             self._drawn = np.append(self._drawn, some)
             self._weight = np.append(self._weight, weight)
         different, of_different = np.unique(some, return_inverse=True)
@@ -248,7 +253,7 @@ class Measurement:
             ideal = ideal * ((weight * ideal.conj() * given).sum() / energy)
         error = _power(given - ideal)
         # The mean power of the ideal image differs little from that of the image, which is known.
-        known = float(self._until[1, -1]) / size
+        known = float(self._power.sum()) / size
         power = known + float((weight * (_power(ideal) - _power(given))).mean())
         if not power > known / 4:  # far from ideal, so that the difference says nothing
             power = float((weight * _power(ideal)).mean())
@@ -288,57 +293,65 @@ def _check(image: Image, lines: RangeLines, beam: BeamWindow | None) -> None:
         check_reaches(lines.sound_speed, [each[2] for each in image.grid.bounds_m], "pixels")
 
 
-def _sums_until(formed: NDArray[np.complex64]) -> NDArray[np.float64]:
-    """Return amplitude and power of all pixels up to the end of each block, [2, blocks]."""
-
-    def until(pixels: NDArray[np.complex64]) -> NDArray[np.float64]:
-        sums = []
-        for first in range(0, len(pixels), _SUMMED_AT_ONCE):
-            block = np.ascontiguousarray(pixels[first : first + _SUMMED_AT_ONCE])
-            parts = block.view(np.float32)
-            sums.append((float(np.abs(block).sum(dtype=np.float64)), float(parts @ parts)))
-        return np.cumsum(sums, axis=0).T
-
+def _power_of_blocks(formed: NDArray[np.complex64]) -> NDArray[np.float64]:
+    """Return the power of all pixels of every block of `_BLOCK`."""
+    parts = np.ascontiguousarray(formed).view(np.float32)
+    whole = parts[: len(parts) // (2 * _BLOCK) * 2 * _BLOCK].reshape(-1, 2 * _BLOCK)
+    pieces = [whole, parts[whole.size :][None]] if whole.size < len(parts) else [whole]
     with np.errstate(over="ignore"):
-        found = until(formed)
-    if 1e-20 < found[1, -1] < math.inf:
-        return found
-    largest = max(np.abs(formed.real).max(), np.abs(formed.imag).max()) or np.float32(1)
-    scale = float(largest)  # squares over- or underflow
-    return until(formed / largest) * [[scale], [scale**2]]
+        power = np.concatenate([np.einsum("bn,bn->b", each, each) for each in pieces])
+    if not 1e-20 < power.sum() < 1e38:  # squares may over- or underflow
+        power = np.concatenate([(each.astype(np.float64) ** 2).sum(axis=1) for each in pieces])
+    return power.astype(np.float64)
 
 
 def _draw(
     formed: NDArray[np.complex64],
-    until: NDArray[np.float64],
+    power: NDArray[np.float64],
     count: int,
     random: np.random.Generator,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the numbers of the pixels drawn, and their weights 1/(N q).
 
-    Draws are stratified: each has an equal part of all pixels, or of all amplitude, or of all
-    power, of its own.
+    A block is drawn by the amplitude that its pixels would have if all were equally bright, or by
+    its power, and then a pixel of it by its amplitude or power. Draws are stratified: each has an
+    equal part of all pixels, or of all amplitude or power, of its own.
     """
     size = len(formed)
-    counts = (count // 2, count // 4) if until[1, -1] else (0, 0)
+    length = np.minimum(_BLOCK, size - _BLOCK * np.arange(len(power)))
+    of_block = (np.sqrt(length * power), power)
+    counts = (count // 2, count // 4) if power.any() else (0, 0)
     uniform = count - sum(counts)
-    drawn = [((np.arange(uniform) + random.random(uniform)) * (size / uniform)).astype(np.int64)]
-    for order, (number, sums_until) in enumerate(zip(counts, until, strict=True), start=1):
-        wanted = (np.arange(number) + random.random(number)) * (sums_until[-1] / max(number, 1))
-        part = np.minimum(np.searchsorted(sums_until, wanted, side="right"), len(sums_until) - 1)
-        for block in np.unique(part):
-            first = block * _SUMMED_AT_ONCE
-            sums = np.cumsum(_amplitude(formed[first : first + _SUMMED_AT_ONCE], order))
-            sums += sums_until[block] - sums[-1]
-            index = np.searchsorted(sums, wanted[part == block], side="right")
-            drawn.append(first + np.minimum(index, len(sums) - 1))
+    drawn = [(_stratified(uniform, random) * size).astype(np.int64)]
+    for order, (number, weights) in enumerate(zip(counts, of_block, strict=True), start=1):
+        until = np.cumsum(weights)
+        wanted = _stratified(number, random) * until[-1]
+        block = np.minimum(np.searchsorted(until, wanted, side="right"), len(power) - 1)
+        left = (until[block] - wanted) / np.maximum(weights[block], 1e-300)
+        sums = np.cumsum(_amplitudes(formed, block) ** order, axis=1)
+        index = (sums <= (1 - left)[:, None] * sums[:, -1:]).sum(axis=1)
+        drawn.append(block * _BLOCK + np.minimum(index, _BLOCK - 1))
     some = np.minimum(np.concatenate(drawn), size - 1)
 
-    density = np.full(count, uniform / count)
-    for order, (number, sums_until) in enumerate(zip(counts, until, strict=True), start=1):
+    density, block = np.full(count, uniform / count), some // _BLOCK
+    amplitude, amplitudes = np.abs(formed[some]).astype(np.float64), _amplitudes(formed, block)
+    for order, (number, weights) in enumerate(zip(counts, of_block, strict=True), start=1):
         if number:
-            density += number / count * _amplitude(formed[some], order) * (size / sums_until[-1])
+            per_pixel = weights[block] / (amplitudes**order).sum(axis=1).clip(1e-300)
+            density += number / count * amplitude**order * per_pixel * (size / weights.sum())
     return some, 1 / density
+
+
+def _stratified(count: int, random: np.random.Generator) -> NDArray[np.float64]:
+    """Return numbers from 0 to 1, one in each of `count` equal intervals."""
+    return (np.arange(count) + random.random(count)) / max(count, 1)
+
+
+def _amplitudes(formed: NDArray[np.complex64], blocks: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the amplitudes of the pixels of some blocks, 0 beyond the last pixel."""
+    index = blocks[:, None] * _BLOCK + np.arange(_BLOCK)
+    amplitude = np.abs(formed[np.minimum(index, len(formed) - 1)]).astype(np.float64)
+    return np.where(index < len(formed), amplitude, 0.0)
 
 
 class IdealImage:
@@ -368,7 +381,7 @@ class IdealImage:
         device: Device,
         points_m: NDArray[np.float64],
         random: np.random.Generator,
-        stopband_db: float,
+        stopband_db: float = _STOPBANDS_DB[1],
     ) -> None:
         self._lines, self._beam, self._device = lines, beam, device
         self._along = None if beam is None else beam.directions(lines)
@@ -376,8 +389,8 @@ class IdealImage:
         self._middle = _middle_of_band(power)
         self._taps, self._denser = _filter_for(power, self._middle, stopband_db)
         middle = 0.0 if self._denser > 1 else self._middle
-        self._table = device.upload(_complex_taps(self._taps, stopband_db, middle))
-        self._kernel = device.kernel("sum_pixels", TAPS=self._taps, PHASES=_PHASES, GROUP=_GROUP)
+        self._filters = device.upload(_complex_taps(self._taps, stopband_db, middle))
+        self._kernel = device.kernel("sum_pixels", PHASES=_PHASES, GROUP=_GROUP, POINTS=_POINTS)
 
     def at(self, points_m: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the pixels at some points [points, 3], metres; complex128 [points]."""
@@ -416,15 +429,12 @@ class IdealImage:
         fraction = position - whole
         if self._denser == 1:
             cycles += self._middle * fraction
-        cycles -= np.floor(cycles)
-        return _Pairs(
-            samples=samples,
-            whole=whole,
-            fraction=fraction.astype(np.float32),
-            cycles=cycles.astype(np.float32),
-            factor=np.where(counts, weight, 0).astype(np.float32),
-            weight=weight,
-        )
+        cycles -= np.rint(cycles)
+        phase = (2 * np.pi * cycles).astype(np.float32)
+        factors = np.empty(phase.shape, np.complex64)
+        factors.real, factors.imag = np.cos(phase), np.sin(phase)
+        factors *= np.where(counts, weight, 0).astype(np.float32)
+        return _Pairs(samples, whole, fraction.astype(np.float32), factors, weight)
 
     def _summed(self, pairs: _Pairs) -> NDArray[np.complex128]:
         """Return the sums over the channels of pairs, [points]."""
@@ -434,15 +444,16 @@ class IdealImage:
         result = device.share(sums)
         device.run(
             self._kernel,
-            (points, len(sums)),
+            (-(-points // _POINTS), len(sums)),
             samples=device.share(pairs.samples),
             length=pairs.samples.shape[1],
-            taps=self._table,
+            filters=self._filters,
+            taps=self._taps,
             whole=device.share(pairs.whole),
             fraction=device.share(pairs.fraction),
-            cycles=device.share(pairs.cycles),
-            weight=device.share(pairs.factor),
+            factors=device.share(pairs.factors),
             channels=channels,
+            points=points,
             sums=result,
         )
         device.read(result, sums)
@@ -453,14 +464,13 @@ class IdealImage:
 class _Pairs:
     """Where channels receive from points, and how they add up; all but samples [channels, points].
 
-    `factor` is the weight, or 0 where the line does not reach the point.
+    Factors turn phases and weigh. They are 0 where a line does not reach a point.
     """
 
     samples: NDArray[np.complex64]
     whole: NDArray[np.int32]
     fraction: NDArray[np.float32]
-    cycles: NDArray[np.float32]
-    factor: NDArray[np.float32]
+    factors: NDArray[np.complex64]
     weight: NDArray[np.float64]
 
 
@@ -658,11 +668,6 @@ def _complex_taps(taps: int, stopband_db: float, middle: float) -> NDArray[np.fl
     filters = _taps(taps, stopband_db) * turns
     parts = np.stack([filters.real, filters.imag], axis=1).astype(np.float32)
     return np.repeat(parts[..., None], 2, axis=-1)
-
-
-def _amplitude(values: NDArray, order: int) -> NDArray[np.float64]:
-    """Return amplitudes, or of order 2 their squares."""
-    return np.sqrt(_power(values)) if order == 1 else _power(values)
 
 
 def _power(values: NDArray) -> NDArray[np.float64]:
