@@ -30,7 +30,7 @@ from clsas.engine.factorized.costs import Costs
 from clsas.engine.factorized.plan import ExactImage, Plan
 from clsas.engine.factorized.planner import BEST_TOLERANCE_DB, TOLERANCE, Request, planned
 from clsas.engine.forming import Progress, SceneImager, form, scene_of_plan
-from clsas.engine.promise import CERTIFICATE, LEAST_SECONDS, ON_MISS, FormAgain, kept
+from clsas.engine.promise import CERTIFICATE, ON_MISS, FormAgain, is_wanted, kept
 from clsas.engine.scene import Scene
 from clsas.engine.signal.spectrum import (
     FEW_CHANNELS,
@@ -740,15 +740,11 @@ def _kept(
     certificate: bool | None,
     on_miss: str,
 ) -> Image:
-    """Return an image that was just formed, with its certificate if it is to have one.
-
-    It was begun at the time `started`. Without a request, it is certified `by_default` if it took
-    long enough.
-    """
+    """Return an image that was begun at a time, with its certificate if it is to have one."""
     seconds = time.perf_counter() - started
-    if certificate is None:
-        certificate = by_default and seconds >= LEAST_SECONDS
-    return kept(image, lines, device, seconds, on_miss, again) if certificate else image
+    if not is_wanted(certificate, seconds, by_default=by_default):
+        return image
+    return kept(image, lines, device, seconds, on_miss, again)
 
 
 def check_accumulate(image: Image, grid: Grid, beam: BeamWindow | None) -> None:

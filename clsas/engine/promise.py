@@ -50,6 +50,14 @@ class ToleranceError(RuntimeError):
         return f"the image misses its tolerance: {self.certificate.describe(self.tolerance_db)}"
 
 
+def is_wanted(certificate: bool | None, seconds: float, *, by_default: bool = True) -> bool:
+    """Return whether an image that took some time is certified.
+
+    Without a request, it is certified `by_default` if it took long enough.
+    """
+    return by_default and seconds >= LEAST_SECONDS if certificate is None else certificate
+
+
 def kept(
     image: Image,
     lines: RangeLines,
@@ -84,7 +92,7 @@ def kept(
         If the error cannot be measured, or the image misses its tolerance.
     """
     tolerance_db = _formed(image).tolerance_db
-    certificate = _measured_if_possible(image, lines, device, seconds, tolerance_db)
+    certificate = measured_if_possible(image, lines, device, seconds, tolerance_db)
     misses: list[str] = []
     for form_again in again if on_miss == "refine" else ():
         if certificate is None or tolerance_db is None:
@@ -93,14 +101,12 @@ def kept(
             break
         misses.append(f"{_formed(image).prediction}, {certificate.describe()}")
         image = form_again(2 * tolerance_db - certificate.error_db)
-        certificate = _measured_if_possible(image, lines, device, seconds, tolerance_db)
+        certificate = measured_if_possible(image, lines, device, seconds, tolerance_db)
     formed = replace(
         _formed(image), tolerance_db=tolerance_db, certificate=certificate, misses=tuple(misses)
     )
     if certificate is not None and tolerance_db is not None:
-        if certificate.verdict(tolerance_db) == "missed" and on_miss == "raise":
-            raise ToleranceError(certificate, tolerance_db)
-        _warn(formed, certificate, tolerance_db)
+        report(certificate, tolerance_db, on_miss, misses, formed.plan)
     return Image(image.pixels, image.grid, formed)
 
 
@@ -145,7 +151,7 @@ def more_pixels(
     return int(more) if more >= _LEAST_MORE else 0
 
 
-def _measured_if_possible(
+def measured_if_possible(
     image: Image, lines: RangeLines, device: Device, seconds: float, tolerance_db: float | None
 ) -> Certificate | None:
     """Return the error of an image, or None with a warning if it cannot be measured."""
@@ -157,21 +163,40 @@ def _measured_if_possible(
         return None
 
 
+def report(
+    certificate: Certificate,
+    tolerance_db: float,
+    on_miss: str,
+    misses: Sequence[str] = (),
+    how: str = "",
+) -> None:
+    """Raise an error or warn if an image misses its tolerance, or did before it was formed again.
+
+    Parameters
+    ----------
+    certificate : Certificate
+    tolerance_db : float
+    on_miss : {"refine", "warn", "raise"}
+    misses : sequence of str
+        What former images missed the tolerance by.
+    how : str
+        How the image was formed again, if it was.
+    """
+    is_missed = certificate.verdict(tolerance_db) == "missed"
+    if is_missed and on_miss == "raise":
+        raise ToleranceError(certificate, tolerance_db)
+    now, tolerance = certificate.describe(), f"its tolerance of {tolerance_db:g} dB"
+    if misses:
+        result = "still misses it" if is_missed else "keeps it"
+        validate.warn(
+            f"the image missed {tolerance} ({'; then '.join(misses)}), was formed again ({how}), "
+            f"and {result}: {now}"
+        )
+    elif is_missed:
+        validate.warn(f"the image misses {tolerance}: {now}")
+
+
 def _formed(image: Image) -> Formed:
     """Return how an image was formed, which all imagers state."""
     assert image.formed is not None
     return image.formed
-
-
-def _warn(formed: Formed, certificate: Certificate, tolerance_db: float) -> None:
-    """Warn if an image missed its tolerance, and say what was done about it."""
-    is_missed = certificate.verdict(tolerance_db) == "missed"
-    now, tolerance = certificate.describe(), f"its tolerance of {tolerance_db:g} dB"
-    if formed.misses:
-        result = "still misses it" if is_missed else "keeps it"
-        validate.warn(
-            f"the image missed {tolerance} ({'; then '.join(formed.misses)}), was formed again "
-            f"({formed.plan}), and {result}: {now}"
-        )
-    elif is_missed:
-        validate.warn(f"the image misses {tolerance}: {now}")

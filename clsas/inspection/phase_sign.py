@@ -99,7 +99,9 @@ def phase_sign(
         sharpness = []
         for each in (part, replace(part, samples=part.samples.conj())):
             with validate.muted():  # about accuracy, which is not needed here
-                image = backproject(each, patch, device=device, accuracy_db=_ACCURACY_DB)
+                image = backproject(
+                    each, patch, device=device, accuracy_db=_ACCURACY_DB, certificate=False
+                )
             # Row by row, that is along the track: echoes confined to a few ranges do not count as
             # sharp, since blurred ones are too.
             amplitude = np.abs(image.pixels)

@@ -25,6 +25,7 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.factorized.planner import TOLERANCE
+from clsas.engine.promise import report
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.interferometry.baseline import Baseline, Lattice, sight_lattice
 from clsas.interferometry.checks import (
@@ -104,8 +105,9 @@ def heights(
         Side of the windows in which the coherence is estimated, metres. It is the resolution of the
         heights. By default windows contain about 50 independent samples.
     tolerance_db : float
-        Largest relative rms error of the images on the relief, dB, as for `factorize`. Images of
-        the sweep may have an error of -30 dB.
+        Largest relative rms error of the images on the relief, dB, as for `factorize`. The error
+        of those of the last pass is measured if they take 0.1 s or more; a warning appears if it
+        exceeds the tolerance. Images of the sweep may have an error of -30 dB.
     least_coherence : float
         Smallest coherence of a valid height, 0.1 to 0.99.
     beam : BeamWindow, optional
@@ -136,8 +138,8 @@ def heights(
     ClsasWarning
         If the search spans several heights of ambiguity and the grid is too small to tell them
         apart; if the banks agree best at an end of the search, so that the seabed seems to lie
-        outside; if less than a hundredth of the pixels is coherent; or if the corrections do not
-        fall below the deviation.
+        outside; if less than a hundredth of the pixels is coherent; if the corrections do not
+        fall below the deviation; or if an image of the last pass misses its tolerance.
 
     See Also
     --------
@@ -235,6 +237,8 @@ def measure(
     found = measured(pair, grid, request, progress)
     found.doubts.warn()
     _warn(found.refined)
+    if (certificate := found.heights.certificate) is not None:
+        report(certificate, request.tolerance_db, "warn")
     return found.heights
 
 
@@ -297,6 +301,7 @@ def measured(
         refined.m_per_rad,
         refined.image,
         window_m,
+        refined.certificate,
     )
     return Measured(found, refined, sights, doubts)
 

@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.device.device import Device
 from clsas.engine.imaging import Imager
+from clsas.engine.promise import is_wanted, measured_if_possible
 from clsas.engine.water.refraction import homogeneous
 
 
@@ -46,7 +48,22 @@ class Pair:
             lines, grid, tolerance_db=self.tolerance_db, accuracy_db=self.accuracy_db,
             beam=self.beam, device=self.device,
         )  # fmt: skip
-        return imager(lines)
+        return imager(lines, certificate=False)
+
+    def certificate(self, a: Image, b: Image, seconds: float) -> Certificate | None:
+        """Return the measured error of that bank's image which errs more.
+
+        It is None if both took less time than images that are certified, or if it cannot be
+        measured.
+        """
+        if not is_wanted(None, seconds):
+            return None
+        found = [
+            measured_if_possible(image, lines, self.device, seconds / 2, self.tolerance_db)
+            for image, lines in ((a, self.a), (b, self.b))
+        ]
+        known = [each for each in found if each is not None]
+        return max(known, key=lambda each: each.error, default=None)
 
     def within(self, tolerance_db: float) -> Pair:
         """Return the pair with a tolerance of at least so many decibels."""

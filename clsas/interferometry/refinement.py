@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
+from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.decibels import DEVIATION_PER_MEDIAN
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
@@ -64,6 +66,8 @@ class Refined:
         Image of the first bank on the relief of the last pass.
     correction : float
         Rms of the last correction, in standard deviations.
+    certificate : Certificate or None
+        Measured error of that bank's image in the last pass which errs more.
     """
 
     offset_m: NDArray[np.float64]
@@ -74,6 +78,7 @@ class Refined:
     valid: NDArray[np.bool_]
     image: Image
     correction: float
+    certificate: Certificate | None = None
 
     @property
     def converged(self) -> bool:
@@ -118,9 +123,9 @@ def refine(
     relief_m = first_m = start_m + filled(relief.offset_m, found_once)
     slope_m = np.array(np.gradient(relief_m))
     for done in range(1, PASSES + 1):
-        on_relief = grid.with_height(relief_m)
-        image = task.pair.image(task.pair.a, on_relief)
-        images = image.pixels, task.pair.image(task.pair.b, on_relief).pixels
+        on_relief, started = grid.with_height(relief_m), time.perf_counter()
+        image, other = (task.pair.image(bank, on_relief) for bank in (task.pair.a, task.pair.b))
+        images, seconds = (image.pixels, other.pixels), time.perf_counter() - started
         rad_m, facing = sensitivity(grid, relief_m, slope_m, sights)
         planes = fit_planes(images, relief_m, -1 / rad_m, window)
         seen = looks_on_plane * np.maximum(facing, _LEAST_FORESHORTENING)
@@ -149,7 +154,7 @@ def refine(
             break
         relief_m = start_m + filled(planes.height_m - start_m, usable)
         slope_m = np.stack([planes.row_slope_m, planes.column_slope_m])
-    return found
+    return replace(found, certificate=task.pair.certificate(image, other, seconds))
 
 
 def sensitivity(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import reprs, validate
+from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentTypeError
@@ -43,6 +44,9 @@ class Heights:
         outside the mask, because a pixel must lie somewhere.
     window_m : float
         Side of the windows, metres.
+    certificate : Certificate, optional
+        Measured error of the images on the relief, of that bank which errs more; None if it was not
+        measured, and in the store of a mosaic, whose records have those of the patches.
 
     See Also
     --------
@@ -58,6 +62,7 @@ class Heights:
     m_per_rad: NDArray[np.float64]
     image: Image
     window_m: float
+    certificate: Certificate | None = None
 
     def __post_init__(self) -> None:
         """Check every field and convert it."""
@@ -66,6 +71,7 @@ class Heights:
             object.__setattr__(self, name, value)
 
         validate.instance("image", self.image, Image)
+        validate.instance("certificate", self.certificate, Certificate, type(None))
         put("window_m", validate.positive("window_m", self.window_m, "m"))
         shape = self.image.shape
         mask = _as_array(self.mask)
@@ -117,6 +123,8 @@ class Heights:
                 f"height {reprs.span(low_m, high_m, 'm')}",
                 f"median deviation {reprs.quantity(float(np.median(self.sd_m[self.mask])), 'm')}",
             )
+        if self.certificate is not None:
+            parts += (f"images: {self.certificate.describe()}",)
         return reprs.summary(self, f"{reprs.by(self.mask.shape)} pixels", valid, *parts)
 
     @property

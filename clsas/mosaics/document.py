@@ -10,14 +10,15 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.atomic import check_writable, make_folders, replacing
+from clsas.engine.data.certificate import Certificate, of_parts
 from clsas.engine.data.digests import digest, is_intact, with_digest
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
@@ -426,6 +427,14 @@ class Record:
         an exact image or an empty patch.
     has_pixels : bool
         True if any pixel is not 0.
+    certificate : Certificate or None
+        Measured error of the patch, with the worst pixels counted from its corner; of heights, that
+        of the bank's image which errs more. None if it was not measured.
+    unmeasured : str
+        Why the error could not be measured; empty if it was, or was not to be.
+    misses : tuple of str
+        Predicted and measured errors of earlier images of the patch, which were formed again
+        because the mosaic missed its tolerance.
     heights : dict or None
         How the heights were measured: the share of `valid` pixels, the median of `looks`, the
         height of ambiguity `ambiguity_m`, and `converged`; or the `reason` why there are none.
@@ -446,6 +455,9 @@ class Record:
     driver: str = ""
     plan: dict[str, Any] | None = None
     has_pixels: bool = False
+    certificate: Certificate | None = field(default=None, compare=False)
+    unmeasured: str = ""
+    misses: tuple[str, ...] = ()
     heights: dict[str, Any] | None = None
 
     __repr__ = reprs.of_fields
@@ -460,6 +472,8 @@ class Record:
             found.append(f"{self.missing_channels} of {self.channels} channels have no samples")
         if self.gap_m:
             found.append(f"a gap of {self.gap_m:.3g} m along the track")
+        if self.unmeasured:
+            found.append(f"the error is not known: {self.unmeasured}")
         if self.heights is not None and "reason" in self.heights:
             found.append(f"no heights: {self.heights['reason']}")
         elif self.heights is not None and not self.heights["converged"]:
@@ -470,7 +484,8 @@ class Record:
         """Return the attributes to store, with the checksums of pixels and levels."""
         levels = {name: value for name, value in checksums.items() if name != "pixels"}
         stored = {PIXELS_CHECKSUM: checksums["pixels"], LEVELS_CHECKSUMS: levels}
-        return with_digest(asdict(self) | stored)
+        text = json.dumps(asdict(self) | stored, default=lambda array: array.tolist())
+        return with_digest(json.loads(text))
 
     @classmethod
     def read(cls, folder: Path) -> tuple[Record, Checksums] | None:
@@ -488,11 +503,64 @@ class Record:
             raise DamageError("its record does not match its digest")
         names = {field.name for field in fields(cls)}
         try:
-            record = cls(**{name: value for name, value in stored.items() if name in names})
+            known = {name: value for name, value in stored.items() if name in names}
+            if (certificate := known.get("certificate")) is not None:
+                known["certificate"] = Certificate(**certificate)
+            record = cls(**known | {"misses": tuple(known.get("misses", ()))})
             checksums = {"pixels": stored[PIXELS_CHECKSUM], **stored[LEVELS_CHECKSUMS]}
-        except (LookupError, TypeError) as error:
+        except (LookupError, TypeError, ValueError) as error:
             raise DamageError("its record is incomplete") from error
         return record, checksums
+
+
+@dataclass(frozen=True, eq=False)
+class MosaicCertificate:
+    """Measured error of a mosaic, and of each of its patches.
+
+    Attributes
+    ----------
+    whole : Certificate
+        Error of all certified patches together.
+    patches : dict of (row, column) to Certificate
+    of_patches : int
+        Number of finished patches with pixels that are not 0, certified or not.
+    """
+
+    whole: Certificate
+    patches: dict[PatchIndex, Certificate]
+    of_patches: int
+
+    @classmethod
+    def of(cls, records: Mapping[PatchIndex, Record]) -> MosaicCertificate | None:
+        """Return the error of finished patches, or None if none is certified."""
+        known = {
+            index: record.certificate
+            for index, record in records.items()
+            if record.certificate is not None
+        }
+        if not known:
+            return None
+        count = sum(record.has_pixels for record in records.values())
+        return cls(of_parts(list(known.values())), known, count)
+
+    @property
+    def worst(self) -> PatchIndex:
+        """The patch whose error is the largest relative to its own power."""
+        return max(self.patches, key=lambda index: self.patches[index].error)
+
+    def describe(self, tolerance_db: float | None = None) -> str:
+        """Return the error of the whole and of the worst patch as a line of text."""
+        row, column = self.worst
+        worst_db = self.patches[self.worst].error_db
+        text = f"{self.whole.describe(tolerance_db)}; at worst {worst_db:.1f} dB in patch "
+        text += f"{row},{column}"
+        if len(self.patches) < self.of_patches:
+            text += f"; {len(self.patches)} of {self.of_patches} patches measured"
+        return text
+
+    def __repr__(self) -> str:
+        """Return the description."""
+        return f"MosaicCertificate({self.describe()})"
 
 
 def describe_damage(found: dict[PatchIndex, str]) -> str:

@@ -249,6 +249,8 @@ def mosaic_heights(
         _store=opened,
         _inputs=inputs,
         _devices=devices,
+        _tolerance_db=request.tolerance_db,
+        _on_miss="warn",
     )
     report = progress or (lambda done, total: None)
     report(len(finished), len(mosaic))
@@ -371,11 +373,13 @@ def measure_patch(
     margin: tuple[int, int],
     store: Store,
     window: PatchWindow,
-    _: PatchSource,
+    _source: PatchSource,
+    _missed: Record | None,
 ) -> tuple[Record, None]:
     """Measure a patch of a grid with a margin, and write it to the store.
 
-    The banks do not grow. If the patch cannot be imaged, a note of the ValueError names it.
+    The banks do not grow, and no patch is measured again for its error. If the patch cannot be
+    imaged, a note of the ValueError names it.
     """
     start = time.perf_counter()
     rows, columns, inside = with_margin(window, margin, grid.shape)
@@ -394,6 +398,9 @@ def measure_patch(
                 scale = scale_to_all(request.beam, pair.a.channels, len(banks[0].members))
                 pixels = scale * measured.heights.image.pixels[inside]
                 layers, known["heights"] = _results(measured, window.grid, inside)
+                if (found := measured.heights.certificate) is not None:
+                    found = replace(found, power=float(scale) ** 2 * found.power)
+                known["certificate"] = found
             known["has_pixels"] = holds_any(pixels)
         record = Record(**known, seconds=time.perf_counter() - start)
     except ValueError as error:

@@ -30,6 +30,7 @@ from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import MOST_TRACK_PINGS, BeamWindow, scale_to_all
 from clsas.engine.data.coverage import reaches, warn_unreached
 from clsas.engine.data.decibels import in_db, power
+from clsas.engine.data.declared import check_declared
 from clsas.engine.data.digests import digest, grid_digest
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
@@ -40,9 +41,10 @@ from clsas.engine.data.threads import uninterrupted, wait
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.engine.data.version import __version__
 from clsas.engine.device.device import Device
-from clsas.engine.exact.decide import ACCURACY
+from clsas.engine.exact.decide import ACCURACY, BEST_ACCURACY_DB
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import (
+    BEST_TOLERANCE_DB,
     DEFAULT_REQUEST,
     THESIS_STAGES,
     TOLERANCE_DB,
@@ -52,10 +54,11 @@ from clsas.engine.factorized.planner import (
     tolerance_in_db,
 )
 from clsas.engine.forming import SceneImager, form
+from clsas.engine.promise import CERTIFICATE, ON_MISS, is_wanted, measured, report
 from clsas.engine.scene import Scene
 from clsas.engine.signal.doubts import warn_before_imaging
 from clsas.mosaics.devices import device_threads, open_devices, process_device, thread_device
-from clsas.mosaics.document import Document, PatchIndex, Record, is_there
+from clsas.mosaics.document import Document, MosaicCertificate, PatchIndex, Record, is_there
 from clsas.mosaics.patches import Layout, PatchWindow, aligned_shape, patch_shape_of
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import (
@@ -103,6 +106,8 @@ def mosaic(
     memory_bytes: int | None = None,
     device: Device | str | int | Sequence[Device | str | int] | None = None,
     client: Client | None = None,
+    certificate: Annotated[bool | None, CERTIFICATE] = None,
+    on_miss: Annotated[str, ON_MISS] = "refine",
     follow_s: Annotated[float | None, FOLLOW] = None,
 ) -> Mosaic:
     """Return a mosaic, an image of any size that is formed patch by patch.
@@ -144,6 +149,15 @@ def mosaic(
     client : distributed.Client, optional
         Client of a Dask cluster whose workers form the patches. They must be able to open `source`
         and `store` under the same paths.
+    certificate : bool, optional
+        Whether the errors of the patches are measured, as by `clsas.certify`. By default that of a
+        patch is if planning and forming it take 0.1 s or more, except with `stages` or
+        `tolerance_wavelengths`.
+    on_miss : {"refine", "warn", "raise"}
+        What to do if the measured error of the whole mosaic exceeds the tolerance beyond doubt:
+        form the patches that exceed it most again, by better plans and then exactly, until the
+        whole keeps the tolerance, with a warning; warn; or raise ToleranceError. Exact patches are
+        not formed again.
     follow_s : float, optional
         Wait for files to be added to the folder `source`, until it contains a file named `end` or
         no file has been added for this many seconds. A patch is formed once the beam of the latest
@@ -184,8 +198,9 @@ def mosaic(
 
     Notes
     -----
-    Patches are formed independently of each other. The error of each patch against the exact image
-    stays within the tolerance, and so does the difference of neighbours along their border.
+    Patches are formed independently of each other. The error that is predicted for each patch is
+    within the tolerance, and so is the difference of neighbours along their border. The tolerance
+    applies to the measured error of all patches together.
 
     Examples
     --------
@@ -207,6 +222,7 @@ def mosaic(
     if len(grid.shape) != 2:
         raise ArgumentError("grid", "have two axes for a mosaic", f"shape {grid.shape}")
     request = _checked_request(tolerance_db, tolerance_wavelengths, stages, accuracy_db)
+    asked = check_declared(mosaic, {"certificate": certificate, "on_miss": on_miss})
     if beam is not None:
         validate.instance("beam", beam, BeamWindow)
     patch_shape = None if patches is None else patch_shape_of(patches, grid)
@@ -262,12 +278,14 @@ def mosaic(
         grid,
         patch_shape,
         finished,
-        _form=partial(form_patch, request, memory_bytes, stored),
+        _form=partial(form_patch, request, memory_bytes, stored, asked["certificate"]),
         _complete=None if stored is None else stored.complete_levels,
         _visibility=visibility,
         _store=stored,
         _inputs=inputs,
         _devices=devices,
+        _tolerance_db=_tolerance_db(request),
+        _on_miss=asked["on_miss"],
         _client=client,
         _growth=growth,
     )
@@ -297,6 +315,12 @@ def _checked_request(
         elif not isinstance(value, (int, float)):
             request[name] = float(value)
     return request or DEFAULT_REQUEST
+
+
+def _tolerance_db(request: dict[str, Any]) -> float | None:
+    """Return the tolerance of a request or of an exact image, dB; None for a fixed method."""
+    ways = request.get("tolerance_db"), request.get("tolerance_wavelengths")
+    return request.get("accuracy_db", tolerance_in_db(*ways))
 
 
 def _check_client(client: object, source: object, store: object, device: object) -> None:
@@ -362,9 +386,7 @@ def warn_of_window(beam: BeamWindow, geometry: RangeLines, request: dict[str, An
     growing = _beam_of_growing(beam)
     sine = np.linalg.norm(np.cross(beam.directions(geometry), growing.directions(geometry)), axis=1)
     error = shift_error(beam, float(np.sqrt(np.mean(sine**2))), geometry)
-    ways = request.get("tolerance_db"), request.get("tolerance_wavelengths")
-    asked_db = request.get("accuracy_db") or tolerance_in_db(*ways) or TOLERANCE_DB
-    if error > power(asked_db):
+    if error > power(_tolerance_db(request) or TOLERANCE_DB):
         validate.warn(
             "`source` may grow, or did when the mosaic began: the direction of the track is "
             f"smoothed over {MOST_TRACK_PINGS} pings, whatever their number. The image may differ "
@@ -432,8 +454,8 @@ def inputs_of(
 class Mosaic:
     """An image of any size, to be formed patch by patch or, with `image`, as a whole.
 
-    Iterating over the mosaic yields every `Patch` as soon as it is finished. A second iteration
-    forms only the patches that the store lacks.
+    Iterating over the mosaic yields every `Patch` as soon as it is finished, and once more if it is
+    formed again. A second iteration forms only the patches that the store lacks.
 
     A mosaic can be pickled, together with its lines unless they are in files. The process that
     unpickles it opens devices of the same names. A mosaic with a client cannot be pickled, since
@@ -459,12 +481,14 @@ class Mosaic:
     grid: Grid
     patch_shape: tuple[int, int]
     finished: dict[PatchIndex, Record]
-    _form: Callable[[PatchWindow, PatchSource], tuple[Record, Image | None]]
+    _form: Callable[[PatchWindow, PatchSource, Record | None], tuple[Record, Image | None]]
     _complete: Callable[[], object] | None  # called once all patches are finished
     _visibility: SurveyVisibility  # the survey when the mosaic was requested
     _store: Store | None
     _inputs: dict[str, Any]  # as stored with the mosaic
     _devices: tuple[Device, ...]  # of this process; empty with a client
+    _tolerance_db: float | None  # of the whole
+    _on_miss: str
     _client: Client | None = None
     _growth: Growth | None = None  # None if no files are to be added
 
@@ -484,14 +508,16 @@ class Mosaic:
         return self.__dict__
 
     def __repr__(self) -> str:
-        """Return the number of patches and of finished ones, the store and the extents."""
+        """Return the number of patches and of finished ones, the store, extents and the error."""
         store = None if self._store is None else str(self._store.path)
+        certificate = MosaicCertificate.of(self.finished)
         return reprs.summary(
             self,
             f"{reprs.by(self.shape)} patches of {reprs.by(self.patch_shape)} pixels",
             f"{len(self.finished)} of {len(self)} finished",
             None if store is None else f"store {store!r}",
             reprs.extents(*self.grid.bounds_m),
+            None if certificate is None else certificate.describe(),
         )
 
     @property
@@ -506,17 +532,31 @@ class Mosaic:
     def __iter__(self) -> Generator[Patch, None, None]:
         """Form the patches that are not finished, and yield each of them.
 
+        If the whole then misses its tolerance, its worst patches are formed again.
+
         Raises
         ------
+        ToleranceError
+            If the whole misses its tolerance, and `on_miss` is "raise". The store is complete.
         OSError
             If the store cannot be written, for example on a full disk. Finished patches remain.
         ValueError
             If a patch cannot be imaged; the message names the patch.
+
+        Warns
+        -----
+        ClsasWarning
+            At the end, if the whole missed its tolerance, or errors of patches could not be
+            measured.
         """
         survey = GrowingSurvey(self._visibility, self._growth, self._store, self._inputs)
         layout, finished = self._layout, self.finished
-        todo = dict.fromkeys(index for index in layout.indices() if index not in finished)
+        # Patches to form, with the records of those images that missed the tolerance
+        todo: dict[PatchIndex, Record | None] = dict.fromkeys(
+            index for index in layout.indices() if index not in finished
+        )
         records = dict(finished)  # of all patches that were formed, with or without a store
+        misses: list[str] = []  # of the whole
         checked = survey.channels  # number of channels when all patches were last checked
         executor: Executor
         if self._client is not None:  # a cluster returns only records
@@ -531,15 +571,22 @@ class Mosaic:
             while True:
                 while ready and len(running) < most_running:
                     index = ready.popleft()
-                    del todo[index]
+                    missed = todo.pop(index)
                     source = survey.visibility if self._client is None else survey.for_workers()
                     with uninterrupted():
-                        future = executor.submit(self._form, layout.window(index), source)
+                        future = executor.submit(self._form, layout.window(index), source, missed)
                         running[future] = index
                 if not running and not todo and survey.has_ended:
-                    if self._complete is not None:
-                        self._complete()
-                    return
+                    certificate = MosaicCertificate.of(records)
+                    todo = self._worst(certificate, records)
+                    if certificate is None or not todo:
+                        if self._complete is not None:
+                            self._complete()
+                        self._report(certificate, records, misses)
+                        return
+                    misses = misses or [certificate.whole.describe()]
+                    ready = survey.ready(layout, todo)
+                    continue
                 timeout_s = None if survey.has_ended and running else POLL_S
                 done = wait(running or [Future()], timeout_s)
                 latest = [index for future, index in running.items() if future in done]
@@ -581,6 +628,51 @@ class Mosaic:
                         if future.exception() is None:
                             finished[running[future]] = future.result()[0]
 
+    def _worst(
+        self, certificate: MosaicCertificate | None, records: dict[PatchIndex, Record]
+    ) -> dict[PatchIndex, Record | None]:
+        """Return the patches to form again so that the whole keeps its tolerance, worst first.
+
+        They are as few as suffice if each of them then just keeps the tolerance.
+        """
+        worst: dict[PatchIndex, Record | None] = {}
+        if certificate is None or self._tolerance_db is None or self._on_miss != "refine":
+            return worst
+        if certificate.whole.verdict(self._tolerance_db) != "missed":
+            return worst
+        allowed = power(self._tolerance_db)
+        excess = {
+            index: each.of_pixels * each.power * (each.error - allowed)
+            for index, each in certificate.patches.items()
+        }
+        left = math.fsum(excess.values())
+        for index in sorted(excess, key=excess.__getitem__, reverse=True):
+            if left <= 0 or excess[index] <= 0:
+                break
+            plan = records[index].plan
+            if plan is not None and "sides" in plan["method"]:  # nothing is better than exact
+                worst[index] = records[index]
+                left -= excess[index]
+        return worst
+
+    def _report(
+        self,
+        certificate: MosaicCertificate | None,
+        records: dict[PatchIndex, Record],
+        misses: list[str],
+    ) -> None:
+        """Report errors that are not known, and a tolerance that is or was missed."""
+        unmeasured = [each.unmeasured for each in records.values() if each.unmeasured]
+        if unmeasured:
+            validate.warn(
+                f"the error of {len(unmeasured)} of {len(records)} patches is not known: "
+                f"{unmeasured[0]}"
+            )
+        if certificate is not None and self._tolerance_db is not None:
+            again = sum(bool(record.misses) for record in records.values())
+            how = f"{again} of {len(records)} patches"
+            report(certificate.whole, self._tolerance_db, self._on_miss, misses, how)
+
     def image(self, tell: Callable[[Patch], object] | None = None) -> Image:
         """Form the patches that are not finished, and return the whole image.
 
@@ -607,14 +699,18 @@ class Mosaic:
         ValueError
             If the image does not fit into the memory of this machine, or a patch cannot be imaged;
             the message names the patch.
+        ToleranceError
+            If the image misses its tolerance, and `on_miss` is "raise".
         """
         validate.function("tell", tell)
         validate.memory("the mosaic", 8 * self.grid.size)
         stored = [self._patch(index, record, None) for index, record in self.finished.items()]
         pixels: NDArray[np.complex64] | None = None
         formed: dict[PatchIndex, Formed | None] = {}
+        records: dict[PatchIndex, Record] = {}
         for patch in chain(stored, self):
             image = patch.image
+            records[patch.row, patch.column] = patch.record
             if patch.record.has_pixels:
                 formed[patch.row, patch.column] = image.formed
             if image.pixels.shape == self.grid.shape:
@@ -631,6 +727,7 @@ class Mosaic:
         if not known or len(known) < len(formed):
             return Image(pixels, self.grid)
         errors_db = [each.predicted_error_db for each in known]
+        certificate = MosaicCertificate.of(records)
         how = Formed(
             method="mosaic",
             tolerance_db=known[0].tolerance_db,
@@ -641,6 +738,12 @@ class Mosaic:
             device=", ".join(dict.fromkeys(each.device for each in known)),
             version=__version__,
             lines_digest=digest(sorted(each.lines_digest for each in known)),
+            certificate=None if certificate is None else certificate.whole,
+            misses=tuple(
+                f"patch {row},{column}: {miss}"
+                for (row, column), record in records.items()
+                for miss in record.misses
+            ),
         )
         return Image(pixels, self.grid, how)
 
@@ -720,10 +823,15 @@ def form_patch(
     request: dict[str, Any],
     memory_bytes: int,
     store: Store | None,
+    certificate: bool | None,
     window: PatchWindow,
     source: PatchSource,
+    missed: Record | None,
 ) -> tuple[Record, Image | None]:
     """Form one patch and write it to the store.
+
+    If its image missed the tolerance, as its record says, it is formed by a better plan, and the
+    next time exactly.
 
     With a client, the arguments are pickled with every patch: one of `REQUESTS` with its value, and
     no samples. A worker process returns no image: the main process reads the pixels from the store.
@@ -732,11 +840,13 @@ def form_patch(
     in_process = isinstance(source, SurveyVisibility)
     try:
         if isinstance(source, SurveyVisibility):
-            record, image = _image(request, memory_bytes, source, window.grid, thread_device())
+            device, visibility = thread_device(), source
         else:
             device = process_device()
             visibility = opened_visibility(*source)
-            record, image = _image(request, memory_bytes, visibility, window.grid, device)
+        record, image = _image(
+            request, memory_bytes, certificate, visibility, window.grid, device, missed
+        )
     except ValueError as error:
         error.add_note(f"patch {window.row},{window.column}")
         raise
@@ -749,9 +859,11 @@ def form_patch(
 def _image(
     request: dict[str, Any],
     memory_bytes: int,
+    certificate: bool | None,
     visibility: SurveyVisibility,
     grid: Grid,
     device: Device,
+    missed: Record | None,
 ) -> tuple[Record, Image]:
     """Return the image of one patch and the record of how it was formed."""
     start = time.perf_counter()
@@ -785,14 +897,40 @@ def _image(
     if not reaches(lines, grid, beam, None if beam is None else beam.along):
         return empty()
 
+    tolerance_db, began = _tolerance_db(request), time.perf_counter()
+    if missed is not None:
+        assert missed.certificate is not None
+        assert tolerance_db is not None
+        predicted = f"predicted error {missed.predicted_error_db:.1f} dB"
+        miss = f"{predicted}, {missed.certificate.describe()}"
+        fields["misses"] = (*missed.misses, miss)
+        better_db = 2 * tolerance_db - missed.certificate.error_db  # tighter by the miss
+        request = {"tolerance_db": max(better_db, BEST_TOLERANCE_DB)}
+        if missed.misses:
+            request = {"accuracy_db": max(better_db, BEST_ACCURACY_DB)}
+        certificate = True
     image, how = _formed(request, memory_bytes, lines, grid, beam, device)
+    seconds = time.perf_counter() - began
+    fields |= how | {"has_pixels": holds_any(image.pixels)}
+    is_to_tolerance = not request.keys() & {"stages", "tolerance_wavelengths"}
+    if fields["has_pixels"] and is_wanted(certificate, seconds, by_default=is_to_tolerance):
+        try:
+            fields["certificate"] = measured(image, lines, device, seconds, tolerance_db)
+        except ArgumentError as error:
+            fields["unmeasured"] = str(error)
     if (scale := scale_to_all(beam, lines.channels, survey.channels)) != 1:
         image = replace(image, pixels=scale * image.pixels)
-    fields |= how | {
-        "has_pixels": holds_any(image.pixels),
-        "seconds": time.perf_counter() - start,
-    }
-    return Record(**fields), image
+        if (found := fields.get("certificate")) is not None:
+            fields["certificate"] = replace(found, power=float(scale) ** 2 * found.power)
+    record = Record(**fields, seconds=time.perf_counter() - start)
+    assert image.formed is not None
+    formed = replace(
+        image.formed,
+        tolerance_db=tolerance_db,
+        certificate=record.certificate,
+        misses=record.misses,
+    )
+    return record, replace(image, formed=formed)
 
 
 def _formed(
@@ -813,9 +951,9 @@ def _formed(
             f"{memory_bytes / 2**20:.1f} MiB",
             "use smaller patches",
         )
-    accuracy_db = request.get("accuracy_db")
-    if accuracy_db is None and "stages" not in request and is_soon_done(lines, grid, device):
-        accuracy_db = tolerance_in_db(*(request.get(name) for name in REQUESTS[:2]))
+    accuracy_db = None
+    if "accuracy_db" in request or is_soon_done(lines, grid, device):
+        accuracy_db = _tolerance_db(request)  # None for `stages`
     if accuracy_db is not None:
         scene = Scene.of(lines, grid, beam, accuracy_db)
         scene.warn("accuracy_db", accuracy_db, doubts=False)

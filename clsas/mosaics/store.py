@@ -32,6 +32,7 @@ from clsas.mosaics.document import (
     REPAIR,
     DamageError,
     Document,
+    MosaicCertificate,
     OtherInputsError,
     PatchIndex,
     Record,
@@ -276,6 +277,10 @@ class Store:
             if record is not None:
                 found[index] = record
         return found
+
+    def certificate(self) -> MosaicCertificate | None:
+        """Return the measured error of the whole and of the patches; None if none was measured."""
+        return MosaicCertificate.of(self.records())
 
     def undamaged_records(self) -> dict[PatchIndex, Record]:
         """Return the records of intact patches after reading all; warn of damaged ones."""
@@ -620,7 +625,7 @@ class Store:
             values[name] = np.nan_to_num(values[name])
         image = Image(pixels, plane.with_height(filled(values["height_m"], mask)))
         window_m = float(self.document.inputs["window_m"])
-        return Heights(**values, mask=mask, image=image, window_m=window_m)
+        return Heights(**values, mask=mask, image=image, window_m=window_m, certificate=None)
 
     def overview(
         self,
