@@ -633,7 +633,7 @@ class Mosaic:
     ) -> dict[PatchIndex, Record | None]:
         """Return the patches to form again so that the whole keeps its tolerance, worst first.
 
-        They are as few as suffice if each of them then just keeps the tolerance.
+        They are as few as can suffice, if nothing of their errors is left.
         """
         worst: dict[PatchIndex, Record | None] = {}
         if certificate is None or self._tolerance_db is None or self._on_miss != "refine":
@@ -641,18 +641,18 @@ class Mosaic:
         if certificate.whole.verdict(self._tolerance_db) != "missed":
             return worst
         allowed = power(self._tolerance_db)
-        excess = {
-            index: each.of_pixels * each.power * (each.error - allowed)
+        whole = certificate.whole.of_pixels * certificate.whole.power
+        left = whole * (certificate.whole.error - allowed)
+        errors = {
+            index: each.of_pixels * each.power * each.error
             for index, each in certificate.patches.items()
         }
-        left = math.fsum(excess.values())
-        for index in sorted(excess, key=excess.__getitem__, reverse=True):
-            if left <= 0 or excess[index] <= 0:
-                break
+        for index in sorted(errors, key=errors.__getitem__, reverse=True):
             plan = records[index].plan
-            if plan is not None and "sides" in plan["method"]:  # nothing is better than exact
+            is_exact = plan is None or "sides" not in plan["method"]  # nothing is better
+            if left > 0 and not is_exact and certificate.patches[index].error > allowed:
                 worst[index] = records[index]
-                left -= excess[index]
+                left -= errors[index]
         return worst
 
     def _report(
