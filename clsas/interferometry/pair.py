@@ -53,17 +53,18 @@ class Pair:
     def certificate(self, a: Image, b: Image, seconds: float) -> Certificate | None:
         """Return the measured error of that bank's image which errs more.
 
-        It is None if both took less time than images that are certified, or if it cannot be
-        measured.
+        It is None if both took less time than images that are certified, or if that of a bank
+        cannot be measured.
         """
         if not is_wanted(None, seconds):
             return None
-        found = [
-            measured_if_possible(image, lines, self.device, seconds / 2, self.tolerance_db)
-            for image, lines in ((a, self.a), (b, self.b))
-        ]
-        known = [each for each in found if each is not None]
-        return max(known, key=lambda each: each.error, default=None)
+        found = []
+        for image, lines in ((a, self.a), (b, self.b)):
+            each = measured_if_possible(image, lines, self.device, seconds / 2, self.tolerance_db)
+            if each is None:
+                return None
+            found.append(each)
+        return max(found, key=lambda each: each.error)
 
     def within(self, tolerance_db: float) -> Pair:
         """Return the pair with a tolerance of at least so many decibels."""

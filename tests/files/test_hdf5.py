@@ -11,6 +11,7 @@ import pytest
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Formed, Image
@@ -71,6 +72,7 @@ def objects():
             *np.abs(noise(2, 3, 5)),
             Image(complex_noise(random, 3, 5), PLANE.with_height(noise(3, 5))),
             0.1,
+            Certificate(64, 15, 0.1, 2 / 3, 1e-5 / 3, 1e-12, 1e-18, [[2, 4]], [-40 / 3]),
         ),
         "lines": RangeLines(samples, noise(4), 1 / 3, tx_m, rx_m, 1e6 / 3, 1500.1),
         "moving lines": RangeLines(samples, 40, 0.1, tx_m, rx_m, 0, 1500, noise(4, 3)),

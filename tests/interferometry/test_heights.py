@@ -11,6 +11,7 @@ from reliefs import BAND_HZ, CARRIER_HZ, GRID, banks, flat_banks, truth
 from tiers import also, few
 
 import clsas
+from clsas.engine import promise
 from clsas.engine.data.validate import ClsasWarning
 from clsas.engine.device.device import open_device
 from clsas.interferometry.heights import heights, measure
@@ -496,6 +497,7 @@ class TestBadInput:
         self.refused("a must be of type RangeLines", a=3, error=TypeError)
 
     @pytest.mark.slow
+    @pytest.mark.filterwarnings("ignore:the error of the image is not known")  # white noise
     def test_nothing_coherent(self):
         first, second = flat_banks()
         random = np.random.default_rng(4)
@@ -534,3 +536,21 @@ def test_refraction_does_not_displace_heights(height_m):
     assert abs(errors.mean()) < 0.5 * np.median(right.sd_m[right.mask])
     assert np.sqrt(np.mean(errors**2)) < 1.3 * np.sqrt(np.mean(right.sd_m[right.mask] ** 2))
     assert abs(np.nanmedian(wrong.height_m) - height_m) > 0.1
+
+
+def test_only_the_last_images_are_certified(monkeypatch):
+    """Of both banks, the worse error counts."""
+    found = []
+
+    def keep(*arguments, **options):
+        found.append(promise.measured(*arguments, **options))
+        return found[-1]
+
+    monkeypatch.setattr(promise, "LEAST_SECONDS", 0.0)
+    monkeypatch.setattr("clsas.interferometry.pair.measured_if_possible", keep)
+    part = GRID.window(slice(40, 80), slice(20, 60))
+    result = heights(*flat_banks(), part, search_m=(-0.2, 0.2), window_m=WINDOW_M)
+    assert len(found) == 2
+    assert result.certificate is max(found, key=lambda each: each.error)
+    assert result.certificate.error_db < -40
+    assert result.certificate.describe() in repr(result)
