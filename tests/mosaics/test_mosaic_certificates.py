@@ -1,11 +1,15 @@
 """Mosaics say how wrong they are, and their worst patches are formed again if the whole misses."""
 
+import json
+
 import numpy as np
 import pytest
 from judging import SLOW
 
 import clsas
 from clsas.engine.data.certificate import of_parts
+from clsas.engine.data.digests import with_digest
+from clsas.engine.data.validate import ArgumentError
 from clsas.engine.factorized import measured_costs
 from clsas.engine.factorized.costs import KnownCosts
 from clsas.mosaics import mosaic as mosaics
@@ -150,3 +154,27 @@ def test_a_normalised_patch_counts_as_much_as_its_pixels(known):
     for patch in clsas.mosaic(known.lines, known.grid, **REQUEST, beam=beam):
         power = float(np.mean(np.abs(patch.image.pixels) ** 2))
         assert patch.record.certificate.power == pytest.approx(power, rel=1e-2)
+
+
+def test_errors_that_cannot_be_measured_are_reported(known, monkeypatch):
+    def refuse(*_):
+        raise ArgumentError("lines", "leave a part of the sampled band empty")
+
+    monkeypatch.setattr(mosaics, "measured", refuse)
+    with pytest.warns(clsas.ClsasWarning, match="error of 4 of 4 patches is not known: lines must"):
+        patches = list(clsas.mosaic(known.lines, known.grid, **REQUEST))
+    for patch in patches:
+        assert patch.record.certificate is None
+        assert "the error is not known: lines must" in patch.record.flags[0]
+
+
+@pytest.mark.parametrize("wrong", [{"power": -1.0}, {"error": "small"}, {"colour": 1}])
+def test_a_wrong_certificate_is_damage(known, tmp_path, wrong):
+    path = tmp_path / "a.zarr"
+    list(clsas.mosaic(known.lines, known.grid, path, **REQUEST | {"patches": (1, 2)}))
+    file = path / "patches" / "0.1" / "zarr.json"
+    document = json.loads(file.read_text())
+    document["attributes"]["certificate"] |= wrong
+    document["attributes"] = with_digest(document["attributes"])
+    file.write_text(json.dumps(document))
+    assert list(clsas.Store.opened(path).damage()) == [(0, 1)]
