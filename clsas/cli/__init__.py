@@ -48,6 +48,7 @@ _GROUPS = {
         ),
     },
     "Measures": {
+        "certify": ("measures", "Measure the error of an image against its range lines."),
         "quality": ("measures", "Measure the contrast, a point or the error of an image."),
         "limits": ("limits", "Show the limits of a survey: sampling, speed, resolution."),
         "assess": ("assess", "Show which effects an image needs, and what each costs."),
@@ -141,8 +142,8 @@ def _errors() -> tuple[type[Exception], ...]:
     """Return the exceptions that users or their machines cause, not faults of clsas."""
     import pyopencl
 
-    ours = ValueError, TypeError, clsas.DeviceError, OSError, ImportError, MemoryError
-    return *ours, pyopencl.Error
+    ours = clsas.DeviceError, clsas.ToleranceError
+    return *ours, ValueError, TypeError, OSError, ImportError, MemoryError, pyopencl.Error
 
 
 @click.group(

@@ -40,6 +40,7 @@ _BUILD_SHARE = 0.1  # of an image's time; if building kernels takes more, it is 
 )
 @options.exactly
 @options.beam
+@options.promise
 @options.device
 @options.picture("the image in dB")
 @options.levels
@@ -55,6 +56,7 @@ def image(
     request: dict[str, Any],
     exact: bool,
     beam: dict[str, Any],
+    promise: dict[str, Any],
     device: str | None,
     picture: Path | None,
     levels: dict[str, Any],
@@ -66,7 +68,8 @@ def image(
     The grid is that of --scene, or given by --x, --y and --z. Choose the method by one of
     --tolerance-db, --tolerance-wavelengths, --stages and --exact, or by [image] of the scene. The
     default is a tolerance of -50 dB against the exact image. If no faster method keeps the
-    tolerance, the image is formed exactly. LINES.H5 may also be a recording of another kind.
+    tolerance, the image is formed exactly. The error of the image is then measured at some pixels,
+    as by `clsas certify`. LINES.H5 may also be a recording of another kind.
 
     \b
     Example:  clsas image lines.h5 --x -2.5:2.5:1024 --y 40:45:1024 -o image.h5 --picture image.png
@@ -80,22 +83,28 @@ def image(
         warn_of_sampling(described, grid)
     lines = load_lines(lines_file, described, **of_bank)
     opened = open_device(device)
-    chosen, planned_s = None, None
+    imager, chosen, planned_s = None, None, None
     if request.keys() & set(PLAN_KEYS):
         start = time.perf_counter()
-        chosen = clsas.plan(lines, grid, **request, beam=window, device=opened)
+        if "tolerance_db" in request:  # which other plans do not promise to keep
+            imager = clsas.Imager(lines, grid, **request, beam=window, device=opened)
+        else:
+            planned = clsas.plan(lines, grid, **request, beam=window, device=opened)
+            _warn_of_error(planned)
+            imager = clsas.Imager(lines, grid, planned, device=opened)
+        chosen = imager.plan  # before another one replaces it, if the image misses its tolerance
         planned_s = time.perf_counter() - start
-        _warn_of_error(chosen)
+    promise = described.promise | promise
     profiling: AbstractContextManager[dict[str, KernelTimes]] = nullcontext({})
     if profile:
         profiling = opened.profile()
     with progress_bar("imaging") as progress, profiling as kernels:
         built_before_s, start = opened.build_seconds, time.perf_counter()
-        if chosen is not None:
-            formed = clsas.factorize(lines, grid, chosen, device=opened, progress=progress)
+        if imager is not None:
+            formed = imager(lines, **promise, progress=progress)
         else:
             formed = clsas.backproject(
-                lines, grid, **request, beam=window, device=opened, progress=progress
+                lines, grid, **request, beam=window, device=opened, **promise, progress=progress
             )
         seconds = time.perf_counter() - start
         built_s = opened.build_seconds - built_before_s
@@ -104,25 +113,27 @@ def image(
         from clsas import plot
 
         plot.save(plot.image_db(formed, **levels), picture)
-    words, figures = _results(formed, chosen)
+    words, error, figures = _results(formed, chosen)
     if planned_s is not None:
         figures["plan_seconds"] = planned_s
-    duration = _duration(seconds, built_s, planned_s)
+    certificate = figures["certificate"]
+    duration = _duration(seconds, built_s, planned_s, certificate and certificate["seconds"])
     report(
         as_json,
         f"{printable(output)}: {' x '.join(map(str, grid.shape))} pixels from "
-        f"{lines.channels} lines in {duration} on {opened.info.label} ({words})" + _table(kernels),
+        f"{lines.channels} lines in {duration} on {opened.info.label} ({words}){error}"
+        + _table(kernels),
         file=output, picture=picture, shape=grid.shape, channels=lines.channels,
         device=opened.info.label, driver=opened.info.driver, **figures, seconds=seconds,
         build_seconds=built_s, kernels=kernels,
     )  # fmt: skip
 
 
-def _results(image: clsas.Image, chosen: clsas.Plan | None) -> tuple[str, dict[str, Any]]:
-    """Return how an image was formed and its predicted error, in words and in types of JSON."""
+def _results(image: clsas.Image, chosen: clsas.Plan | None) -> tuple[str, str, dict[str, Any]]:
+    """Return how an image was formed and its measured error, in words, and both in JSON's types."""
     formed = image.formed
     assert formed is not None
-    error_db = formed.predicted_error_db
+    error_db, certificate = formed.predicted_error_db, formed.certificate
     parts = [formed.plan, "all pixels are zero"]
     if error_db is not None:
         parts[-1] = f"predicted error {error_db:.0f} dB"
@@ -132,6 +143,8 @@ def _results(image: clsas.Image, chosen: clsas.Plan | None) -> tuple[str, dict[s
         "method": formed.method,
         "how": formed.plan,
         "predicted_error_db": error_db,
+        "certificate": None if certificate is None else certificate.figures,
+        "misses": formed.misses,
         "is_zero": error_db is None,
         "left_out": formed.left_out,
     }
@@ -141,14 +154,22 @@ def _results(image: clsas.Image, chosen: clsas.Plan | None) -> tuple[str, dict[s
             figures["method"] = "stages"
         elif chosen.is_exact:
             parts.insert(0, f"exact: nothing faster within {chosen.tolerance_db:.4g} dB")
-    return "; ".join(parts), figures
+    words = "; ".join(parts)
+    if certificate is None:
+        return words, "", figures
+    return words, f"\n  {certificate.describe(formed.tolerance_db)}", figures
 
 
-def _duration(seconds: float, built_s: float, planned_s: float | None) -> str:
+def _duration(
+    seconds: float, built_s: float, planned_s: float | None, measured_s: float | None
+) -> str:
     """Return the time of an image in words, with the parts that later images do not repeat."""
-    words = f"{seconds:.2f} s"
+    parts = []
     if built_s > _BUILD_SHARE * seconds:
-        words += f" ({built_s:.2f} s of that to build kernels, which the driver keeps)"
+        parts.append(f"{built_s:.2f} s of that to build kernels, which the driver keeps")
+    if measured_s is not None:
+        parts.append(f"{measured_s:.2f} s {'' if parts else 'of that '}to measure its error")
+    words = f"{seconds:.2f} s" + (f" ({', and '.join(parts)})" if parts else "")
     return words if planned_s is None else f"{words}, planned in {planned_s:.2f} s"
 
 

@@ -1,23 +1,98 @@
-"""Commands that measure images and the speed of imaging: quality, tradeoff, bench."""
+"""Commands that measure images and the speed of imaging: certify, quality, tradeoff, bench."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 
 import clsas
 from clsas.cli import options
-from clsas.cli.inputs import load, load_lines, read_beam, read_grid
-from clsas.cli.outputs import json_able, print_json, printable, progress_bar, report, say
-from clsas.cli.parameters import HDF5, INPUT, POSITION, STAGES, Output
+from clsas.cli.inputs import load, load_lines, read_beam, read_grid, read_scene
+from clsas.cli.outputs import json_able, print_json, printable, progress_bar, report, say, warn
+from clsas.cli.parameters import HDF5, HDF5_OR_STORE, INPUT, POSITION, STAGES, Output
 from clsas.cli.wording import command
+from clsas.engine.data.decibels import level_db
+from clsas.engine.data.digests import samples_digest
+from clsas.engine.data.reprs import Table
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import TOLERANCE_DB, Request
 from clsas.files.scene_files import SceneFile
+from clsas.maps.sources import Source
 from clsas.measures.quality import DARKEST, Cut, PointResponse, dark_level_db
+
+
+@command()
+@click.argument("image_file", metavar="IMAGE.H5", type=HDF5_OR_STORE)
+@click.argument("lines_file", metavar="LINES.H5", type=HDF5)
+@options.bank
+@options.scene
+@options.beam
+@options.of(clsas.certify, "pixels", "seed", "scale", into="how")
+@options.device
+@options.as_json
+def certify(
+    image_file: Path,
+    lines_file: Path,
+    of_bank: dict[str, Any],
+    scene: Path | None,
+    beam: dict[str, Any],
+    how: dict[str, Any],
+    device: str | None,
+    as_json: bool,
+) -> None:
+    """Measure the error of an image against its range lines.
+
+    A few hundred pixels are formed again in double precision, straight from the lines and the
+    positions of the antennas, and compared with those of the image. It may come from any imager or
+    program, and be the Zarr store of a mosaic that fits into memory. LINES.H5 may also be a
+    recording of another kind. The beam is that with which clsas formed the image, or else that of
+    the scene, which may also have the sound speed. The beam of an image from elsewhere is given by
+    the options.
+
+    \b
+    Example:  clsas certify image.h5 lines.h5
+    """
+    described = read_scene(scene) if scene is not None else SceneFile(name="")
+    lines = load_lines(lines_file, described, **of_bank)
+    tolerance_db, formed = None, None
+    if image_file.is_dir():
+        store = clsas.Store.opened(image_file)
+        Source.of(store, None).check_finished("image")
+        image, inputs = store.image(), store.document.inputs
+        tolerance_db, of_store = inputs.get("tolerance_db"), inputs.get("beam")
+        described = replace(described, image={"beam": of_store and clsas.BeamWindow(**of_store)})
+    else:
+        image = load(image_file, clsas.Image)
+        formed = image.formed
+    if formed is not None:
+        tolerance_db, described = formed.tolerance_db, replace(described, image={"beam": formed.beam})
+        if formed.method != "mosaic" and formed.lines_digest != samples_digest(lines):
+            warn(f"{image_file} was formed from other lines than those of {lines_file}")
+    found = clsas.certify(image, lines, beam=read_beam(described, beam), **how, device=device)
+    figures = found.figures
+    text = found.describe(tolerance_db)
+    if found.worst is not None and found.worst_db is not None:
+        places = tuple(found.worst.T)
+        figures["worst_m"] = image.grid.at(np.ravel_multi_index(places, image.shape))
+        figures["worst_level_db"] = level_db(image.pixels[places], math.sqrt(found.power))
+        headings = ("row", "column") if len(image.shape) == 2 else ("pixel",) * len(image.shape)
+        numbers = zip(
+            found.worst, figures["worst_m"], found.worst_db, figures["worst_level_db"], strict=True
+        )
+        rows = [
+            [*map(str, index), *(f"{each:.4f}" for each in at_m), f"{error:.1f}", f"{level:.1f}"]
+            for index, at_m, error, level in numbers
+        ]
+        table = Table((*headings, "x (m)", "y (m)", "z (m)", "error (dB)", "level (dB)"), rows)
+        heading = "the worst of these pixels, relative to the rms amplitude of the image:"
+        text += "\n".join(["", heading, *table.lines()])
+    report(as_json, text, **figures)
 
 
 @command()

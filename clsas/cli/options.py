@@ -36,8 +36,9 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import Request
+from clsas.engine.imaging import factorize
 from clsas.files.hdf5 import SUFFIXES
-from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS
+from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS, PROMISE_KEYS
 from clsas.maps.exporting import ExportOptions
 from clsas.plot.canvas import SUFFIXES as PICTURES
 from clsas.plot.canvas import Scale
@@ -101,8 +102,11 @@ def of(
         for argument in reversed(arguments):
             what = declared(source)[argument]
             stated = default or _default_in_words(source, argument, what)
+            names = (called or {}).get(argument, [option_of(argument)])
+            if isinstance(what, Flag) and what.default:  # left out, it is neither true nor false
+                names = [f"{name}/--no-{name[2:]}" for name in names]
             run = click.option(
-                *(called or {}).get(argument, [option_of(argument)]), f"{into}__{argument}",
+                *names, f"{into}__{argument}",
                 cls=DeclaredOption, argument=argument, required=required,
                 help=_help(what, stated, beside), callback=partial(_checked, what),
                 **_kind(what, (types or {}).get(argument)),
@@ -242,6 +246,7 @@ device = click.option(
     "name, as `clsas devices` lists them.",
 )
 bank = of(RangeLines.bank, "number", into="of_bank", called={"number": ("--bank",)})
+promise = of(factorize, *PROMISE_KEYS, into="promise")
 axes = of(Grid.plane, "x", "y", "z", into="axes", types={"x": AXIS, "y": AXIS})
 grid = _together(scene, axes)
 method = of(

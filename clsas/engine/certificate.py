@@ -12,6 +12,7 @@ import time
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from types import EllipsisType
+from typing import Annotated
 
 import numpy as np
 import scipy.fft
@@ -24,6 +25,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.beam import LEAST_WEIGHT_SUM, BeamWindow
 from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.decibels import in_db
+from clsas.engine.data.declared import Count, Flag, check_declared
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines, some_channels
@@ -66,9 +68,13 @@ def certify(
     lines: RangeLines,
     *,
     beam: BeamWindow | EllipsisType | None = ...,
-    pixels: int = PIXELS,
-    seed: int | None = None,
-    scale: bool = False,
+    pixels: Annotated[int, Count(help="Number of pixels to form again.")] = PIXELS,
+    seed: Annotated[
+        int | None, Count(0, help="Seed of the draw of pixels.", default="others every time")
+    ] = None,
+    scale: Annotated[
+        bool, Flag("Fit a complex factor by which the image may differ from the ideal one.")
+    ] = False,
     device: Device | str | int | None = None,
 ) -> Certificate:
     """Return the error of an image, measured at a few pixels that are formed again.
@@ -160,13 +166,10 @@ def certify(
     if beam is None and formed_beam is not None:
         allowed = "be that of `image.formed`, or be left out"
         raise ArgumentError("beam", allowed, "None for an image that was formed with a beam")
-    pixels = validate.count("pixels", pixels)
-    validate.flag("scale", scale)
-    if seed is not None:
-        seed = validate.count("seed", seed, least=0)
-    measurement = Measurement(image, lines, beam, open_device(device), seed)
-    measurement.draw(pixels)
-    return measurement.certificate(scale=scale)
+    asked = check_declared(certify, {"pixels": pixels, "seed": seed, "scale": scale})
+    measurement = Measurement(image, lines, beam, open_device(device), asked["seed"])
+    measurement.draw(asked["pixels"])
+    return measurement.certificate(scale=asked["scale"])
 
 
 class Measurement:

@@ -24,7 +24,7 @@ from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.data.system import Sonar
 from clsas.engine.data.track import Track
 from clsas.engine.data.version import __version__
-from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS, SceneTables
+from clsas.files.scene_tables import EXACT_KEYS, PLAN_KEYS, PROMISE_KEYS, SceneTables
 from clsas.files.tables import closest, located, models_in, suggestion
 from clsas.simulation.scenes import Scene
 
@@ -56,8 +56,8 @@ class SceneFile:
         From the tables `targets` and `seabed`.
     simulate, compress, image : dict
         Keyword arguments for `clsas.simulate` (with the sound speed), for `clsas.compress`, and for
-        `clsas.plan` (one of `PLAN_KEYS`) or `clsas.backproject` (any of `EXACT_KEYS`). The latter
-        may include a `beam`.
+        `clsas.plan` (one of `PLAN_KEYS`) or `clsas.backproject` (any of `EXACT_KEYS`). The last
+        may include a `beam`, and `PROMISE_KEYS` for `clsas.factorize` and `clsas.backproject`.
     mosaic : dict
         Paths that `clsas mosaic` reads (`lines`) and writes (`store`), and its `patches` and
         `memory_mib`.
@@ -89,6 +89,11 @@ class SceneFile:
         """Request of `[image]`: one of `PLAN_KEYS` or any of `EXACT_KEYS`, or an empty dict."""
         planned = {key: value for key, value in self.image.items() if key in PLAN_KEYS}
         return planned or {key: value for key, value in self.image.items() if key in EXACT_KEYS}
+
+    @property
+    def promise(self) -> dict[str, Any]:
+        """Those `PROMISE_KEYS` that `[image]` has: whether its error is measured, and what for."""
+        return {key: value for key, value in self.image.items() if key in PROMISE_KEYS}
 
     def need(self, *tables: str) -> tuple[Any, ...]:
         """Return the attributes with the given names; raise ValueError if one is missing."""

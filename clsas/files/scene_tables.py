@@ -28,6 +28,7 @@ from clsas.engine.data.track import Motion, Pointing, Track
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import Request
+from clsas.engine.imaging import factorize
 from clsas.engine.signal.compression import compress
 from clsas.files.csv_files import read_sound_speed, read_track
 from clsas.files.height_files import read_heights
@@ -48,6 +49,8 @@ PLAN_KEYS = ("tolerance_db", "tolerance_wavelengths", "stages")
 """Keys of `[image]` for `clsas.plan`, of which one may be given."""
 EXACT_KEYS = ("accuracy_db", "taps", "upsampling")
 """Keys of `[image]` for `clsas.backproject`."""
+PROMISE_KEYS = ("certificate", "on_miss")
+"""Keys of `[image]` for both, about the measured error."""
 STEP_NAMES = (
     "inspect", "calibrate", "navigate", "focus", "pair_errors", "image", "heights", "mosaic"
 )  # fmt: skip
@@ -438,6 +441,7 @@ class _Beam(Table):
             return BeamWindow(**self.given())
 
 
+@keys_of(factorize, *PROMISE_KEYS)
 @keys_of(ExactImage, *EXACT_KEYS)
 @keys_of(Request, *PLAN_KEYS, stages=list[Annotated[list[int], Field(min_length=2, max_length=2)]])
 class _Image(Table):

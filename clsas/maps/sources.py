@@ -129,14 +129,14 @@ class Source:
             return values
         return np.where(np.isnan(self.store.read_layer("height_m", rows, columns)), np.nan, values)
 
-    def check_finished(self) -> None:
-        """Raise ValueError if patches of the store are missing or damaged."""
+    def check_finished(self, name: str = "source") -> None:
+        """Raise ValueError if patches of the store `name` are missing or damaged."""
         if self.store is None:
             return
         patches = math.prod(self.counts)
         if len(self.records) < patches:
             raise ArgumentError(
-                "source",
+                name,
                 f"be finished, but {len(self.records)} of the {patches} patches of "
                 f"{self.store.path} are, without damage",
                 hint="run `clsas.mosaic` again with the same inputs, which forms the others",

@@ -152,7 +152,7 @@ class Step:
             sonar = scene.sonar
             found["element_length_m"] = None if sonar is None else sonar.element_length_m
         if "request" in self.uses:
-            found["request"] = request_of(scene)
+            found["request"] = request_of(scene) | scene.promise
         if "bank" in self.uses and "bank" in scene.process:
             found["bank"] = scene.process["bank"]
         return found
@@ -271,13 +271,13 @@ def pair_errors_step(job: Job) -> dict[str, Any]:
 def image_step(job: Job) -> dict[str, Any]:
     """Form the image and, if the lines were corrected, also the image without corrections."""
     if not job.corrections:
-        image, error_db = _formed(job, job.lines, 0, 1)
+        image = _formed(job, job.lines, 0, 1)
     else:
-        before, _ = _formed(job, job.given(), 0, 2)
-        image, error_db = _formed(job, job.lines, 1, 2)
+        before = _formed(job, job.given(), 0, 2)
+        image = _formed(job, job.lines, 1, 2)
     save(job.staged / "image.h5", image)
     job.draw("image.png", lambda: plot.image_db(image, title=job.title))
-    numbers = _figures(image) | {"predicted_error_db": error_db}
+    numbers = _figures(image)
     if job.corrections:
         save(job.staged / "before.h5", before)
         job.draw("before-and-after.png", lambda: plot.before_and_after(before, image))
@@ -285,31 +285,35 @@ def image_step(job: Job) -> dict[str, Any]:
     return numbers
 
 
-def _formed(job: Job, lines: RangeLines, number: int, images: int) -> tuple[Image, float | None]:
-    """Return the image of lines, and its predicted error if it is factorized.
-
-    For the progress, it is image `number`, from 0, of several.
-    """
+def _formed(job: Job, lines: RangeLines, number: int, images: int) -> Image:
+    """Return the image of lines; for the progress, it is image `number`, from 0, of several."""
 
     def progress(done: int, total: int) -> None:
         if job.progress is not None:
             job.progress(number * total + done, images * total)
 
     lines, grid, beam, request = job.of_bank(lines), job.grid, job.beam, request_of(job.scene)
+    how = {"device": job.device, "progress": progress, **job.scene.promise}
     if request.keys() & set(EXACT_KEYS):
-        image = backproject(lines, grid, **request, beam=beam, device=job.device, progress=progress)
-        return image, None
-    chosen = plan(lines, grid, **request, beam=beam, device=job.device)
-    image = factorize(lines, grid, chosen, device=job.device, progress=progress)
-    return image, chosen.predicted_error_db
+        return backproject(lines, grid, **request, beam=beam, **how)
+    if "tolerance_db" in request:
+        return factorize(lines, grid, request["tolerance_db"], beam=beam, **how)
+    return factorize(lines, grid, plan(lines, grid, **request, beam=beam, device=job.device), **how)
 
 
 def _figures(image: Image) -> dict[str, Any]:
-    """Return measures of a whole image, all of them None if every pixel is zero."""
-    peak = float(np.abs(image.pixels).max())
+    """Return errors and measures of a whole image; measures are None if every pixel is zero."""
+    peak, formed = float(np.abs(image.pixels).max()), image.formed
+    assert formed is not None
+    certificate = formed.certificate
+    errors = {
+        "predicted_error_db": formed.predicted_error_db,
+        "certificate": None if certificate is None else certificate.figures,
+        "misses": list(formed.misses),
+    }
     if peak == 0:
-        return {"peak_db": None, "contrast": None, "entropy": None}
-    return {
+        return errors | {"peak_db": None, "contrast": None, "entropy": None}
+    return errors | {
         "peak_db": 20 * float(np.log10(peak)),
         "contrast": contrast(image),
         "entropy": entropy(image),

@@ -110,14 +110,20 @@ def test_results_in_json(made):
     ("spent", "words"),
     [
         (
-            (2.0, 0.5, 0.25),
+            (2.0, 0.5, 0.25, None),
             "2.00 s (0.50 s of that to build kernels, which the driver keeps), planned in 0.25 s",
         ),
-        ((2.0, 0.1, None), "2.00 s"),
-        ((0.0, 0.0, None), "0.00 s"),
+        (
+            (2.0, 0.5, None, 0.06),
+            "2.00 s (0.50 s of that to build kernels, which the driver keeps, and 0.06 s to "
+            "measure its error)",
+        ),
+        ((2.0, 0.1, None, 0.06), "2.00 s (0.06 s of that to measure its error)"),
+        ((2.0, 0.1, None, None), "2.00 s"),
+        ((0.0, 0.0, None, None), "0.00 s"),
     ],
 )
-def test_time_that_goes_into_kernels_is_reported(spent, words):
+def test_time_that_goes_into_kernels_and_certificates_is_reported(spent, words):
     assert images._duration(*spent) == words
 
 
