@@ -238,7 +238,7 @@ colour_map = of(
     Scale, "colour_map", into="levels", called={"colour_map": ("--colour-map", "--colours")}
 )
 levels = _together(dynamic_range, of(Scale, "percentiles", into="levels"), colour_map)
-map_marks = of(ExportOptions, "north_arrow", "scale_bar", into="marks")
+map_marks = of(ExportOptions, "north_arrow", "scale_bar", "caption", into="marks")
 scene = click.option("--scene", type=INPUT, help="Scene file. Options override its values.")
 device = click.option(
     "--device",

@@ -35,7 +35,7 @@ Shown: TypeAlias = (
 
 _ENDINGS = (*SUFFIXES, ".mat", ".json", ".zarr")  # that the picture's name does without
 _JSON = b"{"
-_MARKS = ("--north-arrow", "--scale-bar")
+_MARKS = ("--north-arrow", "--scale-bar", "--caption")
 
 
 @command()

@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.decibels import DYNAMIC_RANGE, REFERENCE
 from clsas.engine.data.declared import Choice, Flag, Number, check_fields
 from clsas.engine.data.georeference import Georeference
@@ -48,6 +49,7 @@ def export(
     beam: BeamWindow | None = None,
     north_arrow: bool = False,
     scale_bar: bool = False,
+    caption: bool = False,
     progress: Progress | None = None,
 ) -> None:
     """Write an image, a mosaic or heights as a file that other programs open.
@@ -111,6 +113,8 @@ def export(
         contributes to it.
     north_arrow, scale_bar : bool
         True to draw an arrow to the north and a scale bar into a picture.
+    caption : bool
+        True to write below a picture how large the error of the image is.
     progress : callable, optional
         Called as progress(done, total) while a GeoTIFF or a folder is written.
 
@@ -186,6 +190,7 @@ def export(
         beam=beam,
         north_arrow=north_arrow,
         scale_bar=scale_bar,
+        caption=caption,
     )
     validate.instance("georeference", georeference, Georeference, type(None))
     validate.progress(progress)
@@ -261,6 +266,7 @@ class ExportOptions:
     beam: BeamWindow | None = None
     north_arrow: Annotated[bool, Flag("Draw an arrow to the north into a picture.")] = False
     scale_bar: Annotated[bool, Flag("Draw a scale bar into a picture.")] = False
+    caption: Annotated[bool, Flag("Write the error of the image below a picture.")] = False
 
     def __post_init__(self) -> None:
         """Check every field, and convert those that are declared."""
@@ -400,6 +406,7 @@ def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
             "METHOD": formed.method,
             "TOLERANCE_DB": formed.tolerance_db,
             "PREDICTED_ERROR_DB": formed.predicted_error_db,
+            **_measured(formed.certificate),
             "PLAN": formed.plan or None,
             "BEAM": None if formed.beam is None else repr(formed.beam),
             "LEFT_OUT": ", ".join(formed.left_out) or None,
@@ -425,6 +432,17 @@ def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
                 "X_AXIS_HEADING_DEG": place.heading_deg,
             }
     return {name: value for name, value in known.items() if value is not None}
+
+
+def _measured(certificate: Certificate | None) -> dict[str, Any]:
+    """Return the tags of a measured error."""
+    if certificate is None:
+        return {}
+    return {
+        "MEASURED_ERROR_DB": certificate.error_db,
+        "MEASURED_ERROR_UPPER_DB": certificate.upper_db,
+        "MEASURED_PIXELS": certificate.pixels,
+    }
 
 
 class _Format(NamedTuple):
@@ -463,7 +481,7 @@ _FORMATS = (
     _Format(
         PICTURES,
         _write_picture,
-        options=_COLOURS | {"north_arrow", "scale_bar"},
+        options=_COLOURS | {"north_arrow", "scale_bar", "caption"},
         of_heights={"colour_map"},
     ),
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import math
 import os
+import textwrap
 from collections.abc import Sequence
 from html import escape
 from io import BytesIO
@@ -51,6 +52,7 @@ _PREVIEW_IN, _PREVIEW_DPI = 4.5, 96.0  # for 10 to 100 kB in a notebook
 _PREVIEW_LEVELS, _PREVIEW_GREYS = 208, 48  # 0.3 dB each over 60 dB, and 48 for letters
 _BAR = 0.25  # largest length of a scale bar relative to the width of the axes: a plain choice
 _ARROW = 0.1  # length of the arrow relative to the shorter side: a plain choice
+_LETTERS_PER_IN, _LEAST_LETTERS = 9, 40  # in a line of a caption, by the width of the figure
 _HORIZONTAL = 1e-6  # least part of a step that must be horizontal
 _LIGHT: Any = {"color": "white", "fontweight": "bold", "fontsize": "small"}
 _PANEL_IN, _LEAST_PANEL_IN = 4.3, 1.7  # largest and smallest width of each of two images
@@ -70,6 +72,7 @@ def image(
     colour_bar: bool = True,
     north_arrow: bool = False,
     scale_bar: bool = False,
+    caption: bool = False,
     title: str = "",
 ) -> Axes:
     """Draw the amplitude of an image in dB over metres or millimetres.
@@ -100,6 +103,8 @@ def image(
         True to draw the scale of levels beside the axes.
     north_arrow, scale_bar : bool
         True to draw an arrow to the north, which needs a georeference, and a bar of a round length.
+    caption : bool
+        True to write below the image how large its error is: as measured, or else as predicted.
     title : str
         Title above the axes.
 
@@ -113,8 +118,8 @@ def image(
         If matplotlib is not installed.
     TypeError, ValueError
         If an argument has the wrong type or is out of bounds, the image has arbitrary points
-        (`volume` draws those of a box), or `north_arrow` is set for an image without a georeference
-        or on a vertical plane.
+        (`volume` draws those of a box), `north_arrow` is set for an image without a georeference or
+        on a vertical plane, or `caption` for one whose error is not known.
 
     See Also
     --------
@@ -127,6 +132,7 @@ def image(
     scale = Scale(dynamic_range_db, percentiles, reference, colour_map)
     for name, flag in {
         "colour_bar": colour_bar, "north_arrow": north_arrow, "scale_bar": scale_bar,
+        "caption": caption,
     }.items():  # fmt: skip
         validate.flag(name, flag)
     title = drawable("title", title)
@@ -146,6 +152,8 @@ def image(
         _draw_north(axes, image.grid)
     if scale_bar:
         _draw_scale_bar(axes, 1 / grid_unit(image.grid)[0])
+    if caption:
+        _write_caption(axes, image)
     return axes
 
 
@@ -158,7 +166,7 @@ def image_db(image: Image, *, title: str = "", **options: Any) -> Figure:
         As for `image`.
     **options
         Further arguments of `image`: `dynamic_range_db`, `percentiles`, `reference`, `colour_map`,
-        `colour_bar`, `north_arrow` and `scale_bar`.
+        `colour_bar`, `north_arrow`, `scale_bar` and `caption`.
 
     Raises
     ------
@@ -217,6 +225,20 @@ def image_html(image: Image) -> str:
     reduced.save(small, format="png", optimize=True)
     encoded = base64.b64encode(small.getvalue()).decode()
     return f'<div><img alt="Amplitude in dB" src="data:image/png;base64,{encoded}">{text}</div>'
+
+
+def _write_caption(axes: Axes, image: Image) -> None:
+    """Write the error of an image below its axes."""
+    formed = image.formed
+    if formed is None or (formed.certificate is None and formed.predicted_error_db is None):
+        raise ArgumentError("caption", "be off for an image whose error is not known")
+    text = formed.prediction
+    if formed.certificate is not None:
+        text = formed.certificate.describe(formed.tolerance_db)
+    # As a part of the label, whose width does not change the layout of narrow images.
+    letters = max(int(_LETTERS_PER_IN * _size_in(image)[0]), _LEAST_LETTERS)
+    lines = [axes.get_xlabel(), *textwrap.wrap(text.replace("-", "−"), letters)]
+    axes.set_xlabel("\n".join(lines))
 
 
 def _draw_north(axes: Axes, grid: Grid) -> None:
