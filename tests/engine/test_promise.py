@@ -8,7 +8,7 @@ from families import draw
 from judging import SLOW
 
 import clsas
-from clsas.engine import imaging
+from clsas.engine import promise
 from clsas.engine.device.device import open_device
 from clsas.engine.promise import MOST, kept, more_pixels
 from clsas.selftest import extremes
@@ -45,12 +45,12 @@ def test_images_say_how_wrong_they_are(form, known):
 def test_images_that_take_long_are_certified_by_default(known, monkeypatch):
     """And only the first one of an imager."""
     lines, grid = known.lines, known.grid
-    monkeypatch.setattr(imaging, "LEAST_SECONDS", 0.0)
+    monkeypatch.setattr(promise, "LEAST_SECONDS", 0.0)
     with clsas.Imager(lines, grid, accuracy_db=-80) as imager:
         first, second = imager(lines), imager(lines)
     assert first.formed.certificate.pixels >= 64
     assert second.formed.certificate is None
-    monkeypatch.setattr(imaging, "LEAST_SECONDS", np.inf)
+    monkeypatch.setattr(promise, "LEAST_SECONDS", np.inf)
     assert clsas.backproject(lines, grid).formed.certificate is None
     assert clsas.factorize(lines, grid, -40).formed.certificate is None
 
