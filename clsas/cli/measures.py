@@ -71,7 +71,10 @@ def certify(
         image = load(image_file, clsas.Image)
         formed = image.formed
     if formed is not None:
-        tolerance_db, described = formed.tolerance_db, replace(described, image={"beam": formed.beam})
+        tolerance_db, described = (
+            formed.tolerance_db,
+            replace(described, image={"beam": formed.beam}),
+        )
         if formed.method != "mosaic" and formed.lines_digest != samples_digest(lines):
             warn(f"{image_file} was formed from other lines than those of {lines_file}")
     found = clsas.certify(image, lines, beam=read_beam(described, beam), **how, device=device)

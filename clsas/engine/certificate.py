@@ -60,7 +60,7 @@ _PADDING = 64  # zeros at either end of a line that is made denser, beyond the r
 _SPECTRA, _SPECTRUM_SAMPLES = 512, 256  # pieces of lines that show where the band lies
 _OUTSIDE = (1e-6, 1e-4, 1e-3, 1e-2, 5e-2)  # shares of the power that may lie outside the band
 _WIDEST = 0.95  # width of a band beside which there is a guard band, cycles per sample
-_QUIET = 2.0  # by which the guard band must have less power than a mean band of its width
+_GUARD, _QUIET = 0.0125, 0.25  # half the width of a guard band, and its most power, of the mean
 
 
 def certify(
@@ -579,14 +579,30 @@ def _spectrum(
 def _middle_of_band(power: NDArray[np.float64]) -> float:
     """Return the middle of the band that lines with a power spectrum occupy, cycles per sample.
 
-    The band leaves out as little power as possible and yet has a guard band beside it. It does not
-    contain half the sample rate if that is quiet; else it is the narrowest arc of the circle of
-    frequencies. A white floor of noise does not count.
-
     Raises
     ------
     ValueError
-        If there is no guard band.
+        If there is no guard band around the frequency half a cycle per sample away from it.
+    """
+    bins, middle = len(power), _least_power_outside(power)
+    apart = (scipy.fft.fftfreq(bins) - middle + 0.5) % 1 - 0.5
+    guard = power[np.abs(apart) > 0.5 - _GUARD]
+    if guard.mean() <= _QUIET * power.mean():
+        return middle
+    raise ArgumentError(
+        "lines",
+        "leave a part of the sampled band empty, without which their values between samples, and "
+        "so the error of an image, are not defined",
+        "a band that fills it",
+    )
+
+
+def _least_power_outside(power: NDArray[np.float64]) -> float:
+    """Return the middle of the band that leaves out as little power as possible.
+
+    It has a guard band beside it if that is possible. It does not contain half the sample rate if
+    that is quiet; else it is the narrowest arc of the circle of frequencies. A white floor of noise
+    does not count.
     """
     bins = len(power)
     if not power.any():
@@ -598,20 +614,14 @@ def _middle_of_band(power: NDArray[np.float64]) -> float:
     ascending = np.cumsum(scipy.fft.fftshift(power)) / power.sum()
     for outside in _OUTSIDE:
         low, high = np.searchsorted(ascending, [outside / 2, 1 - outside / 2])
-        widest = min(_WIDEST, 1 - _QUIET * outside) * bins
-        if high - low + 1 <= widest:
+        if high - low + 1 <= _WIDEST * bins:
             return float((low + high) / 2 - bins // 2) / bins
         ends = np.searchsorted(until, until[:bins] + (1 - outside) * until[bins])
         lengths = ends - np.arange(bins)
         first = int(lengths.argmin())
-        if lengths[first] <= widest:
-            return ((first + (int(lengths[first]) - 1) / 2) / bins + 0.5) % 1 - 0.5
-    raise ArgumentError(
-        "lines",
-        "leave a part of the sampled band empty, without which their values between samples, and "
-        "so the error of an image, are not defined",
-        "a band that fills it",
-    )
+        if lengths[first] <= _WIDEST * bins:
+            break
+    return ((first + (int(lengths[first]) - 1) / 2) / bins + 0.5) % 1 - 0.5
 
 
 def _filter_for(power: NDArray[np.float64], middle: float, stopband_db: float) -> tuple[int, int]:
