@@ -95,9 +95,14 @@ def _in_words(step: StepRecord) -> str:
             f"; sharpness {numbers['sharpness_before']:.4g} to {numbers['sharpness_after']:.4g}"
             + ("" if numbers["focused"] else ", left as it was")
         )
-    if step.name == "image" and "before" in numbers and numbers["peak_db"] is not None:
-        gain_db = numbers["peak_db"] - (numbers["before"]["peak_db"] or 0.0)
-        return f"; peak {gain_db:+.1f} dB by the corrections"
+    if step.name == "image":
+        words = ""
+        if "before" in numbers and numbers["peak_db"] is not None:
+            gain_db = numbers["peak_db"] - (numbers["before"]["peak_db"] or 0.0)
+            words = f"; peak {gain_db:+.1f} dB by the corrections"
+        if numbers.get("error") is not None:
+            words += f"; {numbers['error']}"
+        return words
     if step.name == "heights":
         return f"; {heights.in_words(numbers)}"
     return ""

@@ -308,6 +308,7 @@ def _figures(image: Image) -> dict[str, Any]:
     certificate = formed.certificate
     errors = {
         "predicted_error_db": formed.predicted_error_db,
+        "error": None if certificate is None else certificate.describe(formed.tolerance_db),
         "certificate": None if certificate is None else certificate.figures,
         "misses": list(formed.misses),
     }
