@@ -98,22 +98,18 @@ class Certificate:
         """Return a bound of the error.
 
         Errors have a long upper tail, so that estimates are too low more often than too high. The
-        third moment corrects this (Johnson 1978).
+        third moment corrects the upper bound (Johnson 1978). The lower one is left where it is:
+        one draw with a large error must not exclude small ones.
         """
         if self.pixels < min(2, self.of_pixels):
             return side * math.inf
         deviation = math.sqrt(self.error_variance)
         if not deviation:
             return self.error_db
-        skewness = self.error_third / deviation**3
-        quantile = side * _QUANTILE + skewness / 6 * (1 + 2 * _QUANTILE**2)
+        quantile = side * _QUANTILE
+        if side > 0:
+            quantile += self.error_third / deviation**3 / 6 * (1 + 2 * _QUANTILE**2)
         return in_db(max(self.error + quantile * deviation, 0.0))
-
-    @property
-    def figures(self) -> dict[str, Any]:
-        """The error, its bounds, and all that they follow from."""
-        bounds = {name: getattr(self, name) for name in ("error_db", "lower_db", "upper_db")}
-        return bounds | {each.name: getattr(self, each.name) for each in fields(self)}
 
     def verdict(self, tolerance_db: float) -> str:
         """Return "met", "missed" or "undecided": whether the error is within a tolerance.
