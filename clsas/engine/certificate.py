@@ -18,7 +18,6 @@ import numpy as np
 import scipy.fft
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.signal import kaiser_beta
 from scipy.spatial.distance import cdist
 
 from clsas.engine.data import validate
@@ -669,6 +668,8 @@ def _tap_numbers(taps: int) -> NDArray[np.int64]:
 @cache
 def _taps(taps: int, stopband_db: float) -> NDArray[np.float64]:
     """Return the taps of a sinc under a Kaiser window for every phase, [phases, taps]."""
+    from scipy.signal import kaiser_beta  # takes a tenth of a second
+
     beta = kaiser_beta(stopband_db)
     offset = np.arange(_PHASES + 2)[:, None] / _PHASES - _tap_numbers(taps)
     inside = np.sqrt(np.maximum(1 - (2 * offset / taps) ** 2, 0))

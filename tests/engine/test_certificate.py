@@ -330,7 +330,7 @@ def test_a_certificate_describes_itself():
         "error -52.3 dB (below -51.7 dB with 95 % confidence, measured at 256 pixels); -50 dB "
         "requested"
     )
-    assert "between -52.9 and -51.7 dB with 90 % confidence" in found.describe(-52)
+    assert "between -53.0 and -51.7 dB with 90 % confidence" in found.describe(-52)
     assert [found.verdict(each) for each in (-51, -52, -54)] == ["met", "undecided", "missed"]
 
 

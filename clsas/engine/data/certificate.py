@@ -111,6 +111,12 @@ class Certificate:
             quantile += self.error_third / deviation**3 / 6 * (1 + 2 * _QUANTILE**2)
         return in_db(max(self.error + quantile * deviation, 0.0))
 
+    @property
+    def figures(self) -> dict[str, Any]:
+        """The error, its bounds, and all that they follow from."""
+        bounds = {name: getattr(self, name) for name in ("error_db", "lower_db", "upper_db")}
+        return bounds | {each.name: getattr(self, each.name) for each in fields(self)}
+
     def verdict(self, tolerance_db: float) -> str:
         """Return "met", "missed" or "undecided": whether the error is within a tolerance.
 

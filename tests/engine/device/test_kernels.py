@@ -32,6 +32,7 @@ OPTIONS = {
     "later_sheet_stage": [STAGE],
     "upsample_lines": [NUMBERS | {"PHASES": 64, "FREQUENCY_SHIFT": shift} for shift in (0, 1)],
     "peak": [NUMBERS | {"CHAINS": 8}],
+    "sum_pixels": [{"PHASES": 512, "GROUP": 16, "POINTS": 16}],
 }
 """Options of kernels that make their parameters differ."""
 
