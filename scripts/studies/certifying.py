@@ -6,7 +6,6 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -53,12 +52,20 @@ def of(
     accuracy_db: float | None = None,
 ) -> Form:
     """Return what forms the image of lines, exactly if an accuracy is given."""
-    options = {"beam": beam, "device": device}
-    if accuracy_db is None:
-        form = partial(clsas.factorize, lines, grid, TOLERANCE_DB, **options)
-    else:
-        form = partial(clsas.backproject, lines, grid, accuracy_db=accuracy_db, **options)
-    return lambda certificate: form(certificate=certificate).formed.certificate
+
+    def form(certificate: bool) -> clsas.Certificate | None:
+        if accuracy_db is None:
+            image = clsas.factorize(
+                lines, grid, TOLERANCE_DB, beam=beam, device=device, certificate=certificate
+            )
+        else:
+            image = clsas.backproject(
+                lines, grid, accuracy_db=accuracy_db, beam=beam, device=device,
+                certificate=certificate,
+            )  # fmt: skip
+        return certificate_of(image)
+
+    return form
 
 
 def of_wreck(device: str | None) -> Form:
@@ -67,12 +74,19 @@ def of_wreck(device: str | None) -> Form:
     lines, grid = wreck.lines(), wreck.grid(pixels)
 
     def form(certificate: bool) -> clsas.Certificate | None:
-        options = {"tolerance_db": TOLERANCE_DB, "beam": beam, "device": device}
-        image = clsas.mosaic(lines, grid, **options, certificate=certificate).image()
-        assert image.formed is not None
-        return image.formed.certificate
+        mosaic = clsas.mosaic(
+            lines, grid, tolerance_db=TOLERANCE_DB, beam=beam, device=device,
+            certificate=certificate,
+        )  # fmt: skip
+        return certificate_of(mosaic.image())
 
     return form
+
+
+def certificate_of(image: clsas.Image) -> clsas.Certificate | None:
+    """Return the certificate of an image that was just formed."""
+    assert image.formed is not None
+    return image.formed.certificate
 
 
 def compared(name: str, form: Form) -> list[str]:
