@@ -38,7 +38,9 @@ def rows(device: str | None = None) -> Iterator[list[str]]:
     noisy = replace(lines, samples=lines.samples + noise.astype(np.complex64))
     yield compared("ffbp-2k, white noise", of(noisy, case.grid, case.beam, device))
     relief = cases.FACTORIZED_CASES["ffbp-relief"]
-    profile = clsas.SoundSpeed([0, 10, 30], [1500, 1495, 1485], surface_z_m=5)
+    profile = clsas.SoundSpeed(
+        np.array([0.0, 10, 30]), np.array([1500.0, 1495, 1485]), surface_z_m=5.0
+    )
     below = replace(relief.lines(), sound_speed=profile)
     yield compared("ffbp-relief, sound-speed profile", of(below, relief.grid, relief.beam, device))
     yield compared("mosaic-wreck", of_wreck(device))
