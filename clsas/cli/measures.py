@@ -48,7 +48,7 @@ def certify(
 ) -> None:
     """Measure the error of an image against its range lines.
 
-    A few hundred pixels are formed again in double precision, straight from the lines and the
+    A few hundred pixels are formed again, straight from the lines and the
     positions of the antennas, and compared with those of the image. It may come from any imager or
     program, and be the Zarr store of a mosaic that fits into memory. LINES.H5 may also be a
     recording of another kind. The beam is that with which clsas formed the image, or else that of

@@ -34,7 +34,7 @@ from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.engine.factorized.plan import ExactImage
 from clsas.files.scene_files import SceneFile, simulation_digest
 from clsas.files.scene_tables import PLAN_KEYS, MosaicTable
-from clsas.mosaics.document import Record, check_place
+from clsas.mosaics.document import check_place
 from clsas.mosaics.patches import patch_shape_of
 
 _SCHEDULER_S = 10  # how long a scheduler may take to answer; arbitrary
@@ -91,6 +91,7 @@ def _cluster(
 )
 @options.of(ExactImage, "accuracy_db", into="request")
 @options.beam
+@options.promise
 @options.of(MosaicTable, "patches", "memory_mib", into="divided", types={"patches": COUNTS})
 @click.option("--device", multiple=True, help="Device to use; repeat the option to use several.")
 @options.of(_cluster, "workers", into="cluster")
@@ -117,6 +118,7 @@ def mosaic(
     request: dict[str, Any],
     exact: bool,
     beam: dict[str, Any],
+    promise: dict[str, Any],
     divided: dict[str, Any],
     device: tuple[str, ...],
     cluster: dict[str, Any],
@@ -170,7 +172,8 @@ def mosaic(
         formed = clsas.mosaic(
             lines_path, grid, output, **request, beam=window, patches=patches,
             memory_bytes=memory_mib and memory_mib << 20, device=devices,
-            client=client, follow_s=idle.get("follow_s", _IDLE_S) if follow else None,
+            client=client, **(described.promise | promise),
+            follow_s=idle.get("follow_s", _IDLE_S) if follow else None,
         )  # fmt: skip
         before = len(formed.finished)
         new, pixels = _form(formed, output.name, quiet=as_json)
@@ -180,7 +183,7 @@ def mosaic(
         from clsas import plot
 
         plot.save(plot.mosaic(store, borders=borders, **levels), picture)
-    words, figures = _results(formed, store.records())
+    words, figures = _results(formed, store)
     rate = pixels / seconds
     done = f"{new} formed in {seconds:.2f} s ({rate / 1e6:.3g} Mpixel/s)" if new else "none to form"
     words[0] += f", {done}" + (f", {before} finished before" if before else "")
@@ -242,13 +245,12 @@ def _form(formed: clsas.Mosaic, name: str, *, quiet: bool) -> tuple[int, int]:
     return new, pixels
 
 
-def _results(
-    formed: clsas.Mosaic, records: dict[tuple[int, int], Record]
-) -> tuple[list[str], dict[str, Any]]:
+def _results(formed: clsas.Mosaic, store: clsas.Store) -> tuple[list[str], dict[str, Any]]:
     """Return patches, errors and flags of a mosaic: in words, and in types of JSON.
 
     The first item of the words describes the patches.
     """
+    records, certificate = store.records(), store.certificate()
     # Errors are relative to the image, so they are undefined for a patch of zeros.
     errors = [record.predicted_error_db for record in records.values() if record.has_pixels]
     worst = max((error for error in errors if error is not None), default=None)
@@ -260,6 +262,9 @@ def _results(
         words.append("; all pixels are zero")
     elif worst is not None:
         words.append(f"; predicted error at most {worst:.1f} dB")
+    if certificate is not None:
+        tolerance_db = store.document.inputs.get("tolerance_db")
+        words.append(f"\n  {certificate.describe(tolerance_db)}")
     words += [f"\n{line}" for line in described_flags(flagged)]
     return words, {
         "shape": formed.grid.shape,
@@ -267,6 +272,7 @@ def _results(
         "patch_shape": formed.patch_shape,
         "finished": len(records),
         "predicted_error_db": worst,
+        "certificate": None if certificate is None else certificate.whole.figures,
         "is_zero": zero,
         "flags": {f"{row},{column}": flags for (row, column), flags in flagged.items()},
         "seconds_of_patches": sum(record.seconds for record in records.values()),

@@ -371,7 +371,7 @@ def mosaic_step(job: Job) -> dict[str, Any]:
     def begin(store: Path) -> Mosaic:
         return mosaic(
             lines, grid, store, **request, beam=job.beam, patches=patches,
-            memory_bytes=memory_mib and memory_mib << 20, device=job.device,
+            memory_bytes=memory_mib and memory_mib << 20, device=job.device, **job.scene.promise,
         )  # fmt: skip
 
     path, formed = _begun(job, "mosaic", begin)
