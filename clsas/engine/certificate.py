@@ -16,7 +16,6 @@ from typing import Annotated
 
 import numpy as np
 import scipy.fft
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
@@ -50,7 +49,7 @@ _DRAWN_AT_ONCE = 1 << 11  # bounds memory for the blocks of the pixels drawn
 _PHASES = 512
 _TAPS = (12, 16, 20, 24, 28, 32, 40, 48, 56, 64)  # tried before lines are made twice as dense
 _DENSE_TAPS = 20  # enough for -120 dB if lines are twice as dense
-_STOPBANDS_DB = (70.0, 110.0)  # least and most
+_STOPBANDS_DB = (70.0, 120.0)  # least and most
 _BELOW_TOLERANCE_DB = 25.0  # by which filters are better than an image may be
 _SLACK_DB = 5.0  # by which the error of a filter may exceed that of its stop band
 _GROUP, _POINTS = 16, 16  # channels that a work-item adds up in single precision, and points
@@ -560,19 +559,21 @@ def _wavelength_m(lines: RangeLines) -> float:
 def _spectrum(
     lines: RangeLines, points_m: NDArray[np.float64], random: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return the power spectrum of pieces of lines around points, frequencies as in FFTs."""
+    """Return the power spectrum of pieces of lines around points, frequencies as in FFTs.
+
+    A line that is cut off near a point has all frequencies there.
+    """
     channels = some_channels(lines.channels, _SPECTRA)
-    count = min(lines.length, _SPECTRUM_SAMPLES)
     pieces = -(-_SPECTRA // len(channels))
     points_m = points_m[random.integers(len(points_m), size=min(pieces, len(points_m)))]
     some = replace(lines, samples=lines.samples[:, :1]).select(channels)  # for their ranges alone
     position = (_ranges_m(some, points_m) - some.first_range_m[:, None]) / some.range_step_m
-    first = np.clip(np.nan_to_num(position - count / 2), 0, lines.length - count).astype(np.int64)
-    windows = sliding_window_view(lines.samples, count, axis=1)
-    window = np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 4
-    taken = windows[channels[:, None], first].reshape(-1, count) * window.astype(np.float32)
-    bins = scipy.fft.next_fast_len(max(count, 64))
-    return _power(scipy.fft.fft(taken, bins, axis=1)).sum(axis=0)
+    middle = np.clip(position, 0, lines.length - 1).astype(np.int64)
+    index = middle[..., None] + np.arange(_SPECTRUM_SAMPLES) - _SPECTRUM_SAMPLES // 2
+    taken = lines.samples[channels[:, None, None], np.clip(index, 0, lines.length - 1)]
+    window = np.sin(np.pi * (np.arange(_SPECTRUM_SAMPLES) + 0.5) / _SPECTRUM_SAMPLES) ** 4
+    taken = taken * np.where((index >= 0) & (index < lines.length), window, 0).astype(np.float32)
+    return _power(scipy.fft.fft(taken, axis=-1)).sum(axis=(0, 1))
 
 
 def _middle_of_band(power: NDArray[np.float64]) -> float:

@@ -307,14 +307,16 @@ def test_the_snippets_of_the_documentation_run_where_patches_are_unseen(tmp_path
     found = re.findall(r"```python\n(.*?)```", text, re.S)
     # Others need a cluster, or lines of two banks (tests/mosaics/test_height_mosaic.py).
     snippets = [s for s in found if "Client" not in s and "mosaic_heights" not in s]
-    assert len(snippets) == 5
+    assert len(snippets) == 6
     pytest.importorskip("xarray")
     # Few pixels, most of them beyond the track and the recorded ranges.
     small = snippets[0].replace("(0, 500, 10001)", "(0, 500, 56)")
-    small = small.replace("(30, 130, 2001)", "(30, 130, 48)").replace("tol", "patches=(2, 5), tol")
+    small = small.replace("(30, 130, 2001)", "(30, 130, 48)").replace(
+        "tol", "certificate=True, patches=(2, 5), tol"
+    )
     names = {"lines": LINES}
-    part = snippets[4].replace("slice(2000, 3000)", "slice(20, 30)")
-    for snippet in (small, *snippets[1:4], part):
+    part = snippets[5].replace("slice(2000, 3000)", "slice(20, 30)")
+    for snippet in (small, *snippets[1:5], part):
         exec(snippet, names)
     pytest.importorskip("matplotlib.pyplot").close()  # of what xarray plotted
     records = Store.opened("image.zarr").records().values()

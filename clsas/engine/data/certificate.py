@@ -122,6 +122,7 @@ class Certificate:
 
         It is undecided if the tolerance lies between the bounds of the error.
         """
+        tolerance_db = validate.number("tolerance_db", tolerance_db, "dB")
         if self.upper_db <= tolerance_db:
             return "met"
         return "missed" if self.lower_db > tolerance_db else "undecided"

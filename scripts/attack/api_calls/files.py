@@ -96,6 +96,7 @@ def files(folder: Path) -> dict[str, Call]:
             opened.overview, {"most": 8, "rows": slice(0, 4), "columns": slice(1, 5)}
         ),
         "Store.records": Call(opened.records, {}),
+        "Store.certificate": Call(opened.certificate, {}),
         "Store.array_damage": Call(opened.array_damage, {}),
         "Store.damage": Call(opened.damage, {"progress": nothing}, accepts={"progress": optional}),
         "Store.begin": Call(

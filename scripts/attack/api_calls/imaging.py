@@ -18,6 +18,7 @@ from clsas.engine.factorized.costs import Costs
 def imaging(folder: Path) -> dict[str, Call]:
     s = scene(folder)
     lines, grid, beam, plan = s.lines, s.grid, s.beam, s.plan
+    certificate = clsas.certify(s.image, lines, beam=beam, pixels=40, seed=1)
     few = lines.select(slice(0, 20))
     scene_names = {"lines": ("samples", "range_step_m", "carrier_hz"), "grid": ("height_m",)}
     whole = {"lines": lines, "grid": grid}
@@ -36,13 +37,15 @@ def imaging(folder: Path) -> dict[str, Call]:
                 "taps": 4,
                 "upsampling": 2.0,
                 "beam": beam,
+                "certificate": False,
+                "on_miss": "warn",
                 "accumulate": s.image,
                 "progress": nothing,
             },
             kinds=device,
             names=scene_names,
             accepts=dict.fromkeys(
-                ("taps", "upsampling", "beam", "accumulate", "progress"), optional
+                ("taps", "upsampling", "beam", "certificate", "accumulate", "progress"), optional
             ),
         ),
         "factorize": Call(
@@ -52,12 +55,14 @@ def imaging(folder: Path) -> dict[str, Call]:
                 "plan_or_tolerance": plan,
                 "beam": None,
                 "device": 0,
+                "certificate": False,
+                "on_miss": "warn",
                 "accumulate": s.image,
                 "progress": nothing,
             },
             kinds=device,
             names=scene_names,
-            accepts=dict.fromkeys(("beam", "accumulate", "progress"), optional),
+            accepts=dict.fromkeys(("beam", "certificate", "accumulate", "progress"), optional),
         ),
         "wavenumber": Call(
             clsas.wavenumber,
@@ -113,8 +118,14 @@ def imaging(folder: Path) -> dict[str, Call]:
         "Imager.close": Call(clsas.Imager(lines, grid, plan).close, {}),
         "Imager:called": Call(
             clsas.Imager(lines, grid, accuracy_db=-50.0),
-            {"lines": lines, "accumulate": s.image, "progress": nothing},
-            accepts=dict.fromkeys(("accumulate", "progress"), optional),
+            {
+                "lines": lines,
+                "certificate": False,
+                "on_miss": "warn",
+                "accumulate": s.image,
+                "progress": nothing,
+            },
+            accepts=dict.fromkeys(("certificate", "accumulate", "progress"), optional),
         ),
         "plan:tolerance": Call(
             clsas.plan,
@@ -173,10 +184,23 @@ def imaging(folder: Path) -> dict[str, Call]:
         ),
         "certify": Call(
             clsas.certify,
-            {"image": s.image, "lines": lines, "beam": beam, "pixels": 40, "seed": 1},
+            {
+                "image": s.image,
+                "lines": lines,
+                "beam": beam,
+                "pixels": 40,
+                "seed": 1,
+                "scale": False,
+                "device": 0,
+            },
+            kinds=device,
             names={"lines": scene_names["lines"]},
             accepts=dict.fromkeys(("beam", "seed"), optional),
         ),
+        "Certificate.describe": Call(
+            certificate.describe, {"tolerance_db": -40.0}, accepts={"tolerance_db": optional}
+        ),
+        "Certificate.verdict": Call(certificate.verdict, {"tolerance_db": -40.0}),
         "inspect": Call(
             clsas.inspect,
             whole | {"device": 0, "beam": beam, "element_length_m": 0.1},
@@ -256,12 +280,16 @@ def imaging(folder: Path) -> dict[str, Call]:
                 "memory_bytes": 1 << 28,
                 "device": 0,
                 "client": None,
+                "certificate": False,
+                "on_miss": "warn",
                 "follow_s": None,
             },
             kinds=device,
             skips={"source": ("str",)},
             names=scene_names,
-            accepts=dict.fromkeys(("accuracy_db", "beam", "patches", "memory_bytes"), optional),
+            accepts=dict.fromkeys(
+                ("accuracy_db", "beam", "patches", "memory_bytes", "certificate"), optional
+            ),
         ),
         "mosaic:tolerance": Call(
             _anew(folder / "new.zarr"),

@@ -120,6 +120,7 @@ def maps(folder: Path) -> dict[str, Call]:
                 "path": folder / "map.tif",
                 "north_arrow": False,
                 "scale_bar": False,
+                "caption": False,
             },
             kinds={"colour_map": "text"},
             accepts=unset | {"source": ("an Image",)},

@@ -21,7 +21,7 @@ def pictures(folder: Path) -> dict[str, Call]:
     optional = ("None",)
     levels = {"dynamic_range_db": 40.0, "percentiles": None}
     chosen = {"reference": 1.0, "colour_map": "sonar", "colour_bar": True}
-    marks = {"north_arrow": False, "scale_bar": True}
+    marks = {"north_arrow": False, "scale_bar": True, "caption": False}
     between = {"colour_map": "gray"}
     accepts = dict.fromkeys(("dynamic_range_db", "percentiles", "reference", "axes"), optional)
     micro = navigation(folder)["micronavigate"]
