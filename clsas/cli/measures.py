@@ -25,6 +25,7 @@ from clsas.engine.factorized.planner import TOLERANCE_DB, Request
 from clsas.files.scene_files import SceneFile
 from clsas.maps.sources import Source
 from clsas.measures.quality import DARKEST, Cut, PointResponse, dark_level_db
+from clsas.mosaics.document import requested_db
 
 
 @command()
@@ -65,7 +66,7 @@ def certify(
         store = clsas.Store.opened(image_file)
         Source.of(store, None).check_finished("image")
         image, inputs = store.image(), store.document.inputs
-        tolerance_db, of_store = inputs.get("tolerance_db"), inputs.get("beam")
+        tolerance_db, of_store = requested_db(inputs), inputs.get("beam")
         described = replace(described, image={"beam": of_store and clsas.BeamWindow(**of_store)})
     else:
         image = load(image_file, clsas.Image)

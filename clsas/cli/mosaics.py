@@ -34,7 +34,7 @@ from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.engine.factorized.plan import ExactImage
 from clsas.files.scene_files import SceneFile, simulation_digest
 from clsas.files.scene_tables import PLAN_KEYS, MosaicTable
-from clsas.mosaics.document import check_place
+from clsas.mosaics.document import check_place, requested_db
 from clsas.mosaics.patches import patch_shape_of
 
 _SCHEDULER_S = 10  # how long a scheduler may take to answer; arbitrary
@@ -263,8 +263,8 @@ def _results(formed: clsas.Mosaic, store: clsas.Store) -> tuple[list[str], dict[
     elif worst is not None:
         words.append(f"; predicted error at most {worst:.1f} dB")
     if certificate is not None:
-        tolerance_db = store.document.inputs.get("tolerance_db")
-        words.append(f"\n  {certificate.describe(tolerance_db)}")
+        requested = requested_db(store.document.inputs)
+        words.append(f"\n  {certificate.describe(requested)}")
     words += [f"\n{line}" for line in described_flags(flagged)]
     return words, {
         "shape": formed.grid.shape,

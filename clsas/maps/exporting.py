@@ -10,7 +10,6 @@ from typing import Annotated, Any, NamedTuple
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
-from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.decibels import DYNAMIC_RANGE, REFERENCE
 from clsas.engine.data.declared import Choice, Flag, Number, check_fields
 from clsas.engine.data.georeference import Georeference
@@ -401,12 +400,18 @@ def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
         "PATCHES": len(source.records) or None,
         "WINDOW_M": source.window_m,
     }
+    certificate = source.certificate
+    if certificate is not None:
+        known |= {
+            "MEASURED_ERROR_DB": certificate.error_db,
+            "MEASURED_ERROR_UPPER_DB": certificate.upper_db,
+            "MEASURED_PIXELS": certificate.pixels,
+        }
     if formed is not None:
         known |= {
             "METHOD": formed.method,
             "TOLERANCE_DB": formed.tolerance_db,
             "PREDICTED_ERROR_DB": formed.predicted_error_db,
-            **_measured(formed.certificate),
             "PLAN": formed.plan or None,
             "BEAM": None if formed.beam is None else repr(formed.beam),
             "LEFT_OUT": ", ".join(formed.left_out) or None,
@@ -432,17 +437,6 @@ def _tags(source: Source, options: ExportOptions) -> dict[str, Any]:
                 "X_AXIS_HEADING_DEG": place.heading_deg,
             }
     return {name: value for name, value in known.items() if value is not None}
-
-
-def _measured(certificate: Certificate | None) -> dict[str, Any]:
-    """Return the tags of a measured error."""
-    if certificate is None:
-        return {}
-    return {
-        "MEASURED_ERROR_DB": certificate.error_db,
-        "MEASURED_ERROR_UPPER_DB": certificate.upper_db,
-        "MEASURED_PIXELS": certificate.pixels,
-    }
 
 
 class _Format(NamedTuple):

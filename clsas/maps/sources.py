@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
 from clsas.interferometry.result import Heights
-from clsas.mosaics.document import PatchIndex, Record
+from clsas.mosaics.document import MosaicCertificate, PatchIndex, Record
 from clsas.mosaics.store import Store
 
 _WINDOW = 2048  # rows and columns that are read at once: 32 MiB of pixels; a plain choice
@@ -96,6 +97,14 @@ class Source:
     def inputs(self) -> dict[str, Any]:
         """Inputs of the store's mosaic; empty for an image."""
         return {} if self.store is None else self.store.document.inputs
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """Measured error of the image, or of the whole mosaic."""
+        if self.image is not None:
+            return None if self.image.formed is None else self.image.formed.certificate
+        measured = MosaicCertificate.of(self.records)
+        return None if measured is None else measured.whole
 
     def windows(self) -> Iterator[tuple[slice, slice]]:
         """Yield windows that cover the image. Those of a store are whole patches."""

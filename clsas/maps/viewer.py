@@ -38,6 +38,7 @@ from clsas.engine.data.validate import ArgumentError
 from clsas.engine.data.version import __version__
 from clsas.maps.georeferencing import completed_steps
 from clsas.maps.sources import Source
+from clsas.mosaics.document import MosaicCertificate, requested_db
 from clsas.mosaics.pyramid import BRIGHTEST, block_means, covered, eight_bits
 from clsas.mosaics.store import Store
 from clsas.plot.canvas import COLOUR_MAP, DYNAMIC_RANGE_DB
@@ -165,10 +166,9 @@ def write(
     sides_m = tuple(float(np.linalg.norm(step)) for step in steps_of(known))
     factors = factors_of_scales(readers[0].shape, (sides_m[0], sides_m[1]))
     step_db = max(STEP_DB, range_db / (BRIGHTEST - 1))
-    formed = [None if reader.image is None else reader.image.formed for reader in readers]
     scene = {
         "names": names,
-        "formed": ["" if each is None else each.describe() for each in formed],
+        "formed": [_formed_in_words(reader) for reader in readers],
         "range_db": range_db,
         "colours": tables,
         "version": __version__,
@@ -196,6 +196,14 @@ def write(
                 tiles.add(*window)
         for name, reader in zip(("source", "against"), readers, strict=False):
             reader.check_unchanged(name)
+
+
+def _formed_in_words(source: Source) -> str:
+    """Return how an image was formed, or the measured error of a mosaic; "" if unknown."""
+    if source.image is not None:
+        return "" if source.image.formed is None else source.image.formed.describe()
+    measured = MosaicCertificate.of(source.records)
+    return "" if measured is None else measured.describe(requested_db(source.inputs))
 
 
 def _check_grids(grids: Sequence[Grid]) -> None:
@@ -389,9 +397,9 @@ def fitted_degrees(
 
 
 def _patches(source: Source) -> list[list[Any]]:
-    """Return [first row, first column, rows, columns, predicted error (dB), words] of patches.
+    """Return places of patches, predicted and measured errors (dB), and words.
 
-    An image has none.
+    Each is [first row, first column, rows, columns, predicted, measured, words]. An image has none.
     """
     if source.store is None:
         return []
@@ -402,11 +410,15 @@ def _patches(source: Source) -> list[list[Any]]:
         place = [part.start for part in window] + [part.stop - part.start for part in window]
         record = source.records.get((index[0], index[1]))
         if record is None:
-            found.append([*place, None, "not formed yet"])
+            found.append([*place, None, None, "not formed yet"])
             continue
-        error_db = record.predicted_error_db
-        rounded = None if error_db is None else round(error_db, 1)
-        found.append([*place, rounded, "; ".join(record.flags)])
+        certificate = record.certificate
+        errors_db = record.predicted_error_db, None if certificate is None else certificate.error_db
+        rounded = [
+            round(each, 1) if each is not None and math.isfinite(each) else None
+            for each in errors_db
+        ]
+        found.append([*place, *rounded, "; ".join(record.flags)])
     return found
 
 

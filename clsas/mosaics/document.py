@@ -24,6 +24,7 @@ from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.reading import parse_json, read_bytes
 from clsas.engine.data.validate import ArgumentError
+from clsas.engine.factorized.planner import tolerance_in_db
 from clsas.mosaics.levels import (
     IN_DB,
     LAYERS,
@@ -511,6 +512,13 @@ class Record:
         except (LookupError, TypeError, ValueError) as error:
             raise DamageError("its record is incomplete") from error
         return record, checksums
+
+
+def requested_db(request: Mapping[str, Any]) -> float | None:
+    """Return the tolerance of a request, or of the inputs of a mosaic; None for a fixed method."""
+    if request.get("accuracy_db") is not None:
+        return request["accuracy_db"]
+    return tolerance_in_db(request.get("tolerance_db"), request.get("tolerance_wavelengths"))
 
 
 @dataclass(frozen=True, eq=False)

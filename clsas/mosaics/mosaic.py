@@ -58,7 +58,14 @@ from clsas.engine.promise import CERTIFICATE, ON_MISS, is_wanted, measured, repo
 from clsas.engine.scene import Scene
 from clsas.engine.signal.doubts import warn_before_imaging
 from clsas.mosaics.devices import device_threads, open_devices, process_device, thread_device
-from clsas.mosaics.document import Document, MosaicCertificate, PatchIndex, Record, is_there
+from clsas.mosaics.document import (
+    Document,
+    MosaicCertificate,
+    PatchIndex,
+    Record,
+    is_there,
+    requested_db,
+)
 from clsas.mosaics.patches import Layout, PatchWindow, aligned_shape, patch_shape_of
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import (
@@ -284,7 +291,7 @@ def mosaic(
         _store=stored,
         _inputs=inputs,
         _devices=devices,
-        _tolerance_db=_tolerance_db(request),
+        _tolerance_db=requested_db(request),
         _on_miss=asked["on_miss"],
         _client=client,
         _growth=growth,
@@ -315,12 +322,6 @@ def _checked_request(
         elif not isinstance(value, (int, float)):
             request[name] = float(value)
     return request or DEFAULT_REQUEST
-
-
-def _tolerance_db(request: dict[str, Any]) -> float | None:
-    """Return the tolerance of a request or of an exact image, dB; None for a fixed method."""
-    ways = request.get("tolerance_db"), request.get("tolerance_wavelengths")
-    return request.get("accuracy_db", tolerance_in_db(*ways))
 
 
 def _check_client(client: object, source: object, store: object, device: object) -> None:
@@ -386,7 +387,7 @@ def warn_of_window(beam: BeamWindow, geometry: RangeLines, request: dict[str, An
     growing = _beam_of_growing(beam)
     sine = np.linalg.norm(np.cross(beam.directions(geometry), growing.directions(geometry)), axis=1)
     error = shift_error(beam, float(np.sqrt(np.mean(sine**2))), geometry)
-    if error > power(_tolerance_db(request) or TOLERANCE_DB):
+    if error > power(requested_db(request) or TOLERANCE_DB):
         validate.warn(
             "`source` may grow, or did when the mosaic began: the direction of the track is "
             f"smoothed over {MOST_TRACK_PINGS} pings, whatever their number. The image may differ "
@@ -897,7 +898,7 @@ def _image(
     if not reaches(lines, grid, beam, None if beam is None else beam.along):
         return empty()
 
-    tolerance_db, began = _tolerance_db(request), time.perf_counter()
+    tolerance_db, began = requested_db(request), time.perf_counter()
     if missed is not None:
         assert missed.certificate is not None
         assert tolerance_db is not None
@@ -953,7 +954,7 @@ def _formed(
         )
     accuracy_db = None
     if "accuracy_db" in request or is_soon_done(lines, grid, device):
-        accuracy_db = _tolerance_db(request)  # None for `stages`
+        accuracy_db = requested_db(request)  # None for `stages`
     if accuracy_db is not None:
         scene = Scene.of(lines, grid, beam, accuracy_db)
         scene.warn("accuracy_db", accuracy_db, doubts=False)

@@ -236,11 +236,30 @@ def test_tags_say_how_the_image_was_formed(tmp_path):
     assert tags["METHOD"] == "exact"
     assert float(tags["TOLERANCE_DB"]) == -40
     assert float(tags["PREDICTED_ERROR_DB"]) == pytest.approx(formed.predicted_error_db)
+    assert not any(name.startswith("MEASURED") for name in tags)
     assert tags["PLAN"] == formed.plan
     assert tags["BEAM"] == repr(beam)
     assert tags["DEVICE"] == formed.device
     assert tags["LINES_DIGEST"] == formed.lines_digest
     assert tags["FORMED_BY"] == f"clsas {clsas.__version__}"
+
+
+@pytest.mark.parametrize("kind", ["image", "mosaic"])
+def test_tags_have_measured_errors(kind, tmp_path):
+    lines = replace(LINES, georeference=local(90.0))
+    if kind == "image":
+        source = clsas.backproject(lines, PLANE, accuracy_db=-40, certificate=True)
+        measured = source.formed.certificate
+    else:
+        list(clsas.mosaic(lines, PLANE, tmp_path / "a.zarr", certificate=True, **REQUEST))
+        source = clsas.Store.opened(tmp_path / "a.zarr")
+        measured = source.certificate().whole
+    clsas.export(source, tmp_path / "a.tif")
+    with rasterio.open(tmp_path / "a.tif") as file:
+        tags = file.tags()
+    assert float(tags["MEASURED_ERROR_DB"]) == pytest.approx(measured.error_db)
+    assert float(tags["MEASURED_ERROR_UPPER_DB"]) == pytest.approx(measured.upper_db)
+    assert int(tags["MEASURED_PIXELS"]) == measured.pixels
 
 
 @pytest.fixture(scope="module")

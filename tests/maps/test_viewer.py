@@ -403,6 +403,17 @@ class TestStore:
         ]  # fmt: skip
         errors = [record.predicted_error_db for record in opened.records().values()]
         assert [patch[4] for patch in patches] == pytest.approx(errors, abs=0.05)
+        assert {patch[5] for patch in patches} == {None}
+
+    def test_shows_measured_errors_beside_predicted_ones(self, tmp_path):
+        path = tmp_path / "a.zarr"
+        list(clsas.mosaic(LINES, GRID, path, **REQUEST, certificate=True))
+        opened = clsas.Store.opened(path)
+        viewer.write(opened, tmp_path / "web")
+        scene, measured = scene_of(tmp_path / "web"), opened.certificate()
+        errors = [measured.patches[index].error_db for index in sorted(measured.patches)]
+        assert [patch[5] for patch in scene["patches"]] == pytest.approx(errors, abs=0.05)
+        assert scene["formed"] == [measured.describe(REQUEST["accuracy_db"])]
 
     def test_that_changes_meanwhile_is_refused(self, store, tmp_path, monkeypatch):
         opened = clsas.Store.opened(store)

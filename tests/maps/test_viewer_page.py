@@ -283,7 +283,7 @@ def test_a_slanted_grid_with_a_georeference_and_patches(browser, tmp_path, monke
     monkeypatch.setattr(
         clsas.Georeference, "to_geographic", lambda _, positions_m: to_geographic(positions_m)
     )
-    monkeypatch.setattr(viewer, "_patches", lambda _: [[300, 0, 300, 350, -42.1, "a gap"]])
+    monkeypatch.setattr(viewer, "_patches", lambda _: [[300, 0, 300, 350, -42.1, -44.0, "a gap"]])
 
     class Stub(clsas.Store):
         patch_shape = (300, 350)
@@ -308,7 +308,7 @@ def test_a_slanted_grid_with_a_georeference_and_patches(browser, tmp_path, monke
         [float(n) for n in re.findall(r"[\d.]+", expected)], abs=2e-7
     )
     assert re.fullmatch(r"\S+ N, \S+ W", found)
-    assert browser.text("#patch") == "predicted error −42.1 dB, a gap"
+    assert browser.text("#patch") == "predicted error −42.1 dB, measured −44.0 dB, a gap"
     # The rows of the grid point up on the screen, so that north is 30 degrees to the right of it.
     north = "document.querySelector('#north svg').style.transform"
     assert float(browser.js(north)[7:-4]) == pytest.approx(30, abs=0.5)

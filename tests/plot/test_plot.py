@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsas import plot
+from clsas import Certificate, plot
 from clsas.engine.data.georeference import Georeference
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.image import Image
+from clsas.engine.data.image import Formed, Image
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.signal.echoes import Echoes
 from clsas.measures.quality import measure_point
@@ -264,6 +264,22 @@ def test_axes_of_a_map_are_easting_and_northing():
     tip, tail = np.array(north.get_position()), np.array(north.xy)
     np.testing.assert_allclose((tip - tail)[0], 0, atol=1e-12)
     assert tip[1] > tail[1]
+
+
+def test_captions_say_how_large_the_error_is():
+    certificate = Certificate(64, PIXELS.size, 0.1, 1.0, 1e-5, 1e-12, 0.0)
+    formed = Formed("exact", -40, "4 taps", -41.2, None, (), "GPU", "1", "a")
+    for how, words in (
+        (formed, "predicted error −41.2 dB"),
+        (replace(formed, certificate=certificate), "error −50.0 dB (below −49.2 dB with"),
+    ):
+        axes = plot.image_db(Image(PIXELS, GRID, how), caption=True).axes[0]
+        label, *caption = axes.get_xlabel().split("\n")
+        assert label == "Along-track (m)"
+        assert " ".join(caption).startswith(words)
+    for how in (None, replace(formed, predicted_error_db=None)):
+        with pytest.raises(ValueError, match="caption must be off for an image whose error"):
+            plot.image_db(Image(PIXELS, GRID, how), caption=True)
 
 
 def test_the_arrow_points_to_the_north_of_a_rotated_scene():

@@ -181,6 +181,23 @@ def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+def test_the_image_is_certified_as_the_scene_says(plain):
+    for certificate in ("true", "false"):
+        text = plain.read_text()
+        assert "\n[image]\n" in text
+        given = text.replace("\n[image]\n", f"\n[image]\ncertificate = {certificate}\n")
+        plain.write_text(given)
+        found = clsas.process(plain)
+        plain.write_text(text)
+        assert found.repeated == ("image",)
+        measured, numbers = found.image.formed.certificate, found["image"].numbers
+        if certificate == "true":
+            assert numbers["certificate"]["error"] == measured.error
+            assert numbers["error"] == measured.describe(found.image.formed.tolerance_db)
+        else:
+            assert measured is numbers["certificate"] is numbers["error"] is None
+
+
 def test_a_record_that_cannot_be_read_is_no_licence_to_replace(plain):
     folder = clsas.process(plain).folder
     path, before = folder / "process.json", contents(folder)

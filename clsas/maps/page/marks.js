@@ -24,7 +24,7 @@ function drawPatches() {
   draw.font = "12px system-ui, sans-serif";
   draw.textAlign = "left";
   draw.textBaseline = "top";
-  for (const [row, column, rows, columns, error, words] of scene.patches) {
+  for (const [row, column, rows, columns, predicted, measured, words] of scene.patches) {
     const [lastColumn, lastRow] = [column + columns, row + rows];
     const points = [[column, row], [lastColumn, row], [lastColumn, lastRow], [column, lastRow]]
       .map(([c, r]) => toScreen(...toPlane(c - 0.5, r - 0.5)));
@@ -37,17 +37,19 @@ function drawPatches() {
       points.forEach(([x, y], i) => (i ? draw.lineTo(x, y) : draw.moveTo(x, y)));
       draw.closePath();
     }, colour, 1);
-    const text = patchText(error, words, false);
+    const text = patchText(predicted, measured, words, false);
     const [x, y] = [left < 36 ? 42 : left + 6, Math.max(top, 30) + 5]; // beside numbers of the axis
     const fits = right - x > draw.measureText(text).width + 6 && bottom - y > 16;
     if (fits) outlined(text, x, y, colour);
   }
 }
 
-function patchText(error, words, whole) {
-  const name = whole ? "predicted error " : "";
-  const start = error === null ? "" : `${name}${minus(error.toFixed(1))} dB`;
-  return whole || !start ? [start, words].filter(Boolean).join(", ") : start;
+// Of a label, or of the `whole` line below the image.
+function patchText(predicted, measured, words, whole) {
+  const inDb = (name, error) => (error === null ? "" : `${name}${minus(error.toFixed(1))} dB`);
+  const errors = [inDb(whole ? "predicted error " : "", predicted), inDb("measured ", measured)]
+    .filter(Boolean).join(", ");
+  return whole || !errors ? [errors, words].filter(Boolean).join(", ") : errors;
 }
 
 function drawMeasure() {
@@ -180,7 +182,7 @@ function showReadout() {
   show("geographic", text);
   const patch = inside && state.patches && scene.patches.find(([top, left, rows, columns]) =>
     r >= top && c >= left && r < top + rows && c < left + columns);
-  show("patch", patch ? patchText(patch[4], patch[5], true) : "");
+  show("patch", patch ? patchText(...patch.slice(4), true) : "");
 }
 
 function showNorth() {
