@@ -61,7 +61,7 @@ def certify(
     """
     described = read_scene(scene) if scene is not None else SceneFile(name="")
     lines = load_lines(lines_file, described, **of_bank)
-    tolerance_db, formed = None, None
+    tolerance_db = None
     if image_file.is_dir():
         store = clsas.Store.opened(image_file)
         Source.of(store, None).check_finished("image")
@@ -70,14 +70,11 @@ def certify(
         described = replace(described, image={"beam": of_store and clsas.BeamWindow(**of_store)})
     else:
         image = load(image_file, clsas.Image)
-        formed = image.formed
-    if formed is not None:
-        tolerance_db, described = (
-            formed.tolerance_db,
-            replace(described, image={"beam": formed.beam}),
-        )
-        if formed.method != "mosaic" and formed.lines_digest != samples_digest(lines):
-            warn(f"{image_file} was formed from other lines than those of {lines_file}")
+        if (formed := image.formed) is not None:
+            tolerance_db = formed.tolerance_db
+            described = replace(described, image={"beam": formed.beam})
+            if formed.method != "mosaic" and formed.lines_digest != samples_digest(lines):
+                warn(f"{image_file} was formed from other lines than those of {lines_file}")
     found = clsas.certify(image, lines, beam=read_beam(described, beam), **how, device=device)
     figures = found.figures
     text = found.describe(tolerance_db)

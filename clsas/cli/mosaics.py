@@ -34,7 +34,7 @@ from clsas.engine.exact.decide import ACCURACY_DB
 from clsas.engine.factorized.plan import ExactImage
 from clsas.files.scene_files import SceneFile, simulation_digest
 from clsas.files.scene_tables import PLAN_KEYS, MosaicTable
-from clsas.mosaics.document import check_place, requested_db
+from clsas.mosaics.document import MosaicCertificate, check_place, requested_db
 from clsas.mosaics.patches import patch_shape_of
 
 _SCHEDULER_S = 10  # how long a scheduler may take to answer; arbitrary
@@ -250,7 +250,8 @@ def _results(formed: clsas.Mosaic, store: clsas.Store) -> tuple[list[str], dict[
 
     The first item of the words describes the patches.
     """
-    records, certificate = store.records(), store.certificate()
+    records = store.records()
+    certificate = MosaicCertificate.of(records)
     # Errors are relative to the image, so they are undefined for a patch of zeros.
     errors = [record.predicted_error_db for record in records.values() if record.has_pixels]
     worst = max((error for error in errors if error is not None), default=None)

@@ -463,9 +463,10 @@ class IdealImage:
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Where channels receive from points, and how they add up; all but samples [channels, points].
+    """Samples of some channels, and positions and factors by which they add up at some points.
 
-    Factors turn phases and weigh. They are 0 where a line does not reach a point.
+    All but the samples are [channels, points]. Factors turn phases and weigh. They are 0 where a
+    line does not reach a point.
     """
 
     samples: NDArray[np.complex64]

@@ -9,7 +9,7 @@ from clsas.engine.certificate import PIXELS, Measurement
 from clsas.engine.data import validate
 from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.declared import Choice, Flag
-from clsas.engine.data.image import Formed, Image, holds_any
+from clsas.engine.data.image import Formed, Image, holds_any, prediction
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.device.device import Device
@@ -99,8 +99,8 @@ def kept(
             break
         if certificate.verdict(tolerance_db) != "missed":
             break
-        misses.append(f"{_formed(image).prediction}, {certificate.describe()}")
-        image = form_again(2 * tolerance_db - certificate.error_db)
+        misses.append(miss(_formed(image).predicted_error_db, certificate))
+        image = form_again(tightened_db(certificate, tolerance_db))
         certificate = measured_if_possible(image, lines, device, seconds, tolerance_db)
     formed = replace(
         _formed(image), tolerance_db=tolerance_db, certificate=certificate, misses=tuple(misses)
@@ -161,6 +161,16 @@ def measured_if_possible(
         if holds_any(image.pixels):  # else there has been a warning
             validate.warn(f"the error of the image is not known: {error}")
         return None
+
+
+def miss(predicted_error_db: float | None, certificate: Certificate) -> str:
+    """Return what was predicted and measured of an image that missed its tolerance, in words."""
+    return f"{prediction(predicted_error_db)}, {certificate.describe()}"
+
+
+def tightened_db(certificate: Certificate, tolerance_db: float) -> float:
+    """Return the tolerance, dB, to which an image is formed again: tighter by its miss."""
+    return 2 * tolerance_db - certificate.error_db
 
 
 def report(

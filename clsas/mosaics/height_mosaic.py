@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow, scale_to_all
+from clsas.engine.data.certificate import scaled
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import holds_any
@@ -398,9 +399,7 @@ def measure_patch(
                 scale = scale_to_all(request.beam, pair.a.channels, len(banks[0].members))
                 pixels = scale * measured.heights.image.pixels[inside]
                 layers, known["heights"] = _results(measured, window.grid, inside)
-                if (found := measured.heights.certificate) is not None:
-                    found = replace(found, power=float(scale) ** 2 * found.power)
-                known["certificate"] = found
+                known["certificate"] = scaled(measured.heights.certificate, float(scale))
             known["has_pixels"] = holds_any(pixels)
         record = Record(**known, seconds=time.perf_counter() - start)
     except ValueError as error:

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from clsas.engine.data import reprs, validate
 from clsas.engine.data.beam import MOST_TRACK_PINGS, BeamWindow, scale_to_all
+from clsas.engine.data.certificate import scaled
 from clsas.engine.data.coverage import reaches, warn_unreached
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.declared import check_declared
@@ -54,7 +55,15 @@ from clsas.engine.factorized.planner import (
     tolerance_in_db,
 )
 from clsas.engine.forming import SceneImager, form
-from clsas.engine.promise import CERTIFICATE, ON_MISS, is_wanted, measured, report
+from clsas.engine.promise import (
+    CERTIFICATE,
+    ON_MISS,
+    is_wanted,
+    measured,
+    miss,
+    report,
+    tightened_db,
+)
 from clsas.engine.scene import Scene
 from clsas.engine.signal.doubts import warn_before_imaging
 from clsas.mosaics.devices import device_threads, open_devices, process_device, thread_device
@@ -902,10 +911,8 @@ def _image(
     if missed is not None:
         assert missed.certificate is not None
         assert tolerance_db is not None
-        predicted = f"predicted error {missed.predicted_error_db:.1f} dB"
-        miss = f"{predicted}, {missed.certificate.describe()}"
-        fields["misses"] = (*missed.misses, miss)
-        better_db = 2 * tolerance_db - missed.certificate.error_db  # tighter by the miss
+        fields["misses"] = (*missed.misses, miss(missed.predicted_error_db, missed.certificate))
+        better_db = tightened_db(missed.certificate, tolerance_db)
         request = {"tolerance_db": max(better_db, BEST_TOLERANCE_DB)}
         if missed.misses:
             request = {"accuracy_db": max(better_db, BEST_ACCURACY_DB)}
@@ -921,8 +928,7 @@ def _image(
             fields["unmeasured"] = str(error)
     if (scale := scale_to_all(beam, lines.channels, survey.channels)) != 1:
         image = replace(image, pixels=scale * image.pixels)
-        if (found := fields.get("certificate")) is not None:
-            fields["certificate"] = replace(found, power=float(scale) ** 2 * found.power)
+        fields["certificate"] = scaled(fields.get("certificate"), float(scale))
     record = Record(**fields, seconds=time.perf_counter() - start)
     assert image.formed is not None
     formed = replace(

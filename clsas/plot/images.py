@@ -19,7 +19,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.declared import Number, check_declared
 from clsas.engine.data.extras import is_installed
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.image import Image
+from clsas.engine.data.image import Image, prediction
 from clsas.engine.data.reprs import quantity
 from clsas.engine.data.validate import ArgumentError
 from clsas.measures.quality import on_axes
@@ -232,7 +232,7 @@ def _write_caption(axes: Axes, image: Image) -> None:
     formed = image.formed
     if formed is None or (formed.certificate is None and formed.predicted_error_db is None):
         raise ArgumentError("caption", "be off for an image whose error is not known")
-    text = formed.prediction
+    text = prediction(formed.predicted_error_db)
     if formed.certificate is not None:
         text = formed.certificate.describe(formed.tolerance_db)
     # As a part of the label, whose width does not change the layout of narrow images.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -143,6 +143,13 @@ class Certificate:
             f"at most {self.upper_db:.1f} dB",
             f"{self.pixels} pixels in {reprs.quantity(self.seconds, 's')}",
         )
+
+
+def scaled(certificate: Certificate | None, factor: float) -> Certificate | None:
+    """Return the certificate of an image whose pixels are multiplied by a factor."""
+    if certificate is None:
+        return None
+    return replace(certificate, power=factor**2 * certificate.power)
 
 
 def of_parts(parts: Sequence[Certificate]) -> Certificate:

@@ -86,19 +86,13 @@ class Formed:
         for name in ("plan", "device", "version", "lines_digest"):
             validate.text(name, getattr(self, name))
 
-    @property
-    def prediction(self) -> str:
-        """The predicted error in words."""
-        if self.predicted_error_db is None:
-            return "no predicted error"
-        return f"predicted error {self.predicted_error_db:.1f} dB"
-
     def describe(self) -> str:
         """Return everything but the digest as one line of text."""
         parts = [self.method]
         if self.tolerance_db is not None:
             parts.append(f"tolerance {reprs.quantity(self.tolerance_db, 'dB')}")
-        parts += [self.prediction] if self.predicted_error_db is not None else []
+        if self.predicted_error_db is not None:
+            parts.append(prediction(self.predicted_error_db))
         parts += [self.certificate.describe()] if self.certificate is not None else []
         parts += [self.plan] if self.plan else []
         if self.beam is not None:
@@ -272,6 +266,11 @@ class Image:
         if copy is False and wanted != self.pixels.dtype:
             raise ArgumentError("copy", f"not be False if complex64 is to become {wanted}")
         return self.pixels.astype(wanted, copy=bool(copy))
+
+
+def prediction(error_db: float | None) -> str:
+    """Return a predicted error in words."""
+    return "no predicted error" if error_db is None else f"predicted error {error_db:.1f} dB"
 
 
 def holds_any(pixels: NDArray[np.complex64]) -> bool:
