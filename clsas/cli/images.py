@@ -67,7 +67,7 @@ def image(
 
     The grid is that of --scene, or given by --x, --y and --z. Choose the method by one of
     --tolerance-db, --tolerance-wavelengths, --stages and --exact, or by [image] of the scene. The
-    default is a tolerance of -50 dB against the exact image. If no faster method keeps the
+    default is a tolerance of -50 dB against the exact image. If no faster method meets the
     tolerance, the image is formed exactly. The error of the image is then measured at some pixels,
     as by `clsas certify`. LINES.H5 may also be a recording of another kind.
 
@@ -86,7 +86,7 @@ def image(
     imager, chosen, planned_s = None, None, None
     if request.keys() & set(PLAN_KEYS):
         start = time.perf_counter()
-        if "tolerance_db" in request:  # which other plans do not promise to keep
+        if "tolerance_db" in request:  # which other plans do not promise to meet
             imager = clsas.Imager(lines, grid, **request, beam=window, device=opened)
         else:
             planned = clsas.plan(lines, grid, **request, beam=window, device=opened)

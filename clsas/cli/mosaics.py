@@ -236,13 +236,13 @@ def _form(formed: clsas.Mosaic, name: str, *, quiet: bool) -> tuple[int, int]:
 
     Unless `quiet`, a line is printed for every patch.
     """
-    new, pixels = 0, 0
+    pixels: dict[tuple[int, int], int] = {}  # by patch, since patches may be formed again
     with _patch_progress(name, len(formed), len(formed.finished)) as show_patch:
         for patch in formed:
-            new, pixels = new + 1, pixels + patch.grid.size
+            pixels[patch.row, patch.column] = patch.grid.size
             if not quiet:
-                show_patch(patch)
-    return new, pixels
+                show_patch(patch, len(pixels))
+    return len(pixels), sum(pixels.values())
 
 
 def _results(formed: clsas.Mosaic, store: clsas.Store) -> tuple[list[str], dict[str, Any]]:
@@ -273,7 +273,7 @@ def _results(formed: clsas.Mosaic, store: clsas.Store) -> tuple[list[str], dict[
         "patch_shape": formed.patch_shape,
         "finished": len(records),
         "predicted_error_db": worst,
-        "certificate": None if certificate is None else certificate.whole.figures,
+        "certificate": None if certificate is None else certificate.figures,
         "is_zero": zero,
         "flags": {f"{row},{column}": flags for (row, column), flags in flagged.items()},
         "seconds_of_patches": sum(record.seconds for record in records.values()),
@@ -359,7 +359,7 @@ def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsa
     ) as bar:
         task = bar.add_task(printable(name), total=total, completed=done)
 
-        def show_patch(patch: clsas.Patch) -> None:
+        def show_patch(patch: clsas.Patch, formed: int) -> None:
             record = patch.record
             parts = [f"{record.seconds:.2f} s", f"{record.channels} channels"]
             if not record.has_pixels:
@@ -368,6 +368,6 @@ def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsa
                 parts.append(f"predicted error {record.predicted_error_db:.1f} dB")
             line = f"patch {patch.row},{patch.column}: {', '.join((*parts, *record.flags))}"
             console.print(printable(line), markup=False)
-            bar.advance(task)
+            bar.update(task, completed=done + formed)
 
         yield show_patch

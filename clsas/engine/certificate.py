@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 from types import EllipsisType
 from typing import Annotated
@@ -111,8 +111,8 @@ def certify(
         If an argument has the wrong type, the grid of the image has another georeference than the
         lines, a sound-speed profile does not include its pixels, or the beam does not suit the
         lines or is None for an image that was formed with one. If there is nothing to measure,
-        because neither the image nor the lines have any power there, or because the band of the
-        lines fills the whole sampled band, so that no interpolation is right.
+        because the lines have no echoes at the pixels, or because their band fills the whole
+        sampled band, so that no interpolation is right.
     DeviceError
         If the device does not exist.
 
@@ -236,6 +236,14 @@ class Measurement:
         self._values = np.append(self._values, self.ideal(different)[of_different])
         self.seconds += time.perf_counter() - started
 
+    def sharpen(self) -> None:
+        """Form the pixels drawn so far again with the best filters."""
+        started = time.perf_counter()
+        self._ideal, self._stopband_db = None, _STOPBANDS_DB[1]
+        different, of_different = np.unique(self._drawn, return_inverse=True)
+        self._values = self.ideal(different)[of_different]
+        self.seconds += time.perf_counter() - started
+
     def ideal(self, numbers: NDArray[np.int64]) -> NDArray[np.complex128]:
         """Return pixels of the ideal image, whose flat numbers are given."""
         points_m = self._image.grid.at(numbers)
@@ -251,7 +259,8 @@ class Measurement:
         given = given.astype(np.complex128)
         size, count = len(self._formed), len(self._drawn)
         if scale and (energy := (weight * _power(ideal)).sum()):
-            ideal = ideal * ((weight * ideal.conj() * given).sum() / energy)
+            factor = (weight * ideal.conj() * given).sum() / energy
+            ideal = ideal * (factor or 1.0)  # no factor makes an image of zeros
         error = _power(given - ideal)
         # The mean power of the ideal image differs little from that of the image, which is known.
         known = float(self._power.sum()) / size
@@ -259,9 +268,10 @@ class Measurement:
         if not power > known / 4:  # far from ideal, so that the difference says nothing
             power = float((weight * _power(ideal)).mean())
         if not power:
-            given_db = "only zeros" if not known else "pixels that are not 0"
             raise ArgumentError(
-                "lines", "have echoes at the pixels of the image, to measure its error", given_db
+                "lines",
+                "have echoes at the pixels of the image, to measure its error",
+                "none there" if known else "none there, and an image of zeros",
             )
         errors = weight * error / power
         mean, variance, third = float(errors.mean()), 0.0, 0.0
@@ -567,11 +577,11 @@ def _spectrum(
     channels = some_channels(lines.channels, _SPECTRA)
     pieces = -(-_SPECTRA // len(channels))
     points_m = points_m[random.integers(len(points_m), size=min(pieces, len(points_m)))]
-    some = replace(lines, samples=lines.samples[:, :1]).select(channels)  # for their ranges alone
+    some = lines.select(channels)
     position = (_ranges_m(some, points_m) - some.first_range_m[:, None]) / some.range_step_m
     middle = np.clip(position, 0, lines.length - 1).astype(np.int64)
     index = middle[..., None] + np.arange(_SPECTRUM_SAMPLES) - _SPECTRUM_SAMPLES // 2
-    taken = lines.samples[channels[:, None, None], np.clip(index, 0, lines.length - 1)]
+    taken = np.take_along_axis(some.samples[:, None], np.clip(index, 0, lines.length - 1), axis=-1)
     window = np.sin(np.pi * (np.arange(_SPECTRUM_SAMPLES) + 0.5) / _SPECTRUM_SAMPLES) ** 4
     taken = taken * np.where((index >= 0) & (index < lines.length), window, 0).astype(np.float32)
     return _power(scipy.fft.fft(taken, axis=-1)).sum(axis=(0, 1))
@@ -594,7 +604,7 @@ def _middle_of_band(power: NDArray[np.float64]) -> float:
         "lines",
         "leave a part of the sampled band empty, without which their values between samples, and "
         "so the error of an image, are not defined",
-        "a band that fills it",
+        "power throughout the sampled band",
     )
 
 

@@ -44,6 +44,8 @@ class SceneImager:
         next image.
     decision : Decision, optional
         How an exact image is formed, if that is known.
+    tolerance_db : float, optional
+        Tolerance that was requested, if the image is formed to another one than its plan's.
 
     Attributes
     ----------
@@ -61,9 +63,10 @@ class SceneImager:
         warned: bool = False,
         keep: bool = True,
         decision: Decision | None = None,
+        tolerance_db: float | None = None,
     ) -> None:
         self.scene, self.device, self._warned = scene, device, warned
-        self._plan, self.decision = plan, decision
+        self._plan, self.decision, self._tolerance_db = plan, decision, tolerance_db
         method = plan.method if isinstance(plan, Plan) else plan
         if isinstance(method, ExactImage):
             self.decision = decision or decide(
@@ -109,7 +112,9 @@ class SceneImager:
     def _formed(self, pixels: NDArray[np.complex64], digest: str) -> Formed:
         """Return how pixels were formed; `digest` is that of their lines."""
         plan, scene = self._plan, self.scene
-        if isinstance(plan, Plan):
+        if self._tolerance_db is not None:
+            tolerance_db: float | None = self._tolerance_db
+        elif isinstance(plan, Plan):
             tolerance_db = plan.tolerance_db
         else:
             is_fixed = plan.taps is not None and plan.upsampling is not None

@@ -30,7 +30,7 @@ from clsas.engine.factorized.costs import Costs
 from clsas.engine.factorized.plan import ExactImage, Plan
 from clsas.engine.factorized.planner import BEST_TOLERANCE_DB, TOLERANCE, Request, planned
 from clsas.engine.forming import Progress, SceneImager, form, scene_of_plan
-from clsas.engine.promise import CERTIFICATE, ON_MISS, FormAgain, is_wanted, kept
+from clsas.engine.promise import CERTIFICATE, ON_MISS, FormAgain, certified, is_wanted
 from clsas.engine.scene import Scene
 from clsas.engine.signal.spectrum import (
     FEW_CHANNELS,
@@ -216,8 +216,9 @@ def factorize(
     device : Device, str or int, optional
         See `clsas.engine.device.device.choose`.
     certificate : bool, optional
-        Whether the error of the image is measured, as by `clsas.certify`. By default it is if the
-        image is formed to a tolerance, and planning and forming it take 0.1 s or more.
+        Whether the error of the image is measured, as by `clsas.certify`. By default, it is
+        measured if the image is formed to a tolerance in dB, and planning and forming it take 0.1 s
+        or more.
     on_miss : {"refine", "warn", "raise"}
         What to do if the measured error exceeds the tolerance beyond doubt: form the image again by
         a better plan, and then exactly, with a warning; warn; or raise ToleranceError.
@@ -350,11 +351,11 @@ def backproject(
         Weights of the channels by aspect angle. Pixels outside the beam of a channel take no time.
         Without a beam every channel has the weight 1 everywhere.
     certificate : bool, optional
-        Whether the error of the image is measured, as by `clsas.certify`. By default it is if the
-        image takes 0.1 s or more, and not both `taps` and `upsampling` are given.
+        Whether the error of the image is measured, as by `clsas.certify`. By default, it is
+        measured if the image takes 0.1 s or more, and not both `taps` and `upsampling` are given.
     on_miss : {"refine", "warn", "raise"}
-        What to do if the measured error exceeds `accuracy_db` beyond doubt: warn, or raise
-        ToleranceError. Nothing is better than an exact image, so that "refine" only warns.
+        What to do if the measured error exceeds `accuracy_db` beyond doubt: form the image again
+        to a tighter accuracy, with a warning; warn; or raise ToleranceError.
     accumulate : Image, optional
         Image on the same grid to which this one is added, so that data may arrive in pieces.
         `Image.formed` of the sum is None.
@@ -447,7 +448,17 @@ def backproject(
     scene.warn("accuracy_db", 0.0 if is_fixed else accuracy_db)
     method = ExactImage(accuracy_db, taps=taps, upsampling=upsampling)
     image = form(scene, method, device, progress=progress)
-    image = _kept(image, lines, device, started, not is_fixed, **asked)
+
+    def again(better_db: float) -> Image:
+        better_db = max(better_db, BEST_ACCURACY_DB)
+        scene = Scene.of(lines, grid, beam, better_db)
+        imager = SceneImager(
+            scene, ExactImage(better_db), device, warned=True, keep=False, tolerance_db=accuracy_db
+        )
+        return imager.form(lines, progress)
+
+    ways = () if is_fixed or accuracy_db <= BEST_ACCURACY_DB else (again,)
+    image = _certified(image, lines, device, started, not is_fixed, ways, **asked)
     return _added(image, accumulate)
 
 
@@ -481,7 +492,8 @@ class Imager:
     Attributes
     ----------
     plan : Plan or None
-        How the images are formed; None if `accuracy_db` was given.
+        How the images are formed; None if they are exact because `accuracy_db` was given, or an
+        image by a better plan missed the tolerance, too.
     grid : Grid
     beam : BeamWindow or None
     device : Device
@@ -577,6 +589,7 @@ class Imager:
             scene.warn("accuracy_db", accuracy_db)
             method = ExactImage(accuracy_db)
         self.grid, self.plan, self.beam = scene.given_grid, plan, beam
+        self._tolerance_db = accuracy_db if plan is None else plan.tolerance_db
         self._imager: SceneImager | None = SceneImager(
             scene, method, self.device, track=track, warned=warned
         )
@@ -604,13 +617,13 @@ class Imager:
         ----------
         lines : RangeLines
         certificate : bool, optional
-            Whether the error of the image is measured, as by `clsas.certify`. By default it is for
-            the first image, if the imager was not made from a plan, and planning and forming the
-            image take 0.1 s or more.
+            Whether the error of the image is measured, as by `clsas.certify`. By default,
+            that of the first image is measured, if the imager was not made from a plan, and
+            planning and forming the image take 0.1 s or more.
         on_miss : {"refine", "warn", "raise"}
             What to do if the measured error exceeds the tolerance beyond doubt: form the image
             again by a better plan, and then exactly, with a warning; warn; or raise ToleranceError.
-            A better plan replaces that of the imager.
+            The imager forms later images by the better plan, or exactly.
         accumulate : Image, optional
             Image on the same grid to which this one is added, so that data may arrive in pieces.
             `Image.formed` of the sum is None.
@@ -658,11 +671,12 @@ class Imager:
         started = time.perf_counter() - self._planning_s
         image = self._imager.form(lines, progress)
         is_certified, self._is_certified, self._planning_s = self._is_certified, False, 0.0
-        again = partial(self._form_again, lines, progress), partial(self._exactly, lines, progress)
-        is_exact = self._imager.decision is not None
-        image = _kept(
-            image, lines, self.device, started, is_certified, () if is_exact else again, **asked
-        )
+        exactly = partial(self._exactly, lines, progress)
+        ways: tuple[FormAgain, ...] = partial(self._form_again, lines, progress), exactly
+        if self._imager.decision is not None:
+            is_best = (self._tolerance_db or 0.0) <= BEST_ACCURACY_DB
+            ways = () if is_best else (exactly,)
+        image = _certified(image, lines, self.device, started, is_certified, ways, **asked)
         return _added(image, accumulate)
 
     def _form_again(
@@ -672,7 +686,14 @@ class Imager:
         tolerance_db = max(tolerance_db, BEST_TOLERANCE_DB)
         request = Request(lines, self.grid, tolerance_db=tolerance_db, beam=self.beam)
         scene, self.plan, track = planned(request, self.device, doubts=False)
-        self._imager = SceneImager(scene, self.plan, self.device, track=track, warned=True)
+        self._imager = SceneImager(
+            scene,
+            self.plan,
+            self.device,
+            track=track,
+            warned=True,
+            tolerance_db=self._tolerance_db,
+        )
         return self._imager.form(lines, progress)
 
     def _exactly(self, lines: RangeLines, progress: Progress | None, accuracy_db: float) -> Image:
@@ -680,18 +701,24 @@ class Imager:
         accuracy_db = max(accuracy_db, BEST_ACCURACY_DB)
         scene = Scene.of(lines, self.grid, self.beam, accuracy_db)
         self.plan = None
-        self._imager = SceneImager(scene, ExactImage(accuracy_db), self.device, warned=True)
+        self._imager = SceneImager(
+            scene,
+            ExactImage(accuracy_db),
+            self.device,
+            warned=True,
+            tolerance_db=self._tolerance_db,
+        )
         return self._imager.form(lines, progress)
 
     def _check_band(self, lines: RangeLines) -> None:
         """Warn once if lines have power outside the band that the imager was made for."""
         assert self._imager is not None
+        allowed_db = self._tolerance_db
         if self.plan is not None and not self.plan.is_exact:
-            band, allowed_db = self.plan.factorization.band, self.plan.tolerance_db
+            band = self.plan.factorization.band
         else:
-            scene = self._imager.scene
-            allowed_db = scene.allowed_db
-            band = occupied_band(scene.spectrum, OUTSIDE * power(allowed_db or 0.0))
+            spectrum = self._imager.scene.spectrum
+            band = occupied_band(spectrum, OUTSIDE * power(allowed_db or 0.0))
         if band is None or allowed_db is None or self._warned_of_band:
             return
         for channels in (FEW_CHANNELS, MEASURED_CHANNELS):
@@ -729,7 +756,7 @@ class Imager:
         return reprs.summary(self, reprs.by(self.grid.shape), how, self.device.info.label)
 
 
-def _kept(
+def _certified(
     image: Image,
     lines: RangeLines,
     device: Device,
@@ -744,7 +771,7 @@ def _kept(
     seconds = time.perf_counter() - started
     if not is_wanted(certificate, seconds, by_default=by_default):
         return image
-    return kept(image, lines, device, seconds, on_miss, again)
+    return certified(image, lines, device, seconds, on_miss, again)
 
 
 def check_accumulate(image: Image, grid: Grid, beam: BeamWindow | None) -> None:

@@ -1,9 +1,12 @@
-"""The promise of a tolerance: errors of images are measured, and images that miss formed again."""
+"""The promise of a tolerance: errors are measured, and images that miss it are formed again."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Protocol
+
+import pyopencl as cl
 
 from clsas.engine.certificate import PIXELS, Measurement
 from clsas.engine.data import validate
@@ -12,12 +15,15 @@ from clsas.engine.data.declared import Choice, Flag
 from clsas.engine.data.image import Formed, Image, holds_any, prediction
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.validate import ArgumentError
-from clsas.engine.device.device import Device
+from clsas.engine.device.device import Device, DeviceError
 
 LEAST_SECONDS = 0.1
 """Images that take less are certified only if that is requested."""
 
-CERTIFICATE = Flag("Measure the error of the image.", default="if the image takes 0.1 s or more")
+CERTIFICATE = Flag(
+    "Measure the error of the image.",
+    default=f"if it is formed to a tolerance in dB and takes {LEAST_SECONDS:g} s or more",
+)
 ON_MISS = Choice(
     ("refine", "warn", "raise"),
     help="What to do if the measured error exceeds the tolerance: form the image again, warn of "
@@ -32,16 +38,30 @@ FormAgain = Callable[[float], Image]
 """Forms the image to another tolerance, dB."""
 
 
+class Measured(Protocol):
+    """A measured error, of an image or of a mosaic."""
+
+    @property
+    def error_db(self) -> float:
+        """Estimate of the error, dB."""
+
+    def verdict(self, tolerance_db: float) -> str:
+        """Return "met", "missed" or "undecided"."""
+
+    def describe(self, tolerance_db: float | None = None) -> str:
+        """Return the error in words."""
+
+
 class ToleranceError(RuntimeError):
     """The measured error of an image exceeds its tolerance.
 
     Attributes
     ----------
-    certificate : Certificate
+    certificate : Certificate or MosaicCertificate
     tolerance_db : float
     """
 
-    def __init__(self, certificate: Certificate, tolerance_db: float) -> None:
+    def __init__(self, certificate: Measured, tolerance_db: float) -> None:
         super().__init__(certificate, tolerance_db)
         self.certificate, self.tolerance_db = certificate, tolerance_db
 
@@ -58,7 +78,7 @@ def is_wanted(certificate: bool | None, seconds: float, *, by_default: bool = Tr
     return by_default and seconds >= LEAST_SECONDS if certificate is None else certificate
 
 
-def kept(
+def certified(
     image: Image,
     lines: RangeLines,
     device: Device,
@@ -91,7 +111,7 @@ def kept(
     ClsasWarning
         If the error cannot be measured, or the image misses its tolerance.
     """
-    tolerance_db = _formed(image).tolerance_db
+    tolerance_db, how = _formed(image).tolerance_db, ""
     certificate = measured_if_possible(image, lines, device, seconds, tolerance_db)
     misses: list[str] = []
     for form_again in again if on_miss == "refine" else ():
@@ -99,14 +119,15 @@ def kept(
             break
         if certificate.verdict(tolerance_db) != "missed":
             break
-        misses.append(miss(_formed(image).predicted_error_db, certificate))
+        misses.append(describe_miss(_formed(image).predicted_error_db, certificate))
         image = form_again(tightened_db(certificate, tolerance_db))
-        certificate = measured_if_possible(image, lines, device, seconds, tolerance_db)
-    formed = replace(
-        _formed(image), tolerance_db=tolerance_db, certificate=certificate, misses=tuple(misses)
-    )
+        certificate, how = (
+            measured_if_possible(image, lines, device, seconds, tolerance_db),
+            _formed(image).plan,
+        )
+    formed = replace(_formed(image), certificate=certificate, misses=tuple(misses))
     if certificate is not None and tolerance_db is not None:
-        report(certificate, tolerance_db, on_miss, misses, formed.plan)
+        report(certificate, tolerance_db, on_miss, misses, how)
     return Image(image.pixels, image.grid, formed)
 
 
@@ -115,9 +136,9 @@ def measured(
 ) -> Certificate:
     """Return the error of an image, measured in a small part of the time that the image took.
 
-    It is measured at 64 pixels, and at up to 256 if these take no more than 3 % of the time. While
-    it is undecided whether the image keeps its tolerance, more are drawn, up to 1024 in all: within
-    5 % of the time, or in any case if the image seems to miss.
+    It is measured at 64 pixels in any case, and at up to 256 if these take no more than 3 % of the
+    time. While it is undecided whether the image meets its tolerance, more are drawn, up to 1024 in
+    all: within 5 % of the time, or however long it takes if the image seems to miss.
     """
     measurement = Measurement(image, lines, _formed(image).beam, device, tolerance_db=tolerance_db)
     measurement.draw(FIRST)
@@ -130,8 +151,13 @@ def measured(
         found = measurement.certificate()
         more = more_pixels(found, tolerance_db, affordable)
         if not more or measurement.is_complete:
-            return found
+            break
         measurement.draw(more)
+    if tolerance_db is not None and found.verdict(tolerance_db) == "missed":
+        # If an image is much darker than its lines, the error may be that of the filters.
+        measurement.sharpen()
+        found = measurement.certificate()
+    return found
 
 
 def more_pixels(
@@ -155,15 +181,27 @@ def measured_if_possible(
     image: Image, lines: RangeLines, device: Device, seconds: float, tolerance_db: float | None
 ) -> Certificate | None:
     """Return the error of an image, or None with a warning if it cannot be measured."""
+    certificate, reason = measured_or_reason(image, lines, device, seconds, tolerance_db)
+    if reason:
+        validate.warn(f"the error of the image is not known: {reason}")
+    return certificate
+
+
+def measured_or_reason(
+    image: Image, lines: RangeLines, device: Device, seconds: float, tolerance_db: float | None
+) -> tuple[Certificate | None, str]:
+    """Return the error of an image, or None and the reason why it cannot be measured.
+
+    The reason is "" for an image of zeros from lines without echoes there.
+    """
     try:
-        return measured(image, lines, device, seconds, tolerance_db)
-    except ArgumentError as error:
-        if holds_any(image.pixels):  # else there has been a warning
-            validate.warn(f"the error of the image is not known: {error}")
-        return None
+        return measured(image, lines, device, seconds, tolerance_db), ""
+    except (ArgumentError, DeviceError, cl.Error) as error:  # the image itself is not lost
+        is_empty = isinstance(error, ArgumentError) and not holds_any(image.pixels)
+        return None, "" if is_empty else str(error)
 
 
-def miss(predicted_error_db: float | None, certificate: Certificate) -> str:
+def describe_miss(predicted_error_db: float | None, certificate: Certificate) -> str:
     """Return what was predicted and measured of an image that missed its tolerance, in words."""
     return f"{prediction(predicted_error_db)}, {certificate.describe()}"
 
@@ -174,7 +212,7 @@ def tightened_db(certificate: Certificate, tolerance_db: float) -> float:
 
 
 def report(
-    certificate: Certificate,
+    certificate: Measured,
     tolerance_db: float,
     on_miss: str,
     misses: Sequence[str] = (),
@@ -184,7 +222,7 @@ def report(
 
     Parameters
     ----------
-    certificate : Certificate
+    certificate : Certificate or MosaicCertificate
     tolerance_db : float
     on_miss : {"refine", "warn", "raise"}
     misses : sequence of str
@@ -192,18 +230,17 @@ def report(
     how : str
         How the image was formed again, if it was.
     """
-    is_missed = certificate.verdict(tolerance_db) == "missed"
-    if is_missed and on_miss == "raise":
+    verdict, now = certificate.verdict(tolerance_db), certificate.describe(tolerance_db)
+    if verdict == "missed" and on_miss == "raise":
         raise ToleranceError(certificate, tolerance_db)
-    now, tolerance = certificate.describe(), f"its tolerance of {tolerance_db:g} dB"
     if misses:
-        result = "still misses it" if is_missed else "keeps it"
+        result = {"met": "meets it", "missed": "still misses it", "undecided": "may meet it"}
         validate.warn(
-            f"the image missed {tolerance} ({'; then '.join(misses)}), was formed again ({how}), "
-            f"and {result}: {now}"
+            f"the image missed its tolerance ({'; then '.join(misses)}), was formed again ({how}), "
+            f"and {result[verdict]}: {now}"
         )
-    elif is_missed:
-        validate.warn(f"the image misses {tolerance}: {now}")
+    elif verdict == "missed":
+        validate.warn(f"the image misses its tolerance: {now}")
 
 
 def _formed(image: Image) -> Formed:

@@ -104,7 +104,7 @@ class Source:
         if self.image is not None:
             return None if self.image.formed is None else self.image.formed.certificate
         measured = MosaicCertificate.of(self.records)
-        return None if measured is None else measured.whole
+        return None if measured is None else measured.of_all
 
     def windows(self) -> Iterator[tuple[slice, slice]]:
         """Yield windows that cover the image. Those of a store are whole patches."""

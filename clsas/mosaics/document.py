@@ -430,7 +430,7 @@ class Record:
         True if any pixel is not 0.
     certificate : Certificate or None
         Measured error of the patch, with the worst pixels counted from its corner; of heights, that
-        of the bank's image which errs more. None if it was not measured.
+        of the bank whose image has the larger error. None if it was not measured.
     unmeasured : str
         Why the error could not be measured; empty if it was, or was not to be.
     misses : tuple of str
@@ -462,6 +462,11 @@ class Record:
     heights: dict[str, Any] | None = None
 
     __repr__ = reprs.of_fields
+
+    @property
+    def is_exact(self) -> bool:
+        """True if the patch is exact, whether its plan or the request says so."""
+        return self.plan is None or "sides" not in self.plan["method"]
 
     @property
     def flags(self) -> tuple[str, ...]:
@@ -552,6 +557,20 @@ class MosaicCertificate:
         return cls(of_parts(list(known.values())), known, count)
 
     @property
+    def error_db(self) -> float:
+        """Estimate of the relative rms error of all certified patches, dB."""
+        return self.whole.error_db
+
+    def verdict(self, tolerance_db: float) -> str:
+        """Return the verdict of `whole`."""
+        return self.whole.verdict(tolerance_db)
+
+    @property
+    def of_all(self) -> Certificate | None:
+        """Error of the whole mosaic; None if that of a patch with pixels is not known."""
+        return self.whole if len(self.patches) >= self.of_patches else None
+
+    @property
     def worst(self) -> PatchIndex:
         """The patch whose error is the largest relative to its own power."""
         return max(self.patches, key=lambda index: self.patches[index].error)
@@ -565,6 +584,12 @@ class MosaicCertificate:
         if len(self.patches) < self.of_patches:
             text += f"; {len(self.patches)} of {self.of_patches} patches measured"
         return text
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Those of `whole`, and of how many of the patches it is that."""
+        counts = {"patches": len(self.patches), "of_patches": self.of_patches}
+        return self.whole.figures | counts
 
     def __repr__(self) -> str:
         """Return the description."""

@@ -58,9 +58,9 @@ from clsas.engine.forming import SceneImager, form
 from clsas.engine.promise import (
     CERTIFICATE,
     ON_MISS,
+    describe_miss,
     is_wanted,
-    measured,
-    miss,
+    measured_or_reason,
     report,
     tightened_db,
 )
@@ -166,14 +166,13 @@ def mosaic(
         Client of a Dask cluster whose workers form the patches. They must be able to open `source`
         and `store` under the same paths.
     certificate : bool, optional
-        Whether the errors of the patches are measured, as by `clsas.certify`. By default that of a
-        patch is if planning and forming it take 0.1 s or more, except with `stages` or
+        Whether the errors of the patches are measured, as by `clsas.certify`. By default, that of a
+        patch is measured if planning and forming it take 0.1 s or more, except with `stages` or
         `tolerance_wavelengths`.
     on_miss : {"refine", "warn", "raise"}
         What to do if the measured error of the whole mosaic exceeds the tolerance beyond doubt:
         form the patches that exceed it most again, by better plans and then exactly, until the
-        whole keeps the tolerance, with a warning; warn; or raise ToleranceError. Exact patches are
-        not formed again.
+        whole meets the tolerance, with a warning; warn; or raise ToleranceError.
     follow_s : float, optional
         Wait for files to be added to the folder `source`, until it contains a file named `end` or
         no file has been added for this many seconds. A patch is formed once the beam of the latest
@@ -594,7 +593,7 @@ class Mosaic:
                             self._complete()
                         self._report(certificate, records, misses)
                         return
-                    misses = misses or [certificate.whole.describe()]
+                    misses = misses or [certificate.describe()]
                     ready = survey.ready(layout, todo)
                     continue
                 timeout_s = None if survey.has_ended and running else POLL_S
@@ -641,7 +640,7 @@ class Mosaic:
     def _worst(
         self, certificate: MosaicCertificate | None, records: dict[PatchIndex, Record]
     ) -> dict[PatchIndex, Record | None]:
-        """Return the patches to form again so that the whole keeps its tolerance, worst first.
+        """Return the patches to form again so that the whole meets its tolerance, worst first.
 
         They are as few as can suffice, if nothing of their errors is left.
         """
@@ -658,10 +657,10 @@ class Mosaic:
             for index, each in certificate.patches.items()
         }
         for index in sorted(errors, key=errors.__getitem__, reverse=True):
-            plan = records[index].plan
-            is_exact = plan is None or "sides" not in plan["method"]  # nothing is better
-            if left > 0 and not is_exact and certificate.patches[index].error > allowed:
-                worst[index] = records[index]
+            record = records[index]
+            is_best = record.is_exact and record.misses
+            if left > 0 and not is_best and certificate.patches[index].error > allowed:
+                worst[index] = record
                 left -= errors[index]
         return worst
 
@@ -681,7 +680,7 @@ class Mosaic:
         if certificate is not None and self._tolerance_db is not None:
             again = sum(bool(record.misses) for record in records.values())
             how = f"{again} of {len(records)} patches"
-            report(certificate.whole, self._tolerance_db, self._on_miss, misses, how)
+            report(certificate, self._tolerance_db, self._on_miss, misses, how)
 
     def image(self, tell: Callable[[Patch], object] | None = None) -> Image:
         """Form the patches that are not finished, and return the whole image.
@@ -748,7 +747,7 @@ class Mosaic:
             device=", ".join(dict.fromkeys(each.device for each in known)),
             version=__version__,
             lines_digest=digest(sorted(each.lines_digest for each in known)),
-            certificate=None if certificate is None else certificate.whole,
+            certificate=None if certificate is None else certificate.of_all,
             misses=tuple(
                 f"patch {row},{column}: {miss}"
                 for (row, column), record in records.items()
@@ -911,21 +910,21 @@ def _image(
     if missed is not None:
         assert missed.certificate is not None
         assert tolerance_db is not None
-        fields["misses"] = (*missed.misses, miss(missed.predicted_error_db, missed.certificate))
+        found = describe_miss(missed.predicted_error_db, missed.certificate)
+        fields["misses"] = (*missed.misses, found)
         better_db = tightened_db(missed.certificate, tolerance_db)
         request = {"tolerance_db": max(better_db, BEST_TOLERANCE_DB)}
-        if missed.misses:
+        if missed.misses or missed.is_exact:
             request = {"accuracy_db": max(better_db, BEST_ACCURACY_DB)}
         certificate = True
     image, how = _formed(request, memory_bytes, lines, grid, beam, device)
     seconds = time.perf_counter() - began
     fields |= how | {"has_pixels": holds_any(image.pixels)}
     is_to_tolerance = not request.keys() & {"stages", "tolerance_wavelengths"}
-    if fields["has_pixels"] and is_wanted(certificate, seconds, by_default=is_to_tolerance):
-        try:
-            fields["certificate"] = measured(image, lines, device, seconds, tolerance_db)
-        except ArgumentError as error:
-            fields["unmeasured"] = str(error)
+    if is_wanted(certificate, seconds, by_default=is_to_tolerance):
+        fields["certificate"], fields["unmeasured"] = measured_or_reason(
+            image, lines, device, seconds, tolerance_db
+        )
     if (scale := scale_to_all(beam, lines.channels, survey.channels)) != 1:
         image = replace(image, pixels=scale * image.pixels)
         fields["certificate"] = scaled(fields.get("certificate"), float(scale))

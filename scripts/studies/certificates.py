@@ -67,7 +67,7 @@ def near(excess_db: float) -> str:
 
 
 def of_own(least_db: int | None) -> str:
-    how = "keep it" if least_db is None else f"miss it by more than {least_db} dB"
+    how = "meet it" if least_db is None else f"miss it by more than {least_db} dB"
     return f"called missed, with the tolerance of images that {how}"
 
 
@@ -96,7 +96,7 @@ def rows(
     jobs : int
         Number of processes.
     keep : Path, optional
-        File that keeps images, which are then not formed again.
+        File that meets images, which are then not formed again.
     picture : Path, optional
         File for a picture.
     """

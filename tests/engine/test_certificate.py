@@ -251,6 +251,22 @@ def test_a_complex_factor_is_fitted(speckle):
     assert certified_db(pixels * 3e-4j, speckle) > -1
 
 
+def test_no_complex_factor_makes_an_image_of_zeros(speckle):
+    zeros = clsas.Image(0 * speckle.ideal, speckle.grid)
+    found = clsas.certify(zeros, speckle.lines, pixels=64, seed=1, scale=True)
+    assert found.error_db == pytest.approx(0.0, abs=1e-6)
+
+
+def test_better_filters_measure_what_filters_for_a_loose_tolerance_cannot(speckle):
+    """The sums with filters for -10 dB err by less than that, but by more than the best."""
+    image, device = clsas.Image(speckle.ideal, speckle.grid), open_device()
+    measurement = Measurement(image, speckle.lines, speckle.beam, device, 1, tolerance_db=-10)
+    measurement.draw(64)
+    before_db = measurement.certificate().error_db
+    measurement.sharpen()
+    assert measurement.certificate().error_db < min(before_db - 20, -90)
+
+
 def test_the_beam_is_that_of_the_image(speckle):
     """Without it, an image under a beam gives no number."""
     lines, grid, beam = speckle.lines, speckle.grid, clsas.BeamWindow(2.0, "hann", along=[1, 0, 0])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsas.engine.data import reprs, validate
-from clsas.engine.data.decibels import in_db
+from clsas.engine.data.decibels import NO_ERROR_DB, in_db
 
 # Of a normal distribution, 97.5 %. With 1.645 (95 %) the bound held in fewer than 95 % of draws of
 # 64 pixels from factorized images of random scenes, whose errors have longer tails.
@@ -130,7 +130,8 @@ class Certificate:
     def describe(self, tolerance_db: float | None = None) -> str:
         """Return the error, its bound and what was requested as a line of text."""
         bound = f"below {self.upper_db:.1f} dB with 95 % confidence"
-        if tolerance_db is not None and self.verdict(tolerance_db) == "undecided":
+        is_undecided = tolerance_db is not None and self.verdict(tolerance_db) == "undecided"
+        if is_undecided and self.lower_db > NO_ERROR_DB:
             bound = f"between {self.lower_db:.1f} and {self.upper_db:.1f} dB with 90 % confidence"
         text = f"error {self.error_db:.1f} dB ({bound}, measured at {self.pixels} pixels)"
         return text if tolerance_db is None else f"{text}; {tolerance_db:g} dB requested"

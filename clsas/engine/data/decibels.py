@@ -27,7 +27,9 @@ REFERENCE = Number(above=0.0, help="Amplitude of 0 dB.", default="1 for db, othe
 DEVIATION_PER_MEDIAN = 1.482602
 """Standard deviation over the median magnitude of normal errors."""
 
-_FLOOR = 1e-30  # power that stands for none: -300 dB
+NO_ERROR_DB = -300.0
+"""Level of a power of 0."""
+_FLOOR = 1e-30  # the same as a power
 _Number = TypeVar("_Number", float, NDArray[np.float64])
 
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
 from contextlib import contextmanager
+from itertools import islice
 from typing import TypeVar
 
 from clsas.engine.data import validate
@@ -73,21 +74,27 @@ def in_threads(
     function : callable
         Called with one item. Ctrl-C, or closing the generator, waits for the calls that have begun.
     items : iterable
-        Items, all of which are read before the first result.
+        Items, which are read a few ahead of the results, so that few results wait in memory.
     workers : int, optional
         Number of threads; by default `cores`.
     """
     if workers is not None:
         workers = validate.count("workers", workers)
     futures: deque[Future[Result]] = deque()
-    pool = ThreadPoolExecutor(workers or cores())
+    workers, left = workers or cores(), iter(items)
+    pool = ThreadPoolExecutor(workers)
+
+    def submit(count: int) -> None:
+        futures.extend(pool.submit(function, item) for item in islice(left, count))
+
     try:
         with uninterrupted():
-            futures.extend(pool.submit(function, item) for item in items)
+            submit(2 * workers)
         while futures:
             wait([futures[0]])
             with uninterrupted():
                 result = futures.popleft().result()
+                submit(1)
             yield result
     finally:
         with uninterrupted():
