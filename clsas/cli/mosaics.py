@@ -347,7 +347,9 @@ def _simulated(
 
 
 @contextmanager
-def _patch_progress(name: str, total: int, done: int) -> Iterator[Callable[[clsas.Patch, int], None]]:
+def _patch_progress(
+    name: str, total: int, done: int
+) -> Iterator[Callable[[clsas.Patch, int], None]]:
     """Yield a function that prints a line for a patch and, on a terminal, moves a progress bar."""
     columns = (
         TextColumn("{task.description}", markup=False), BarColumn(),

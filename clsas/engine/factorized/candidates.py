@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from clsas.engine.data.decibels import in_db, power
-from clsas.engine.data.surface import LEAST_SIDE
 from clsas.engine.device import kernels
 from clsas.engine.device.buffers import padded_length
 from clsas.engine.device.device import Device
@@ -60,8 +59,8 @@ from clsas.engine.factorized.search import (
     Sizes,
     all_sizes,
     half_range_extents_m,
+    ladder,
     largest_root,
-    root_limits,
     search,
 )
 from clsas.engine.factorized.track import MeanTrack
@@ -150,8 +149,8 @@ class _Trial:
     ----------
     choices : Choices
         Taps and numbers of stages to choose from.
-    most_root : (rows, columns)
-        Size of the largest roots.
+    most_root : int
+        Number of the ladder's rung that is the size of the largest roots.
     beam_cycles : float
         See `InterpolatedAperture`.
     reserved : float
@@ -164,7 +163,7 @@ class _Trial:
     """
 
     choices: Choices
-    most_root: Side
+    most_root: int
     beam_cycles: float
     reserved: float
     least_leaf_pixels: int = 1
@@ -181,10 +180,11 @@ def fastest_plan(
     matter.
     """
     candidates = _Candidates(roots, conditions)
-    most_root = root_limits(roots, _ROOTS_SHARE * candidates.allowed, candidates.root_error)
-    if most_root is None:
+    rungs, of_roots = candidates.rungs, _ROOTS_SHARE * candidates.allowed
+    most_root = largest_root(rungs, candidates.root_error, of_roots)
+    if most_root < 0:
         return Outcome(obstacle=_NOT_SMOOTH, is_off_track=True)
-    is_off_track = most_root != largest_root(roots)
+    is_off_track = most_root < len(rungs) - 1
     beam_cycles = 0.0 if roots.sampled.scene.beam is None else _LEAST_BEAM_CYCLES
     trial: _Trial | None = _Trial(choices, most_root, beam_cycles, candidates.reserved)
     least_bytes = math.inf
@@ -204,10 +204,8 @@ def fastest_plan(
             trial = candidates.more_accurate(trial, spacing, found)
         elif found.memory_bytes > conditions.memory_bytes:
             least_bytes = min(least_bytes, found.memory_bytes)
-            rows, columns = found.sides[0]
-            smaller = (rows // 2, columns) if rows > columns else (rows, columns // 2)
-            is_least = smaller[0] < LEAST_SIDE[0] or smaller[1] < LEAST_SIDE[1]
-            trial = None if is_least else replace(trial, most_root=smaller, division=None)
+            smaller = rungs.index(found.sides[0]) - 1
+            trial = None if smaller < 0 else replace(trial, most_root=smaller, division=None)
         else:
             return Outcome(found, roots.sampled.track, is_off_track=is_off_track)
     return Outcome(least_bytes=least_bytes, is_off_track=is_off_track)
@@ -229,8 +227,9 @@ class _Candidates:
         of_phases = kernels.phase_error(terms) ** 2
         self.reserved = self.beam_edges + _RESERVED_SHARE * self.allowed + of_phases
         self.margin_db = margin_db(roots)
+        self.rungs = ladder(roots)
         self._root_errors: dict[Side, float] = {}
-        self._sizes: dict[Side, Sizes] = {}
+        self._sizes: dict[int, Sizes] = {}
         self._spacing: dict[Side, SpacingErrors] = {}
         self._designs: dict[tuple[FilterRates, int, float], Filters] = {}
 
@@ -249,12 +248,12 @@ class _Candidates:
 
     def searched(self, trial: _Trial) -> _Trial | None:
         """Return the trial with the fastest division; None if there is no division."""
-        filters_db = self.filters_db(trial.reserved, trial.most_root)
+        filters_db = self.filters_db(trial.reserved, self.rungs[trial.most_root])
         if filters_db is None:
             return None
         if trial.most_root not in self._sizes:
-            sizes = all_sizes(self.roots, trial.most_root, self.conditions.device)
-            self._sizes[trial.most_root] = sizes
+            rungs = self.rungs[: trial.most_root + 1]
+            self._sizes[trial.most_root] = all_sizes(self.roots, rungs, self.conditions.device)
         division = search(
             self._sizes[trial.most_root],
             filters_db,
