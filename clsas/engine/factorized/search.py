@@ -42,7 +42,6 @@ from clsas.engine.factorized.plan import Work
 from clsas.engine.factorized.sampled import (
     INNER_POINTS,
     SampledRoots,
-    SampledScene,
     Side,
     mean_over_points,
     trapezoidal_weights,
@@ -57,9 +56,10 @@ MOST_STAGES = 5
 """Largest number of stages of a tree. More stages add errors without saving work."""
 
 _MOST_SIDE = 2048  # rows or columns of a root
-_ODD = (1, 3, 5, 7)  # multiples of the least side, of which roots that fit an image are doublings
-# What trees usually have: virtual channels per cycle and past the ends, and upsampling.
-_USUAL_DENSITY, _USUAL_ENDS, _USUAL_UPSAMPLING = 3.0, 5.0, 1.6
+_MOST_OVERHANG = 1.1  # rows or columns of roots over those of the image that they fit
+# What trees usually have: virtual channels per cycle and past the ends, upsampling, and samples whose
+# combination takes as long as all else that is done for a line. With half, trees take 2 % longer.
+_USUAL_DENSITY, _USUAL_ENDS, _USUAL_UPSAMPLING, _USUAL_SPARE = 3.0, 5.0, 1.6, 96.0
 _EVERY = 8  # of the samples of the track that is searched with; a fourth chose the same trees
 # Share of the filters' error power that the expansion of ranges in leaves may add. With half of it,
 # some grids close to the track have no leaf and are imaged exactly; twice: up to 6 % faster.
@@ -167,7 +167,7 @@ class Sizes:
     roots : SampledRoots
         The sample points, without a size of roots.
     pairs : tuple of (rows, columns)
-        The sizes, ascending. Each divides into those before it.
+        The sizes.
     sides : int64 [sizes, 2]
         The same as an array.
     counts : float64
@@ -199,6 +199,11 @@ class Sizes:
     _in_roots: dict[int, SizesInRoot] = field(default_factory=dict, init=False)
 
     @functools.cached_property
+    def divides(self) -> NDArray[np.bool_]:
+        """True where subimages of one size divide into those of another, [sizes, sizes]."""
+        return (self.sides[:, None] % self.sides == 0).all(axis=-1)
+
+    @functools.cached_property
     def anywhere(self) -> SizesInRoot:
         """All sizes, with the phases at the sample points: lower bounds of those in a root."""
         return self._within(self.roots, np.arange(len(self.sides)))
@@ -207,7 +212,7 @@ class Sizes:
         """Return the sizes that divide a root, with the largest phases in it."""
         if root not in self._in_roots:
             within = self.roots.within(self.pairs[root])
-            self._in_roots[root] = self._within(within, np.arange(root + 1))
+            self._in_roots[root] = self._within(within, np.flatnonzero(self.divides[root]))
         return self._in_roots[root]
 
     @functools.cached_property
@@ -229,13 +234,15 @@ class Sizes:
         cycles = (self._spacing @ rates.reshape(len(rates), -1).T)[index] @ extents.T
         cycles_across = None
         if across is not None:
-            cycles_across = extents @ _cycles_across(sampled, across)
-        smaller = index[:, None] < index
+            line = sampled.track.line_across(0.5)
+            weights = trapezoidal_weights(line.samples[::_EVERY]) * line.on_track[::_EVERY]
+            cycles_across = extents @ (across @ weights).mean(axis=1)
+        smaller = self.divides[np.ix_(index, index)].T & (index[:, None] != index)
         return SizesInRoot(index, cycles, np.where(smaller, 0.0, np.inf), cycles_across)
 
 
 def all_sizes(roots: SampledRoots, pairs: Sequence[Side], device: Device) -> Sizes:
-    """Return the subimages of some sizes, each of which divides into those before it."""
+    """Return the subimages of some sizes."""
     sampled, sides = roots.sampled, np.array(pairs, np.int64)
     visible = roots.visible_by_size(pairs)
     share = mean_over_points(visible.sum(axis=-1)) / np.count_nonzero(sampled.track.on_track)
@@ -262,18 +269,22 @@ def all_sizes(roots: SampledRoots, pairs: Sequence[Side], device: Device) -> Siz
 
 
 def ladder(roots: SampledRoots) -> list[Side]:
-    """Return the sizes of subimages to choose from: each has twice the rows or columns of the last.
+    """Return the sizes of subimages to choose from, ascending.
 
-    The first is a work-item, and the last contains the image or is as large as roots may be. An
-    axis is doubled where the lines of all subimages then have fewer samples. Trees of a ladder's
-    rungs take up to 8 % longer than the fastest of any sizes, and are found ten times faster.
+    Those of a curve are a ladder. The first is a work-item. Each other has twice the rows or the
+    columns of the one before it: the axis is doubled with which the lines of all subimages have
+    fewer samples. The last contains the image, or is as large as roots may be. Trees of a ladder
+    take up to 8 % longer than the fastest of any sizes, and are found ten times faster.
+
+    Every channel of a dense aperture is aligned for every root, so that roots should fit the image.
+    There, all combinations of powers of two and of such sides are tried.
     """
-    sampled, shape = roots.sampled, roots.sampled.scene.surface.plane.shape
-    side = LEAST_SIDE
-    if sampled.track.is_dense:  # every channel is aligned for every root: roots fit the image
-        side = _fitting(shape[0], side[0]), _fitting(shape[1], side[1])
+    shape = roots.sampled.scene.surface.plane.shape
+    if roots.sampled.track.is_dense:
+        sides = (_sides(*axis) for axis in zip(shape, LEAST_SIDE, strict=True))
+        return sorted(product(*sides), key=math.prod)
     samples = _samples_per_pixel(roots)
-    rungs = [side]
+    rungs = [LEAST_SIDE]
     while True:
         rows, columns = rungs[-1]
         larger = [
@@ -286,45 +297,40 @@ def ladder(roots: SampledRoots) -> list[Side]:
         rungs.append(min(larger, key=samples))
 
 
-def _fitting(pixels: int, least: int) -> int:
-    """Return a small multiple of the least side that, doubled often enough, fits an axis best."""
-    sides = [odd * least for odd in _ODD]
-    return min(sides, key=lambda side: side * 2 ** max(math.ceil(math.log2(pixels / side)), 0))
+def _sides(pixels: int, least: int) -> set[int]:
+    """Return numbers of rows or columns: powers of two, and those that fit one axis of an image."""
+    sides = {least}
+    while max(sides) < min(pixels, _MOST_SIDE):
+        sides.add(2 * max(sides))
+    for parts in (1, 2, 4):
+        part = least * math.ceil(pixels / (least * parts))
+        if part * parts <= _MOST_OVERHANG * max(pixels, least):
+            sides |= {part * 2**k for k in range(parts.bit_length())}
+    return sides
 
 
 def _samples_per_pixel(roots: SampledRoots) -> Callable[[Side], float]:
     """Return a function of a size: samples of all lines of a subimage, over its pixels."""
-    sampled = roots.sampled
-    rates, across = roots.coarse_rates(_EVERY)
+    sampled, steps_m = roots.sampled, roots.sampled.scene.surface.steps_m[:2]
     small = roots.visible(roots.small)
+    rates, _ = roots.coarse_rates(_EVERY)
     spacing = trapezoidal_weights(sampled.track.samples[::_EVERY])
     cycles = (rates[:2] * small[INNER_POINTS, ::_EVERY] @ spacing).mean(axis=1)
-    cycles_across = None if across is None else _cycles_across(sampled, across[:2])
     seen = small if small.any() else np.ones_like(small)
-    extent_m = np.abs(sampled.sight[seen] @ sampled.scene.surface.steps_m[:2].T).mean(axis=0)
+    extent_m = np.abs(sampled.sight[seen] @ steps_m.T).mean(axis=0)
     per_m = _USUAL_UPSAMPLING / sampled.scene.lines.range_step_m
 
     def samples(side: Side) -> float:
         lines = _USUAL_DENSITY * float(cycles @ side) + _USUAL_ENDS
-        if cycles_across is not None:
-            lines *= _USUAL_DENSITY * float(cycles_across @ side) + _USUAL_ENDS
-        return lines * (per_m * float(extent_m @ side) + _SPARE_SAMPLES) / math.prod(side)
+        return lines * (per_m * float(extent_m @ side) + _USUAL_SPARE) / math.prod(side)
 
     return samples
 
 
-def _cycles_across(sampled: SampledScene, rates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the phase cycles across a sheet per extent of a subimage, [axes], from rates there."""
-    line = sampled.track.line_across(0.5)
-    weights = trapezoidal_weights(line.samples[::_EVERY]) * line.on_track[::_EVERY]
-    found: NDArray[np.float64] = (rates @ weights).mean(axis=1)
-    return found
-
-
-def largest_root(rungs: Sequence[Side], error: Callable[[Side], float], allowed: float) -> int:
-    """Return the number of the largest rung whose error as a root is within `allowed`; else -1."""
-    for number in reversed(range(len(rungs))):
-        if error(rungs[number]) <= allowed:
+def largest_root(sides: Sequence[Side], error: Callable[[Side], float], allowed: float) -> int:
+    """Return the number of the largest size whose error as a root is within `allowed`; else -1."""
+    for number in reversed(range(len(sides))):
+        if error(sides[number]) <= allowed:
             return number
     return -1
 
