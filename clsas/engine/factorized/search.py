@@ -57,8 +57,8 @@ MOST_STAGES = 5
 
 _MOST_SIDE = 2048  # rows or columns of a root
 _MOST_OVERHANG = 1.1  # rows or columns of roots over those of the image that they fit
-# What trees usually have: virtual channels per cycle and past the ends, upsampling, and samples whose
-# combination takes as long as all else that is done for a line. With half, trees take 2 % longer.
+# What trees usually have: virtual channels per cycle and past the ends, upsampling, and samples
+# that take as long to combine as all else that is done for a line. Half: trees take 2 % longer.
 _USUAL_DENSITY, _USUAL_ENDS, _USUAL_UPSAMPLING, _USUAL_SPARE = 3.0, 5.0, 1.6, 96.0
 _EVERY = 8  # of the samples of the track that is searched with; a fourth chose the same trees
 # Share of the filters' error power that the expansion of ranges in leaves may add. With half of it,
@@ -281,16 +281,16 @@ def ladder(roots: SampledRoots) -> list[Side]:
     """
     shape = roots.sampled.scene.surface.plane.shape
     if roots.sampled.track.is_dense:
-        sides = (_sides(*axis) for axis in zip(shape, LEAST_SIDE, strict=True))
-        return sorted(product(*sides), key=math.prod)
+        rows, columns = (_sides(*axis) for axis in zip(shape, LEAST_SIDE, strict=True))
+        return sorted(product(rows, columns), key=math.prod)
     samples = _samples_per_pixel(roots)
     rungs = [LEAST_SIDE]
     while True:
-        rows, columns = rungs[-1]
+        last = rungs[-1]
         larger = [
-            doubled
-            for doubled, axis in (((2 * rows, columns), 0), ((rows, 2 * columns), 1))
-            if rungs[-1][axis] < shape[axis] and doubled[axis] <= _MOST_SIDE
+            side
+            for axis, side in enumerate(((2 * last[0], last[1]), (last[0], 2 * last[1])))
+            if last[axis] < shape[axis] and side[axis] <= _MOST_SIDE
         ]
         if not larger:
             return rungs

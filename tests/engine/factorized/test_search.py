@@ -6,10 +6,11 @@ import pytest
 from exactly import sampled
 from factorizing import BEAMS, around, over
 
+from clsas.engine.data.grid import Grid
 from clsas.engine.device.device import open_device
 from clsas.engine.factorized import search
 from clsas.engine.factorized.costs import Costs
-from clsas.engine.factorized.search import Choices, all_sizes
+from clsas.engine.factorized.search import Choices, all_sizes, ladder
 
 
 def priced(sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed):
@@ -33,7 +34,8 @@ def everything_tried(*arguments):
 @pytest.fixture(scope="module", params=[None, BEAMS[0]], ids=["wide", "beam"])
 def sizes(request):
     grid = around(0, 40, shape=(500, 700))
-    return all_sizes(sampled(over(grid)[0], grid, request.param), (512, 512), open_device())
+    roots = sampled(over(grid)[0], grid, request.param)
+    return all_sizes(roots, ladder(roots), open_device())
 
 
 def cost_of(tree, sizes, filters_db, leaf_pixels, beam_cycles, costs, allowed):
@@ -76,10 +78,22 @@ def test_leaves_are_as_large_as_asked(sizes):
 
 
 def test_without_any_size_that_fits_there_is_none(sizes):
-    arguments = (0.5, Costs(), Choices())
-    none = all_sizes(sizes.roots, (8, 2), open_device())
-    assert search.search(none, -40.0, 1, *arguments) is None
-    assert search.search(sizes, -40.0, 10**9, *arguments) is None
+    assert search.search(sizes, -40.0, 10**9, 0.5, Costs(), Choices()) is None
+
+
+def test_a_ladder_of_sizes_is_as_long_in_range_as_it_is_along_the_track(sizes):
+    """Each size is divided by those before it; a grid with exchanged axes has exchanged sides."""
+    found = sizes.pairs
+    for smaller, larger in pairwise(found):
+        assert sorted((larger[0] // smaller[0], larger[1] // smaller[1])) == [1, 2]
+    assert found[0] == (16, 4)
+    assert found[-1] == (512, 1024)
+    grid = sizes.roots.sampled.scene.grid
+    mirrored = Grid.oriented(grid.vectors_m[0], *grid.vectors_m[:0:-1], grid.shape[::-1])
+    roots = sampled(sizes.roots.sampled.scene.given_lines, mirrored, sizes.roots.sampled.scene.beam)
+    exchanged = {(columns, rows) for rows, columns in ladder(roots)}
+    large = {side for side in found if min(side) >= 32}
+    assert len(large & exchanged) >= len(large) - 1
 
 
 @pytest.mark.parametrize("is_sheet", [False, True])
