@@ -32,13 +32,13 @@ from clsas.engine.factorized.costs import (
     upsampling,
 )
 from clsas.engine.factorized.errors import (
+    SpacedStage,
     SpacingErrors,
     UpsampledLines,
     errors_of_tree,
     looked_up_singly,
     margin_db,
     root_error,
-    spaced_stages,
     with_arithmetic,
     with_range_filters,
 )
@@ -348,8 +348,8 @@ class _Candidates:
         beam_cycles = trial.beam_cycles
         if excess[-1] and beam_cycles > 0:
             aperture = found.factorization.aperture.filter
-            stages = spaced_stages(found.sides, aperture, trial.oversampling, None)
-            without_beam = self._spacing[found.sides[0]].of_stage(stages).uneven
+            stage = SpacedStage(last, aperture, trial.oversampling[-1], None)
+            without_beam = self._spacing[found.sides[0]].of_stage(stage).uneven
             if 2 * without_beam < spacing[-1]:  # the beam causes most of it
                 if beam_cycles >= _MOST_BEAM_CYCLES:
                     return None  # virtual channels cannot follow a step

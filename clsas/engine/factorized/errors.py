@@ -72,9 +72,6 @@ _FLOAT32 = 4.5e-8
 # 4, no leaf of some of them is small enough. Half or twice changes no scene of
 # `scripts/bench sensitivity`.
 _MOST_OF_MEAN = 16.0
-# Corners of roots in which subimages are sampled, by row and column of the sample points: at the
-# edges of the grid those that lie inside.
-_CORNERS = np.stack(np.meshgrid((1, -1, 1, 1, -1), (1, -1, -1, 1, -1), indexing="ij"), axis=-1)
 _SAMPLED_CHANNELS = 96  # of the visible aperture; half as many move the error by 3 dB at most
 _CHANNELS_OF_STRIP = 16  # more of them, for each strip after the first
 _CHANNELS_OF_LINE = 384  # evenly spaced along a line of a sheet: four times those sampled of them
@@ -121,24 +118,6 @@ class SpacedStage:
     beam_cycles: float | None
 
 
-Stages = tuple[SpacedStage, ...]
-"""A stage, the last, and those before it."""
-
-
-def spaced_stages(
-    sides: Sequence[Side],
-    aperture: Interpolator,
-    oversampling: tuple[float, ...],
-    beam_cycles: float | None,
-) -> Stages:
-    """Return the stages of a tree. Only the virtual channels of the last stage follow the beam."""
-    last = len(sides) - 1
-    return tuple(
-        SpacedStage(side, aperture, denser, beam_cycles if level == last else 0.0)
-        for level, (side, denser) in enumerate(zip(sides, oversampling, strict=True))
-    )
-
-
 def errors_of_tree(
     spacing: SpacingErrors,
     sides: Sequence[Side],
@@ -150,25 +129,22 @@ def errors_of_tree(
     """Return the errors that a tree causes, and those of uneven spacing by stage.
 
     They are those of the filter along the aperture, of uneven spacing of virtual channels, and of
-    the expansion of ranges in leaves.
+    the expansion of ranges in leaves. Only the virtual channels of the last stage follow the beam.
     """
-    stages = spaced_stages(sides, filters.aperture, oversampling, beam_cycles)
-    of_filters, by_stage, biases = 0.0, [], []
-    for level in range(len(stages)):
-        found = spacing.of_stage(stages[: level + 1])
-        of_filters += found.of_filter
-        by_stage.append(found.uneven)
-        biases += found.biases
-    # Filters of few taps attenuate steering functions. The mean attenuation is common to all
-    # interpolations on a sheet, along and across and in every stage, so that its amplitudes add.
-    bias = np.array(biases)
-    of_filters += float(max(bias.sum() ** 2 - bias @ bias, 0.0))
+    last = len(sides) - 1
+    found = [
+        spacing.of_stage(
+            SpacedStage(side, filters.aperture, denser, beam_cycles if level == last else 0.0)
+        )
+        for level, (side, denser) in enumerate(zip(sides, oversampling, strict=True))
+    ]
+    by_stage = tuple(stage.uneven for stage in found)
     errors = ErrorBudget(
-        aperture_filters=of_filters,
+        aperture_filters=sum(stage.of_filter for stage in found),
         spacing=sum(by_stage),
         leaves=float(leaf_error(spacing.roots, np.array([sides[-1]]), device)[0]),
     )
-    return errors, tuple(by_stage)
+    return errors, by_stage
 
 
 def leaf_error(
@@ -348,16 +324,6 @@ class _Line:
     along: NDArray[np.float64] | None
     beam_rates: NDArray[np.float64]
 
-    def past_ends(self, coordinate: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which aperture coordinates lie past the ends of the curve, or of their strip."""
-        strip = self.track.strip_of(self.channels)
-        first, last = (
-            np.searchsorted(strip, np.arange(self.track.strips), side) for side in ("left", "right")
-        )
-        of_strip = self.track.strip_of(coordinate)
-        past: NDArray[np.bool_] = coordinate < self.channels[first][of_strip]
-        return past | (coordinate > self.channels[last - 1][of_strip])
-
     def virtual_channels(
         self,
         points: NDArray[np.int64],
@@ -416,13 +382,10 @@ class StageErrors:
         Error power of the filter along the aperture. On a sheet, virtual channels are everywhere as
         dense as the largest phase rate of any line along it and across it requires. Where phases
         turn more slowly, the error is below the filter's worst.
-    biases : list of float
-        On a sheet, the biases of the filter along and across it.
     """
 
     uneven: float
     of_filter: float
-    biases: list[float]
 
 
 class SpacingErrors:
@@ -451,47 +414,43 @@ class SpacingErrors:
         else:
             self._lines = {"track": (_line_of_track(roots),)}
         self._samples: dict[tuple[_Line, Side, bool, tuple[float, ...]], _Samples | None] = {}
-        self._found: dict[tuple[_Line, Stages, tuple[float, ...]], tuple[float, float]] = {}
+        self._found: dict[tuple[_Line, SpacedStage, tuple[float, ...]], float] = {}
 
-    def of_stage(self, stages: Stages) -> StageErrors:
-        """Return the errors of the last of some stages, over the relief of the grid.
+    def of_stage(self, stage: SpacedStage) -> StageErrors:
+        """Return the errors of a stage, over the relief of the grid.
 
         On a sheet, errors along and across it add up.
         """
-        surface, side = self.roots.sampled.scene.surface, stages[-1].side
-        worst = power(stages[-1].aperture.error_db)
-        reliefs, share = reliefs_of(surface, side, self.roots.side)
-        uneven, of_filter, biases = 0.0, 0.0 if self._is_sheet else worst, []
+        surface = self.roots.sampled.scene.surface
+        worst = power(stage.aperture.error_db)
+        reliefs, share = reliefs_of(surface, stage.side, self.roots.side)
+        uneven, of_filter = 0.0, 0.0 if self._is_sheet else worst
         for lines in self._lines.values():
-            found = [[self._error(line, stages, each) for each in reliefs] for line in lines]
-            errors = [np.array([error for error, _ in of_line]) for of_line in found]
+            errors = [
+                np.array([self._error(line, stage, each) for each in reliefs]) for line in lines
+            ]
             above = [mean_over_relief(np.maximum(each - worst, 0.0), share) for each in errors]
             uneven += sum(above) / len(lines)
             if self._is_sheet:
                 below = [mean_over_relief(np.minimum(each, worst), share) for each in errors]
                 of_filter += sum(below) / len(lines)
-                biases.append(float(np.mean([of_line[0][1] for of_line in found])))
-        return StageErrors(uneven, of_filter, biases)
+        return StageErrors(uneven, of_filter)
 
-    def _error(
-        self, line: _Line, stages: Stages, extents: tuple[float, ...]
-    ) -> tuple[float, float]:
-        """Return the relative error power of steering functions in the last stage's subimages.
+    def _error(self, line: _Line, stage: SpacedStage, extents: tuple[float, ...]) -> float:
+        """Return the relative error power of steering functions in the subimages of a stage.
 
-        The second result is the bias: the mean error in the direction of the exact functions, over
-        their power. The error is 1, as large as the image, if no beam touches a subimage.
+        It is 1, as large as the image, if no beam touches a subimage.
         """
-        if (line, stages, extents) in self._found:
-            return self._found[line, stages, extents]
-        weighted = stages[-1].beam_cycles is not None and self.roots.sampled.scene.beam is not None
-        key = line, stages[-1].side, weighted, extents
+        if (line, stage, extents) in self._found:
+            return self._found[line, stage, extents]
+        weighted = stage.beam_cycles is not None and self.roots.sampled.scene.beam is not None
+        key = line, stage.side, weighted, extents
         if key not in self._samples:
             self._samples[key] = self._sampled(*key)
         samples = self._samples[key]
         if samples is None:
-            return 1.0, 0.0
-        coordinate, share = self._sources(line, samples, stages[:-1])
-        virtual = line.virtual_channels(samples.points, stages[-1], extents, coordinate)
+            return 1.0
+        virtual = line.virtual_channels(samples.points, stage, extents, samples.coordinate)
         steering = self._steering(line, samples, weighted, virtual.coordinate)
         steering = steering.reshape(-1, steering.shape[-1])
         # One sparse matrix interpolates at all aperture coordinates of all subimages.
@@ -501,45 +460,13 @@ class SpacingErrors:
             (weights, virtual.contributed.ravel(), rows), shape=(len(rows) - 1, len(steering))
         )
         exact = samples.exact
-        if len(stages) > 1:
-            exact = self._steering(line, samples, weighted, coordinate)
         wrong = (interpolate @ steering).reshape(exact.shape) - exact
-        error, bias = (
-            samples.count @ np.einsum("ns,nsp,nsp->n", share, *each, dtype=np.float64)
-            for each in ((wrong, wrong), (wrong, exact))
+        error, total = (
+            float(samples.count @ np.einsum("nsp,nsp->n", each, each, dtype=np.float64))
+            for each in (wrong, exact)
         )
-        total = samples.count @ np.einsum(
-            "nsp,nsp->n", samples.exact, samples.exact, dtype=np.float64
-        )
-        total = max(total, 1e-30)
-        self._found[line, stages, extents] = float(error / total), float(bias / total)
-        return self._found[line, stages, extents]
-
-    def _sources(
-        self, line: _Line, samples: _Samples, before: Stages
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return what a stage interpolates for: aperture coordinates and powers, [n, channels].
-
-        They are those of the sampled channels, of power 1, and of the earlier stages' virtual
-        channels past the aperture's ends. Filters extend past the ends, farther with every stage.
-        The power of virtual channels there must be interpolated too, although phases may turn
-        faster there than on the track.
-        """
-        of_channels = samples.coordinate
-        coordinate, share = of_channels, np.ones(of_channels.shape)
-        for stage in before:
-            extents = self.roots.extents(stage.side)
-            virtual = line.virtual_channels(samples.points, stage, extents, coordinate)
-            of_virtual = share[..., None] * virtual.weights**2
-            size = virtual.coordinate.size
-            past = np.bincount(virtual.contributed.ravel(), of_virtual.ravel(), size)
-            past = past.reshape(virtual.coordinate.shape) * line.past_ends(virtual.coordinate)
-            some = past.any(axis=0)
-            coordinate = np.concatenate([of_channels, virtual.coordinate[:, some]], axis=1)
-            share = np.concatenate([np.ones(of_channels.shape), past[:, some]], axis=1)
-            order = np.argsort(coordinate, axis=1, kind="stable")
-            coordinate, share = (np.take_along_axis(each, order, 1) for each in (coordinate, share))
-        return coordinate, share
+        self._found[line, stage, extents] = error / max(total, 1e-30)
+        return self._found[line, stage, extents]
 
     def _sampled(
         self, line: _Line, side: Side, weighted: bool, extents: tuple[float, ...]
@@ -574,7 +501,7 @@ class SpacingErrors:
             points,
             count,
             coordinate,
-            centres_m=sampled.points_m[points] + self._within_roots_m(extents)[points],
+            centres_m=sampled.points_m[points],
             offsets_m=np.stack([each_m for each_m, _ in found]),
             cycles_per_m=np.stack(chosen),
             exact=np.zeros(0, np.float32),
@@ -601,20 +528,6 @@ class SpacingErrors:
         end[~visible.any(axis=1)] = -np.inf
         first = np.searchsorted(channels, begin)
         return first, np.maximum(np.searchsorted(channels, end, "right") - first, 0)
-
-    def _within_roots_m(self, extents: tuple[float, ...]) -> NDArray[np.float64]:
-        """Return the offsets of sampled subimages from the sample points, in roots there.
-
-        Virtual channels are spaced for the corner of a root, where phases turn fastest, and errors
-        are sampled there. Where a beam selects channels, they are those of the sample point itself.
-        The result is [points, 3].
-        """
-        roots, sampled = self.roots, self.roots.sampled
-        assert roots.side is not None
-        if not (roots.limits is None or sampled.track.is_dense):
-            return np.zeros((len(sampled.points_m), 3))
-        spare = np.maximum(roots.extents(roots.side, most=True) - extents, 0.0)[:2]
-        return (_CORNERS.reshape(-1, 2) * spare / 2) @ sampled.scene.surface.steps_m[:2]
 
     def _steering(
         self, line: _Line, samples: _Samples, weighted: bool, at: NDArray[np.float64]
