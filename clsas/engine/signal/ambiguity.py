@@ -261,9 +261,8 @@ _GROUP_CHANNELS = 64
 _LEAST_GROUP = 32
 _MOST_CHANNELS = 1024  # channels summed together if groups are dark: a plain choice
 _GROUPS = 4  # groups of channels, spread evenly along the lines
-# Points along either side of the grid: first without and with a beam, whose coverage may vary, and
-# then if those find little power.
-_FEW, _SOME, _MANY = 8, 16, 48
+# Points along either side of the grid: at first, and if those find little power.
+_FEW, _MANY = 8, 48
 _PAIRS_AT_ONCE = 1 << 16  # of points and channels; bounds memory
 _DARKEST = 1e-8  # least ratio returned, far below what any image resolves
 _DARK = 0.5  # ratio above which images are not dark; sampling alone changes it by 1 dB
@@ -313,7 +312,7 @@ def brightness(
         ]
     )
     found = 1.0
-    for most in (_FEW if beam is None else _SOME, _MANY):
+    for most in (_FEW, _MANY):
         points_m = grid.spread(most)
         found = _brightness_of_groups(lines, channels, points_m, spectrum, beam, along)
         if found > _DARK:

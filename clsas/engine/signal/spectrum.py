@@ -13,8 +13,7 @@ from scipy.ndimage import uniform_filter1d
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at, some_channels
 
 MEASURED_CHANNELS = 256
-"""Channels sampled for a spectrum. Half or twice as many change predicted errors by less than
-0.05 dB. With half as many, filters depend a little on the order of channels."""
+"""Channels sampled for a spectrum. With fewer, filters depend a little on the order of channels."""
 FEW_CHANNELS = 32
 """Channels sampled for a quick estimate of the power outside a band."""
 NEEDED_OVERSAMPLING = 1.05
