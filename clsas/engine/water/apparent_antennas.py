@@ -22,8 +22,9 @@ from clsas.engine.signal.interpolation import MOST_TAPS, Readout
 from clsas.engine.water.ray_delays import FLIGHT_STEPS, RaySample, at_speed, straight_m, times_s
 from clsas.engine.water.rays import Rays, rays, shadow
 
-_NODES = 64  # distances from which the change of a range axis follows
+_NODES = 48  # distances from which the change of a range axis follows
 _DEGREE = 28  # of the polynomial through them
+_FITTED_AT_ONCE = 1 << 9  # of these polynomials; bounds memory
 _CHANGED_AT_ONCE = 1 << 16  # samples that are interpolated together; they fit into a cache
 _BEYOND = 0.1  # of the distances of sample pixels, by which those of others may extend farther
 _RESAMPLED_DB = -80.0  # largest error of the interpolation of samples
@@ -89,38 +90,39 @@ class Change:
         level = float(heights.min() + heights.max()) / 2
         near, far = _limits_m(sample, level)
         speed = float(profile.at(level))
-        tx_z = lines.tx_m[:, 2]
-        rx_z, middle_s = lines.rx_m[:, 2], np.zeros(lines.channels)
+        tx_z, rx_z, flight_s = lines.tx_m[:, 2], lines.rx_m[:, 2], np.zeros(lines.channels)
         if lines.rx_velocity_m_s is not None:  # heights when the echoes of the middle arrive
-            middle_s = 2 * _times(profile, middle_m, tx_z, level)
-            rx_z = rx_z + middle_s * lines.rx_velocity_m_s[:, 2]
+            out_s = _times(profile, middle_m, tx_z, level)
+            flight_s = 2 * out_s
+            for _ in range(FLIGHT_STEPS):
+                rx_z = lines.rx_m[:, 2] + flight_s * lines.rx_velocity_m_s[:, 2]
+                flight_s = out_s + _times(profile, middle_m, rx_z, level)
         given = np.stack([tx_z, rx_z, np.broadcast_to(middle_m, tx_z.shape)], axis=1)
         triples, kinds = np.unique(given, axis=0, return_inverse=True)
-        kinds, middle_m, pairs = kinds.reshape(-1), triples[:, 2], triples[:, :2]
-        apparent = np.stack(
-            [_apparent_z(profile, middle_m, each, level) for each in pairs.T], axis=1
-        )
-        nodes = (near + far + (far - near) * chebyshev.chebpts2(_NODES)) / 2
-        delay = sum(_times(profile, nodes, each[:, None], level) for each in pairs.T)
-        range_m = sum(np.hypot(nodes, each[:, None] - level) for each in apparent.T) / 2
-        offset = speed * delay / 2 - range_m
+        kinds, pairs, middle_m = kinds.reshape(-1), triples[:, :2], triples[:, 2:]
+        arriving = _rays_to(profile, middle_m, pairs, level)
+        # Heights from which straight rays reach the level in the direction of the real ones.
+        apparent = level - middle_m * arriving.other_slope_s_m / arriving.slowness_s_m
+
+        distance = (near + far + (far - near) * chebyshev.chebpts2(_NODES)) / 2
+        heights, which = np.unique(pairs, return_inverse=True)
+        times = _times(profile, distance, heights[:, None], level)
+        delay = times[which.reshape(pairs.shape)].sum(axis=1)
+        range_m = np.hypot(distance, apparent[..., None] - level).mean(axis=1)
         limits = np.stack([range_m.min(axis=1), range_m.max(axis=1)], axis=1)
-        scaled = _scaled(range_m, limits)
-        degree = min(_DEGREE, _NODES - 1) if far > near else 0
-        coefficients = np.stack(
-            [chebyshev.chebfit(x, y, degree) for x, y in zip(scaled, offset, strict=True)], axis=1
-        )
+        offset = speed * delay / 2 - range_m
+        coefficients = _fitted(_scaled(range_m, limits), offset, _DEGREE if far > near else 0)
+
         accuracy_db = _RESAMPLED_DB if allowed_db is None else allowed_db + in_db(SHARE)
         accuracy_db = min(accuracy_db, _RESAMPLED_DB)
-        path_m = sum(np.hypot(middle_m, each - level) for each in apparent.T)[kinds]
+        straight_s = np.hypot(middle_m, apparent - level).sum(axis=1)[kinds] / speed
         tx_z, rx_z = apparent[kinds].T
         climb = np.ones(lines.channels)
         if lines.rx_velocity_m_s is not None:
-            arriving = _rays_to(profile, middle_m, pairs[:, 1], level)
-            climb = (-arriving.one_slope_s_m / arriving.other_slope_s_m)[kinds]
-            rx_z = rx_z - path_m / speed * climb * lines.rx_velocity_m_s[:, 2]
+            climb = (-arriving.one_slope_s_m / arriving.other_slope_s_m)[kinds, 1]
+            rx_z = rx_z - straight_s * climb * lines.rx_velocity_m_s[:, 2]
         return cls(
-            speed, level, tx_z, rx_z, middle_s - path_m / speed, climb, kinds, limits, coefficients,
+            speed, level, tx_z, rx_z, flight_s - straight_s, climb, kinds, limits, coefficients,
             accuracy_db,
         )  # fmt: skip
 
@@ -251,12 +253,20 @@ def _rays_to(
     return found
 
 
-def _apparent_z(
-    profile: SoundSpeed, distance_m: NDArray[np.float64], z_m: NDArray[np.float64], level_m: float
+def _fitted(
+    scaled: NDArray[np.float64], values: NDArray[np.float64], degree: int
 ) -> NDArray[np.float64]:
-    """Return heights from which straight rays reach a level in the direction of the real ones."""
-    found = _rays_to(profile, distance_m, z_m, level_m)
-    return level_m - distance_m * found.other_slope_s_m / found.slowness_s_m
+    """Return Chebyshev coefficients that fit values best, one column for each row of values.
+
+    Nodes are dense towards the ends, so that the normal equations are well conditioned.
+    """
+    found = np.empty((degree + 1, len(values)))
+    for first in range(0, len(values), _FITTED_AT_ONCE):
+        some = slice(first, first + _FITTED_AT_ONCE)
+        basis = chebyshev.chebvander(scaled[some], degree)
+        across = basis.transpose(0, 2, 1)
+        found[:, some] = np.linalg.solve(across @ basis, across @ values[some, :, None])[..., 0].T
+    return found
 
 
 def _scaled(range_m: NDArray[np.float64], limits_m: NDArray[np.float64]) -> NDArray[np.float64]:

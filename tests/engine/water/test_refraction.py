@@ -199,6 +199,22 @@ def test_apparent_antennas_never_err_more_than_straight_rays(
     assert water.error <= water.straight.error
 
 
+@pytest.mark.parametrize(
+    ("velocity", "apart_m", "depths_m", "speeds_m_s"),
+    [
+        ([-1.8, 0.0, -0.5], 0.1, [0, 7, 8, 60], [1490, 1490.02, 1489.99, 1490.01]),
+        ([0.4, 2.6, -0.9], 0.05, [0, 60], [1500, 1501.5]),
+        ([3.0, 0.0, 0.2], 0.2, [0, 8, 9, 60], [1500, 1500, 1499.9, 1499.9]),
+    ],
+)
+def test_moving_receivers_in_water_of_nearly_one_speed(velocity, apart_m, depths_m, speeds_m_s):
+    """They are where they are when echoes arrive, however far they are from the transmitter."""
+    close = Grid.plane((-2, 2, 33), (3, 9, 41), -10.0)
+    rx = TRACK + np.array([apart_m, 0, 0.3 * apart_m])
+    lines = over(close, rx=rx, velocity=velocity, profile=SoundSpeed(depths_m, speeds_m_s))
+    assert homogeneous(lines, close, None, None, corrected=False).error < 10**-7.2
+
+
 DEPTHS = np.linspace(0, 60, 300)
 
 
