@@ -113,7 +113,7 @@ class Scene:
             beam=simplified.beam,
             allowed_db=allowed_db,
             water=water,
-            left_out=tuple(dict.fromkeys((*simplified.left_out, *water.left_out))),
+            left_out=simplified.left_out,
             left_out_error=simplified.error + water.error,
             largest_sample=largest,
         )

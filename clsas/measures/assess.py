@@ -33,7 +33,7 @@ from clsas.engine.data.lines import (
 )
 from clsas.engine.data.pings import channels_per_ping
 from clsas.engine.data.reprs import Report, Table
-from clsas.engine.data.simplify import APART, MOTION, REFRACTION, RELIEF, SHARE, leave_out
+from clsas.engine.data.simplify import APART, MOTION, RELIEF, SHARE, leave_out
 from clsas.engine.data.sound_speed import SoundSpeed, range_bounds_m
 from clsas.engine.data.surface import surface_of
 from clsas.engine.data.system import Sonar, element_pattern
@@ -52,10 +52,12 @@ from clsas.engine.signal.ambiguity import ends_error
 from clsas.engine.signal.compression import Window, compress
 from clsas.engine.signal.interpolation import MOST_TAPS
 from clsas.engine.signal.spectrum import measure_spectrum
-from clsas.engine.water.refraction import Homogeneous, homogeneous
+from clsas.engine.water.ray_delays import RaySample, at_speed, straight_m
+from clsas.engine.water.refraction import homogeneous
 from clsas.simulation.scenes import PointTargets
 from clsas.simulation.simulator import simulate_lines
 
+REFRACTION = "refraction"
 SWAY = "sway and yaw beyond a straight track"
 PATTERN = "element pattern"
 BEAM = "beam window"
@@ -182,12 +184,14 @@ def assess(
     repeats = check_declared(assess, {"repeats": repeats})["repeats"]
     validate.instance("lines", lines, RangeLines)
     validate.instance("grid", grid, Grid)
-    start, water = time.perf_counter(), None
+    in_profile, refraction_s = None, 0.0
     if lines.sound_speed is not None:
+        in_profile = RaySample.of(lines, grid, beam)
+        start = time.perf_counter()
         water = homogeneous(lines, grid, beam, None, corrected=False)
         lines, grid, beam = water.lines(lines), water.grid, water.beam
-    refraction_s = time.perf_counter() - start
-    inputs = Inputs(lines, grid, beam, sonar, track, pointing, element_pattern, ends, water)
+        refraction_s = time.perf_counter() - start
+    inputs = Inputs(lines, grid, beam, sonar, track, pointing, element_pattern, ends, in_profile)
     device = open_device(device)
 
     images = _images(inputs, partial(plan, tolerance_db=tolerance_db, device=device, costs=costs))
@@ -206,10 +210,8 @@ def assess(
     if not full.is_exact and device.info.half_precision:
         errors[SINGLE] = in_db(half_precision_error(len(full.sides))), None, None
     allowed = SHARE * power(tolerance_db)
-    if water is not None and water.straight is not None:
+    if in_profile is not None:
         seconds[REFRACTION] = seconds[_FULL] - refraction_s
-        if water.straight.error <= allowed:
-            left_out = (*left_out, REFRACTION)
 
     effects = []
     for name, key in KEYS.items():
@@ -263,8 +265,8 @@ class Inputs:
         True if the lines contain the sonar's element patterns.
     ends : bool
         True if recorded data end where the lines do.
-    water : Homogeneous or None
-        Homogeneous water of `lines` and `grid` if they replace lines in a profile of the sound
+    in_profile : RaySample or None
+        Delays along exact rays, if `lines` and `grid` replace those in a profile of the sound
         speed.
 
     Raises
@@ -281,7 +283,7 @@ class Inputs:
     pointing: Pointing | None = None
     element_pattern: bool = True
     ends: bool = True
-    water: Homogeneous | None = None
+    in_profile: RaySample | None = None
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -313,7 +315,7 @@ class Inputs:
             MOTION: lines.rx_velocity_m_s is not None,
             APART: not lines.is_monostatic,
             RELIEF: not surface_of(self.grid).is_plane,
-            REFRACTION: self.water is not None,
+            REFRACTION: self.in_profile is not None,
             SWAY: bool(track_errors_m(lines).any()),
             PATTERN: self.directive is not None and self.element_pattern,
             BEAM: self.beam is not None,
@@ -469,17 +471,28 @@ def errors_without(inputs: Inputs) -> dict[str, _Error]:
         errors[PATTERN] = _error_of_weights(weights * pattern, weights)
     if beam is not None:
         errors[BEAM] = _error_of_weights(weighted, inside * of_lines)
-    if inputs.water is not None and (straight := inputs.water.straight) is not None:
-        cycles_per_s = inputs.water.sound_speed_m_s / middle_m
+    if inputs.in_profile is not None and inputs.in_profile.visible.any():
+        away_s = _straight_errors_s(inputs.in_profile)
+        cycles_per_s = lines.sound_speed_m_s / middle_m
         errors[REFRACTION] = (
-            in_db(straight.image_error(cycles_per_s)),
-            straight.rms_s * cycles_per_s,
-            straight.most_s * cycles_per_s,
+            in_db(np.mean(4 * np.sin(np.pi * cycles_per_s * away_s) ** 2)),
+            float(np.sqrt(np.mean(away_s**2)) * cycles_per_s),
+            float(np.abs(away_s).max() * cycles_per_s),
         )
     if inputs.ends:
         error = ends_error(inputs.lines, inputs.grid, spectrum, beam, along)
         errors[ENDS] = in_db(error), None, None
     return errors
+
+
+def _straight_errors_s(sample: RaySample) -> NDArray[np.float64]:
+    """Return the errors of delays along straight rays of the speed that fits them best, [pairs]."""
+    lines, delay_s = sample.lines, sample.delay_s[sample.visible]
+    for _ in range(2):  # the positions of moving receivers depend a little on the speed
+        range_m = straight_m(lines, sample.points_m)[sample.visible]
+        lines = at_speed(lines, float(2 * (range_m @ delay_s) / (delay_s @ delay_s)))
+    range_m = straight_m(lines, sample.points_m)[sample.visible]
+    return 2 * range_m / lines.sound_speed_m_s - delay_s
 
 
 def _error_of_weights(with_it: NDArray[np.float64], without: NDArray[np.float64]) -> _Error:

@@ -28,8 +28,7 @@ from clsas.engine.data.visibility import is_within, sines
 MOTION = "motion during flight"
 APART = "transmitter and receiver apart"
 RELIEF = "relief of the grid"
-REFRACTION = "refraction"
-EFFECTS = (MOTION, APART, RELIEF, REFRACTION)
+EFFECTS = (MOTION, APART, RELIEF)
 
 SHARE = 1 / 20
 """Share of the allowed error power that all omitted effects together may add."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-from clsas.engine.data.decibels import in_db
+from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.fourier import turned
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.simplify import SHARE
@@ -28,6 +28,7 @@ _FITTED_AT_ONCE = 1 << 9  # of these polynomials; bounds memory
 _CHANGED_AT_ONCE = 1 << 16  # samples that are interpolated together; they fit into a cache
 _BEYOND = 0.1  # of the distances of sample pixels, by which those of others may extend farther
 _RESAMPLED_DB = -80.0  # largest error of the interpolation of samples
+_NO_OFFSET_M = 1e-9  # up to which an offset is rounding: 1e-5 rad at 1 MHz
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,15 +155,27 @@ class Change:
             value = value + slope * (scaled - inside)
         return np.asarray(value, np.float64)
 
-    def lines(self, lines: RangeLines, sound_speed_m_s: float) -> RangeLines:
+    @property
+    def resampling_error(self) -> float:
+        """Relative error power of the interpolation of samples; 0 in water of one speed."""
+        return power(self.accuracy_db) if self._shifts else 0.0
+
+    @property
+    def _shifts(self) -> bool:
+        """Whether any offset counts."""
+        return bool(np.abs(self.coefficients).sum(axis=0).max() > _NO_OFFSET_M)
+
+    def lines(self, lines: RangeLines) -> RangeLines:
         """Return lines of the geometry in homogeneous water, with samples over changed ranges.
 
         Where offsets change by a share of the range, so do the frequencies of echoes, the carrier
         included. Lines get as many more samples as their band then needs.
         """
         changed = self.antennas(lines, slice(None))
+        if not self._shifts:
+            return changed
         # Not `highest_cycles_per_m`: a band around the carrier reaches half the sample rate beyond.
-        highest = 2 * lines.carrier_hz / sound_speed_m_s + 0.5 / changed.range_step_m
+        highest = 2 * lines.carrier_hz / self.sound_speed_m_s + 0.5 / changed.range_step_m
         finer = 1 + 2 * highest * self._steepest * changed.range_step_m
         length = 1 + math.ceil((lines.length - 1) * finer)
         changed = replace(changed, range_step_m=changed.range_step_m / finer)
@@ -173,8 +186,8 @@ class Change:
         samples = np.empty((lines.channels, length), np.complex64)
         readout = Readout.of(lines, self.accuracy_db)
         steps_m = changed.range_step_m * np.arange(length)
-        cycles_per_m = 2 * lines.carrier_hz / sound_speed_m_s
-        scale = lines.sound_speed_m_s / sound_speed_m_s
+        cycles_per_m = 2 * lines.carrier_hz / self.sound_speed_m_s
+        scale = lines.sound_speed_m_s / self.sound_speed_m_s
         rows = max(1, _CHANGED_AT_ONCE // length)
         for first in range(0, lines.channels, rows):
             some = everyone[first : first + rows]

@@ -219,17 +219,6 @@ class RaySample:
         offset_m = lines.phase_centres_m[:, :2] - self.centre_m
         return np.clip(np.hypot(*offset_m.T), max(distance.min(), 1e-3), distance.max())
 
-    def mean_speed_m_s(self) -> float:
-        """Return the speed with which straight rays fit the delays best, by least squares."""
-        lines, speed = self.lines, self.lines.sound_speed_m_s
-        for _ in range(2):  # the positions of moving receivers depend a little on the speed
-            range_m = pairwise_range_m(
-                self.points_m, lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, speed
-            )[self.visible]
-            delay = self.delay_s[self.visible]
-            speed = float(2 * (range_m @ delay) / (delay @ delay))
-        return speed
-
     def error(self, lines: RangeLines, range_m: NDArray[np.float64]) -> float:
         """Return the mean squared phase error of the worst pixel if its ranges are others.
 

@@ -270,7 +270,7 @@ def test_no_number_of_a_plan_can_be_replaced_unless_an_image_can_be_formed(any_p
         ("method.half_lengths", [8] * 10**5, "method.half_lengths must be 3 numbers"),
         ("method.aperture.oversampling", [1.0] * 10**5, "aperture.oversampling must be 3 numbers"),
         ("method.tile", [16] * 10**5, "method.tile must be 2 numbers"),
-        ("left_out", ["refraction"] * 5, "left_out must be some of"),
+        ("left_out", ["relief of the grid"] * 4, "left_out must be some of"),
         ("prediction.stages", [], "prediction.stages must not be empty"),
     ],
 )

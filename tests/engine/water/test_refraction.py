@@ -10,7 +10,6 @@ from tiers import thinned
 import clsas
 from clsas import BeamWindow, ClsasWarning, Grid, SoundSpeed
 from clsas.engine.data.decibels import in_db
-from clsas.engine.data.simplify import REFRACTION
 from clsas.engine.exact.layout import gather
 from clsas.engine.water.ray_delays import RaySample, delays_s, sample_pixels
 from clsas.engine.water.refraction import homogeneous
@@ -58,7 +57,7 @@ def test_lines_without_a_profile_pay_nothing():
     water = homogeneous(lines, GRID, None, -50)
     assert water.lines(lines) is lines
     assert water.grid is GRID
-    assert (water.error, water.left_out) == (0.0, ())
+    assert water.error == 0.0
 
 
 def test_delays_are_those_of_independent_rays():
@@ -167,36 +166,18 @@ def test_a_beam_limits_what_has_to_be_right():
     assert water.error < 1e-6  # with that of the beam's weights
 
 
-def test_straight_rays_are_chosen_by_the_tolerance():
-    lines = over(profile=SoundSpeed([0, 60], [1500, 1502]))
-    bound_db = in_db(homogeneous(lines, GRID, None, None).straight.error)
-    for allowed_db, names in ((bound_db + 14, (REFRACTION,)), (bound_db + 12, ())):
-        water = homogeneous(lines, GRID, None, allowed_db)
-        assert water.left_out == names
-    mean = homogeneous(lines, GRID, None, bound_db + 14)
-    assert mean.sound_speed_m_s == pytest.approx(lines.sound_speed.mean_m_s(-6, -25), abs=0.01)
-    straight = mean.lines(lines)
-    assert straight.samples is lines.samples or np.shares_memory(straight.samples, lines.samples)
-    assert np.array_equal(straight.tx_m, lines.tx_m)
-
-
-@pytest.mark.filterwarnings("ignore:refraction alone")
-@pytest.mark.parametrize(
-    ("velocity", "apart_m", "depths_m", "speeds_m_s"),
-    [
-        ([-1.8, 0.0, -0.5], 0.1, [0, 7, 8, 60], [1490, 1490.02, 1489.99, 1490.01]),
-        ([0.4, 2.6, -0.9], 0.05, [0, 60], [1500, 1501.5]),
-        ([3.0, 0.0, 0.2], 0.2, [0, 8, 9, 60], [1500, 1500, 1499.9, 1499.9]),
-    ],
-)
-def test_apparent_antennas_never_err_more_than_straight_rays(
-    velocity, apart_m, depths_m, speeds_m_s
-):
+@pytest.mark.parametrize("velocity", [None, [-1.8, 0.0, -0.5], [0.4, 2.6, -0.9], [3.0, 0.0, 0.2]])
+@pytest.mark.parametrize("speed_m_s", [1480, 1500])
+def test_in_water_of_one_speed_antennas_and_samples_are_what_they_are(speed_m_s, velocity):
     close = Grid.plane((-2, 2, 33), (3, 9, 41), -10.0)
-    rx = TRACK + np.array([apart_m, 0, 0.3 * apart_m])
-    lines = over(close, rx=rx, velocity=velocity, profile=SoundSpeed(depths_m, speeds_m_s))
+    rx = TRACK + np.array([0.2, 0, 0.06])
+    lines = over(close, rx=rx, velocity=velocity, profile=SoundSpeed([0, 60], [speed_m_s] * 2))
     water = homogeneous(lines, close, None, -80)
-    assert water.error <= water.straight.error
+    straight = water.lines(lines)
+    assert water.error < 1e-15
+    assert straight.sound_speed_m_s == speed_m_s
+    assert np.shares_memory(straight.samples, lines.samples)
+    assert np.abs(straight.rx_m - rx).max() < 1e-9
 
 
 @pytest.mark.parametrize(
