@@ -32,10 +32,71 @@ _NO_OFFSET_M = 1e-9  # up to which an offset is rounding: 1e-5 rad at 1 MHz
 
 
 @dataclass(frozen=True, eq=False)
+class Offsets:
+    """Smooth functions of range, one for each kind of line.
+
+    Attributes
+    ----------
+    limits_m : float64 [kinds, 2]
+        Ranges between which they are polynomials. They continue linearly.
+    coefficients : float64 [degree + 1, kinds]
+        Chebyshev coefficients, metres.
+    """
+
+    limits_m: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
+
+    @classmethod
+    def through(cls, range_m: NDArray[np.float64], offset_m: NDArray[np.float64]) -> Offsets:
+        """Return functions that fit values at some ranges best, [kinds, nodes].
+
+        The nodes are dense towards the ends, so that the normal equations are well conditioned.
+        """
+        limits = np.stack([range_m.min(axis=1), range_m.max(axis=1)], axis=1)
+        degree = _DEGREE if np.ptp(limits) else 0
+        coefficients = np.empty((degree + 1, len(range_m)))
+        for first in range(0, len(range_m), _FITTED_AT_ONCE):
+            some = slice(first, first + _FITTED_AT_ONCE)
+            terms = chebyshev.chebvander(_scaled(range_m[some], limits[some]), degree)
+            across = terms.transpose(0, 2, 1)
+            fitted = np.linalg.solve(across @ terms, across @ offset_m[some, :, None])
+            coefficients[:, some] = fitted[..., 0].T
+        return cls(limits, coefficients)
+
+    def at(self, kinds: NDArray[np.int64], range_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the values of some kinds at ranges, [kinds, n], metres."""
+        limits, coefficients = self.limits_m[kinds], self.coefficients[:, kinds]
+        scaled = _scaled(range_m, limits)
+        inside = np.clip(scaled, -1, 1)
+        value = chebyshev.chebval(inside, coefficients[..., None], tensor=False)
+        if not np.array_equal(inside, scaled):
+            slopes = chebyshev.chebval(
+                np.array([-1.0, 1.0]), chebyshev.chebder(coefficients)[..., None], tensor=False
+            )
+            slope = np.where(scaled < 0, slopes[:, :1], slopes[:, 1:])
+            value = value + slope * (scaled - inside)
+        return np.asarray(value, np.float64)
+
+    @property
+    def most_m(self) -> float:
+        """Upper bound of the values between the limits."""
+        return float(np.abs(self.coefficients).sum(axis=0).max())
+
+    @property
+    def steepest(self) -> float:
+        """Largest change per metre of range."""
+        half_m = np.maximum(np.diff(self.limits_m), 1e-9) / 2
+        scaled = np.linspace(-1, 1, _NODES)
+        slopes = chebyshev.chebval(scaled, chebyshev.chebder(self.coefficients)) / half_m
+        return float(np.abs(slopes).max())
+
+
+@dataclass(frozen=True, eq=False)
 class Change:
     """Apparent antennas, and the change of every line's range axis.
 
     In homogeneous water of speed c, a sample at range r belongs to the delay 2 (r + offset(r))/c.
+    The delay 2 d/c belongs to the range d - inverse(d).
 
     Attributes
     ----------
@@ -53,10 +114,7 @@ class Change:
         angles at which echoes arrive.
     kinds : int64 [channels]
         Number of every channel's pair of heights.
-    limits_m : float64 [kinds, 2]
-        Ranges between which the offsets are polynomials. They continue linearly.
-    coefficients : float64 [degree + 1, kinds]
-        Chebyshev coefficients of the offsets, metres.
+    offsets, inverse : Offsets
     accuracy_db : float
         Error of the interpolation of samples.
     """
@@ -68,8 +126,8 @@ class Change:
     ahead_s: NDArray[np.float64]
     climb: NDArray[np.float64]
     kinds: NDArray[np.int64]
-    limits_m: NDArray[np.float64]
-    coefficients: NDArray[np.float64]
+    offsets: Offsets
+    inverse: Offsets
     accuracy_db: float
 
     @classmethod
@@ -110,9 +168,9 @@ class Change:
         times = _times(profile, distance, heights[:, None], level)
         delay = times[which.reshape(pairs.shape)].sum(axis=1)
         range_m = np.hypot(distance, apparent[..., None] - level).mean(axis=1)
-        limits = np.stack([range_m.min(axis=1), range_m.max(axis=1)], axis=1)
-        offset = speed * delay / 2 - range_m
-        coefficients = _fitted(_scaled(range_m, limits), offset, _DEGREE if far > near else 0)
+        delay_m = speed * delay / 2
+        offsets = Offsets.through(range_m, delay_m - range_m)
+        inverse = Offsets.through(delay_m, delay_m - range_m)
 
         accuracy_db = _RESAMPLED_DB if allowed_db is None else allowed_db + in_db(SHARE)
         accuracy_db = min(accuracy_db, _RESAMPLED_DB)
@@ -123,7 +181,7 @@ class Change:
             climb = (-arriving.one_slope_s_m / arriving.other_slope_s_m)[kinds, 1]
             rx_z = rx_z - straight_s * climb * lines.rx_velocity_m_s[:, 2]
         return cls(
-            speed, level, tx_z, rx_z, flight_s - straight_s, climb, kinds, limits, coefficients,
+            speed, level, tx_z, rx_z, flight_s - straight_s, climb, kinds, offsets, inverse,
             accuracy_db,
         )  # fmt: skip
 
@@ -142,28 +200,19 @@ class Change:
         self, channels: NDArray[np.int64], range_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return the offsets at some ranges of some channels, [channels, n], metres."""
-        kinds = self.kinds[channels]
-        limits, coefficients = self.limits_m[kinds], self.coefficients[:, kinds]
-        scaled = _scaled(range_m, limits)
-        inside = np.clip(scaled, -1, 1)
-        value = chebyshev.chebval(inside, coefficients[..., None], tensor=False)
-        if not np.array_equal(inside, scaled):
-            slopes = chebyshev.chebval(
-                np.array([-1.0, 1.0]), chebyshev.chebder(coefficients)[..., None], tensor=False
-            )
-            slope = np.where(scaled < 0, slopes[:, :1], slopes[:, 1:])
-            value = value + slope * (scaled - inside)
-        return np.asarray(value, np.float64)
+        return self.offsets.at(self.kinds[channels], range_m)
+
+    def ranges_m(
+        self, channels: NDArray[np.int64], delay_s: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the ranges of some channels that belong to delays, [channels, n], metres."""
+        delay_m = self.sound_speed_m_s * delay_s / 2
+        return delay_m - self.inverse.at(self.kinds[channels], delay_m)
 
     @property
     def resampling_error(self) -> float:
         """Relative error power of the interpolation of samples; 0 in water of one speed."""
-        return power(self.accuracy_db) if self._shifts else 0.0
-
-    @property
-    def _shifts(self) -> bool:
-        """Whether any offset counts."""
-        return bool(np.abs(self.coefficients).sum(axis=0).max() > _NO_OFFSET_M)
+        return power(self.accuracy_db) if self.offsets.most_m > _NO_OFFSET_M else 0.0
 
     def lines(self, lines: RangeLines) -> RangeLines:
         """Return lines of the geometry in homogeneous water, with samples over changed ranges.
@@ -172,17 +221,18 @@ class Change:
         included. Lines get as many more samples as their band then needs.
         """
         changed = self.antennas(lines, slice(None))
-        if not self._shifts:
+        if self.offsets.most_m <= _NO_OFFSET_M:
             return changed
         # Not `highest_cycles_per_m`: a band around the carrier reaches half the sample rate beyond.
         highest = 2 * lines.carrier_hz / self.sound_speed_m_s + 0.5 / changed.range_step_m
-        finer = 1 + 2 * highest * self._steepest * changed.range_step_m
+        finer = 1 + 2 * highest * self.offsets.steepest * changed.range_step_m
         length = 1 + math.ceil((lines.length - 1) * finer)
         changed = replace(changed, range_step_m=changed.range_step_m / finer)
         everyone = np.arange(lines.channels)
-        first_m = changed.first_range_m.copy()
-        for _ in range(FLIGHT_STEPS):  # so that the first sample stays the first
-            first_m = changed.first_range_m - self.offsets_m(everyone, first_m[:, None])[:, 0]
+        first_s = 2 * changed.first_range_m / self.sound_speed_m_s
+        first_m = self.ranges_m(everyone, first_s[:, None])[
+            :, 0
+        ]  # the first sample stays the first
         samples = np.empty((lines.channels, length), np.complex64)
         readout = Readout.of(lines, self.accuracy_db)
         steps_m = changed.range_step_m * np.arange(length)
@@ -197,21 +247,19 @@ class Change:
             samples[some] = values * turned(cycles_per_m * offset_m)
         return replace(changed, samples=samples, first_range_m=first_m)
 
-    @property
-    def _steepest(self) -> float:
-        """Largest change of an offset per metre of range."""
-        half_m = np.maximum(np.diff(self.limits_m), 1e-9) / 2
-        scaled = np.linspace(-1, 1, _NODES)
-        slopes = chebyshev.chebval(scaled, chebyshev.chebder(self.coefficients)) / half_m
-        return float(np.abs(slopes).max())
-
-    def error(self, sample: RaySample, points_m: NDArray[np.float64] | None = None) -> float:
+    def error(
+        self,
+        sample: RaySample,
+        points_m: NDArray[np.float64],
+        correction_m: NDArray[np.float64] | float = 0.0,
+    ) -> float:
         """Return the squared phase error of the worst sample pixel, rad^2.
 
-        `points_m` are the apparent positions of the sample pixels, if they differ.
+        `points_m` are the apparent positions of the sample pixels. Corrections, [points, channels],
+        are added to their ranges.
         """
         lines = self.antennas(sample.lines, sample.channels)
-        range_m = straight_m(lines, sample.points_m if points_m is None else points_m)
+        range_m = straight_m(lines, points_m) + correction_m
         return sample.error(lines, range_m + self.offsets_m(sample.channels, range_m.T).T)
 
 
@@ -263,22 +311,6 @@ def _rays_to(
         )
         why = shadow(profile, distance, z, level_m)
         raise ArgumentError("sound_speed", "lead a direct ray to every pixel", hint=why)
-    return found
-
-
-def _fitted(
-    scaled: NDArray[np.float64], values: NDArray[np.float64], degree: int
-) -> NDArray[np.float64]:
-    """Return Chebyshev coefficients that fit values best, one column for each row of values.
-
-    Nodes are dense towards the ends, so that the normal equations are well conditioned.
-    """
-    found = np.empty((degree + 1, len(values)))
-    for first in range(0, len(values), _FITTED_AT_ONCE):
-        some = slice(first, first + _FITTED_AT_ONCE)
-        basis = chebyshev.chebvander(scaled[some], degree)
-        across = basis.transpose(0, 2, 1)
-        found[:, some] = np.linalg.solve(across @ basis, across @ values[some, :, None])[..., 0].T
     return found
 
 

@@ -13,7 +13,7 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.data.threads import cores, in_threads
 from clsas.engine.water.apparent_antennas import Change
-from clsas.engine.water.ray_delays import FLIGHT_STEPS, RaySample
+from clsas.engine.water.ray_delays import RaySample
 from clsas.engine.water.ray_times import RayTimes
 from clsas.engine.water.rays import rays
 
@@ -55,10 +55,7 @@ def apparent_grid(grid: Grid, lines: RangeLines, sample: RaySample, change: Chan
         delay_s = np.where(np.isfinite(delay_s), delay_s, 0.0)
         channel, away_m = nearest[some], moved_m[some, :2] - sample.centre_m
         moved_m[some, :2] += bend * (z_m - change.level_m)[:, None] * away_m
-        wanted_m = change.sound_speed_m_s * delay_s / 2
-        range_m = wanted_m.copy()
-        for _ in range(FLIGHT_STEPS):
-            range_m = wanted_m - change.offsets_m(channel, range_m[:, None])[:, 0]
+        range_m = change.ranges_m(channel, delay_s[:, None])[:, 0]
         aside_m = np.linalg.norm(moved_m[some, :2] - centres_m[channel, :2], axis=1)
         apparent_z_m = change.tx_z_m[channel], change.rx_z_m[channel]
         moved_m[some, 2] = _heights(range_m, aside_m, apparent_z_m, change.level_m)

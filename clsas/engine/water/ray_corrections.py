@@ -23,7 +23,7 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, some_channels
 from clsas.engine.data.threads import in_threads
 from clsas.engine.water.apparent_antennas import Change
-from clsas.engine.water.ray_delays import FLIGHT_STEPS, RaySample, in_beam, straight_m
+from clsas.engine.water.ray_delays import RaySample, delays_s, in_beam, straight_m
 from clsas.engine.water.ray_times import RayTimes
 
 _GROUP = 8  # rows and columns of the largest groups of pixels, which have 64
@@ -147,30 +147,24 @@ class Corrections:
     def error(self, sample: RaySample) -> float:
         """Return the squared phase error that corrections leave at the worst sample pixel, rad^2.
 
-        It is that of a pixel as far from the one whose correction it has as groups are wide, for
-        other channels than the nodes.
+        It is that of a pixel with the correction of another one, as far away as groups are wide,
+        for other channels than the nodes.
         """
-        beside = _beside(self.grid, sample.pixels)
-        there = sample.at(self.grid.at(beside))
-        antennas = self.change.antennas(there.lines, there.channels)
-        range_m = straight_m(antennas, self.apparent.at(beside))
-        range_m += self.at(sample.pixels) @ self.weights(self.antennas[there.channels]).T
-        range_m += self.change.offsets_m(there.channels, range_m.T).T
-        return there.error(antennas, range_m)
+        beside_m = self.at(_beside(self.grid, sample.pixels))
+        correction_m = beside_m @ self.weights(self.antennas[sample.channels]).T
+        return self.change.error(sample, self.apparent.at(sample.pixels), correction_m)
 
     def _some_at(self, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
         points_m = self.grid.at(pixels)
         visible = self._visible(points_m)
         pixel, node = np.nonzero(visible)
         delay_s = np.full(visible.shape, np.inf)
-        delay_s[visible] = self._delays_s(points_m[pixel], node)
+        delay_s[visible] = delays_s(self.lines, node, points_m[pixel], self._one_way_s)
         known = np.isfinite(delay_s)
-        antennas = self.change.antennas(self.lines, self.nodes)
-        straight = straight_m(antennas, self.apparent.at(pixels))
-        wanted_m = np.where(known, antennas.sound_speed_m_s * delay_s / 2, 0.0)
-        range_m = straight.copy()
-        for _ in range(FLIGHT_STEPS):
-            range_m = wanted_m - self.change.offsets_m(self.nodes, range_m.T).T
+        straight = straight_m(
+            self.change.antennas(self.lines, self.nodes), self.apparent.at(pixels)
+        )
+        range_m = self.change.ranges_m(self.nodes, np.where(known, delay_s, 0.0).T).T
         return _filled(range_m - straight, known)
 
     def _visible(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -187,24 +181,12 @@ class Corrections:
             visible[:, :-1] |= after
         return visible
 
-    def _delays_s(
-        self, points_m: NDArray[np.float64], node: NDArray[np.int64]
+    def _one_way_s(
+        self, points_m: NDArray[np.float64], antennas_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the delays of pairs of points and nodes; infinite where there is no ray."""
-
-        def one_way_s(antennas_m: NDArray[np.float64]) -> NDArray[np.float64]:
-            offset_m = points_m[:, :2] - antennas_m[:, :2]
-            return self.times.between(np.hypot(*offset_m.T), antennas_m[:, 2], points_m[:, 2])
-
-        tx_m, rx_m, velocity = self.lines.tx_m, self.lines.rx_m, self.lines.rx_velocity_m_s
-        out_s = one_way_s(tx_m[node])
-        if velocity is None:
-            return out_s + (out_s if np.array_equal(tx_m, rx_m) else one_way_s(rx_m[node]))
-        delay_s = 2 * out_s
-        for _ in range(FLIGHT_STEPS):
-            flight_s = np.where(np.isfinite(delay_s), delay_s, 0.0)
-            delay_s = out_s + one_way_s(rx_m[node] + velocity[node] * flight_s[:, None])
-        return delay_s
+        """Return the travel times between points and antennas; infinite where there is no ray."""
+        distance_m = np.hypot(*(points_m[:, :2] - antennas_m[:, :2]).T)
+        return self.times.between(distance_m, antennas_m[:, 2], points_m[:, 2])
 
 
 def _distances_m(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,8 @@ POINTS = 9
 """Number of sample pixels along either side of a grid; points without rows have its square."""
 
 _PARTS = 8  # along either side of a grid, whose highest and lowest pixels are sampled as well
+
+OneWay = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 FLIGHT_STEPS = 4
 """Iterations for a moving receiver. Each multiplies the error by v/c, which is below 0.05."""
@@ -44,29 +48,38 @@ def at_speed(lines: RangeLines, sound_speed_m_s: float) -> RangeLines:
 
 
 def delays_s(
-    lines: RangeLines, channels: NDArray[np.int64], points_m: NDArray[np.float64]
+    lines: RangeLines,
+    channels: NDArray[np.int64],
+    points_m: NDArray[np.float64],
+    one_way_s: OneWay | None = None,
 ) -> NDArray[np.float64]:
     """Return the two-way delays along exact rays of pairs of channels and points, [n], seconds.
 
-    Raises
-    ------
-    ValueError
-        If no direct ray connects a pair.
+    Parameters
+    ----------
+    lines : RangeLines
+        Lines with a profile.
+    channels : int64 [n]
+    points_m : float64 [n, 3]
+    one_way_s : callable, optional
+        Function that returns the travel times between points and antennas, [n, 3] each, infinite
+        where there is no ray [`traced_s`, which raises ValueError there].
     """
-    profile = lines.sound_speed
-    assert profile is not None
-    tx_m, rx_m = lines.tx_m[channels], lines.rx_m[channels]
-    out = one_way_s(profile, points_m, tx_m)
-    if lines.rx_velocity_m_s is None:
-        monostatic = np.array_equal(tx_m, rx_m)
-        return 2 * out if monostatic else out + one_way_s(profile, points_m, rx_m)
-    velocity, delay = lines.rx_velocity_m_s[channels], 2 * out
+    if one_way_s is None:
+        assert lines.sound_speed is not None
+        one_way_s = partial(traced_s, lines.sound_speed)
+    tx_m, rx_m, velocity = lines.tx_m[channels], lines.rx_m[channels], lines.rx_velocity_m_s
+    out_s = one_way_s(points_m, tx_m)
+    if velocity is None:
+        return out_s + (out_s if np.array_equal(tx_m, rx_m) else one_way_s(points_m, rx_m))
+    delay_s = 2 * out_s
     for _ in range(FLIGHT_STEPS):
-        delay = out + one_way_s(profile, points_m, rx_m + velocity * delay[:, None])
-    return delay
+        flight_s = np.where(np.isfinite(delay_s), delay_s, 0.0)
+        delay_s = out_s + one_way_s(points_m, rx_m + velocity[channels] * flight_s[:, None])
+    return delay_s
 
 
-def one_way_s(
+def traced_s(
     profile: SoundSpeed, points_m: NDArray[np.float64], antennas_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the travel times between pairs of points and antennas, [n], seconds.
@@ -163,7 +176,13 @@ class RaySample:
 
     @classmethod
     def of(cls, lines: RangeLines, grid: Grid, beam: BeamWindow | None) -> RaySample:
-        """Return a sample of lines and grid."""
+        """Return a sample of lines and grid.
+
+        Raises
+        ------
+        ValueError
+            If no direct ray connects a visible pair.
+        """
         extreme = [f(each[:, 2]) for each in (lines.tx_m, lines.rx_m)
                    for f in (np.argmin, np.argmax)]  # fmt: skip
         some = np.union1d(
@@ -180,20 +199,10 @@ class RaySample:
         visible &= range_m * ratio.min() - slack_m <= part.last_range_m
         if beam is not None:
             visible &= in_beam(part, points_m, beam, beam.directions(lines)[some], slack_m)
-        return cls(part, some, pixels, points_m, visible, np.zeros(visible.shape)).at(points_m)
-
-    def at(self, points_m: NDArray[np.float64]) -> RaySample:
-        """Return the same pairs of channels and points, with the points elsewhere.
-
-        Raises
-        ------
-        ValueError
-            If no direct ray connects a visible pair.
-        """
-        delay_s = np.zeros(self.visible.shape)
-        point, channel = np.nonzero(self.visible)
-        delay_s[self.visible] = delays_s(self.lines, channel, points_m[point])
-        return replace(self, points_m=points_m, delay_s=delay_s)
+        delay_s = np.zeros(visible.shape)
+        point, channel = np.nonzero(visible)
+        delay_s[visible] = delays_s(part, channel, points_m[point])
+        return cls(part, some, pixels, points_m, visible, delay_s)
 
     @property
     def distances_m(self) -> NDArray[np.float64]:

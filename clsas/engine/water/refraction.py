@@ -141,7 +141,7 @@ def homogeneous(
     allowed = 0.0 if allowed_db is None else power(allowed_db)
     apparent, corrections = grid, None
     change = Change.of(lines, sample, allowed_db, sample.middle_m)
-    error = change.error(sample)
+    error = change.error(sample, sample.points_m)
 
     if error > SHARE * allowed and high[2] - low[2] > _LEVEL_M:
         for_relief = Change.of(lines, sample, allowed_db, sample.middles_m(lines))

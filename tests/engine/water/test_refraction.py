@@ -162,7 +162,8 @@ def test_a_beam_limits_what_has_to_be_right():
     beam = BeamWindow(10, "hann")
     lines = replace(lines, sound_speed=SoundSpeed([0, 60], [1480, 1600]))
     water = homogeneous(lines, GRID, beam, -50)
-    assert water.change.error(RaySample.of(lines, GRID, beam)) < 1e-7
+    sample = RaySample.of(lines, GRID, beam)
+    assert water.change.error(sample, sample.points_m) < 1e-7
     assert water.error < 1e-6  # with that of the beam's weights
 
 
