@@ -22,7 +22,7 @@ from clsas.engine.signal.interpolation import MOST_TAPS, Readout
 from clsas.engine.water.ray_delays import FLIGHT_STEPS, RaySample, at_speed, straight_m, times_s
 from clsas.engine.water.rays import Rays, rays, shadow
 
-_NODES = 48  # distances from which the change of a range axis follows
+_NODES = 36  # distances from which the change of a range axis follows; 64 leave the same error
 _DEGREE = 28  # of the polynomial through them
 _FITTED_AT_ONCE = 1 << 9  # of these polynomials; bounds memory
 _CHANGED_AT_ONCE = 1 << 16  # samples that are interpolated together; they fit into a cache

@@ -52,8 +52,6 @@ class Homogeneous:
         Pixels, at apparent positions if they do not lie on a level plane.
     beam : BeamWindow or None
         Beam whose weights are those of the rays' directions at the antennas.
-    sound_speed_m_s : float
-        Speed of the homogeneous water; 0 if the lines have no profile.
     change : Change or None
         Apparent antennas and the changes of range axes; None without a profile, or if no pixel is
         visible.
@@ -66,7 +64,6 @@ class Homogeneous:
 
     grid: Grid
     beam: BeamWindow | None = None
-    sound_speed_m_s: float = 0.0
     change: Change | None = None
     error: float = 0.0
     corrections: Corrections | None = None
@@ -82,8 +79,8 @@ class Homogeneous:
         """
         if lines.sound_speed is None:
             return lines
-        if self.change is None:
-            return at_speed(lines, self.sound_speed_m_s)
+        if self.change is None:  # at any speed of the profile, nothing is visible
+            return at_speed(lines, float(lines.sound_speed.speed_m_s[0]))
         known = self._converted.get(lines)
         if known is None:
             known = self.change.lines(lines)
@@ -136,8 +133,7 @@ def homogeneous(
     check_reaches(profile, np.array([low[2], high[2]]), "the grid's pixels")
     sample = RaySample.of(lines, grid, beam)
     if not sample.visible.any():
-        middle = profile.mean_m_s(float(lines.tx_m[0, 2]), float((low[2] + high[2]) / 2))
-        return Homogeneous(grid, beam, middle)
+        return Homogeneous(grid, beam)
     allowed = 0.0 if allowed_db is None else power(allowed_db)
     apparent, corrections = grid, None
     change = Change.of(lines, sample, allowed_db, sample.middle_m)
@@ -174,6 +170,4 @@ def homogeneous(
         )
     # Where a window's steps lie elsewhere, the image is as good as the intended one: no reason to
     # warn, although it is an error.
-    return Homogeneous(
-        apparent, beam, change.sound_speed_m_s, change, error + of_steps, corrections
-    )
+    return Homogeneous(apparent, beam, change, error + of_steps, corrections)

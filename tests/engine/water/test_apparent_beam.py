@@ -22,9 +22,9 @@ def test_weights_are_those_at_larger_sines(shape):
     beam = BeamWindow(20, shape, 2.0, element_length_m=0.03)
     water = water_of(beam, along_x(150, 0.2, z=-6.0))
     found = water.beam
-    assert found.ratio == pytest.approx(1494 / water.sound_speed_m_s, abs=2e-3)
+    assert found.ratio == pytest.approx(1494 / water.change.sound_speed_m_s, abs=2e-3)
     sine = np.linspace(-0.13, 0.19, 50)
-    given, apparent = 1494.0 / 100e3, water.sound_speed_m_s / 100e3
+    given, apparent = 1494.0 / 100e3, water.change.sound_speed_m_s / 100e3
     np.testing.assert_allclose(
         found.weights(sine / found.ratio, apparent), beam.weights(sine, given), rtol=1e-12
     )
