@@ -19,11 +19,12 @@ from clsas.engine.data.simplify import SHARE
 from clsas.engine.data.sound_speed import SoundSpeed
 from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.interpolation import MOST_TAPS, Readout
-from clsas.engine.water.ray_delays import FLIGHT_STEPS, RaySample, at_speed, straight_m, times_s
+from clsas.engine.water.ray_delays import RaySample, at_speed, straight_m, times_s
 from clsas.engine.water.rays import Rays, rays, shadow
 
 _NODES = 36  # distances from which the change of a range axis follows; 64 leave the same error
 _DEGREE = 28  # of the polynomial through them
+_FLIGHT_STEPS = 4  # each multiplies the error of a moving receiver's delay by v/c, below 0.05
 _FITTED_AT_ONCE = 1 << 9  # of these polynomials; bounds memory
 _CHANGED_AT_ONCE = 1 << 16  # samples that are interpolated together; they fit into a cache
 _BEYOND = 0.1  # of the distances of sample pixels, by which those of others may extend farther
@@ -153,7 +154,7 @@ class Change:
         if lines.rx_velocity_m_s is not None:  # heights when the echoes of the middle arrive
             out_s = _times(profile, middle_m, tx_z, level)
             flight_s = 2 * out_s
-            for _ in range(FLIGHT_STEPS):
+            for _ in range(_FLIGHT_STEPS):
                 rx_z = lines.rx_m[:, 2] + flight_s * lines.rx_velocity_m_s[:, 2]
                 flight_s = out_s + _times(profile, middle_m, rx_z, level)
         given = np.stack([tx_z, rx_z, np.broadcast_to(middle_m, tx_z.shape)], axis=1)

@@ -27,9 +27,7 @@ _PARTS = 8  # along either side of a grid, whose highest and lowest pixels are s
 
 OneWay = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
-FLIGHT_STEPS = 4
-"""Iterations for a moving receiver. Each multiplies the error by v/c, which is below 0.05."""
-
+_SAME_S = 1e-12  # differences of delays up to which no slope follows from them
 _CHANNELS = 48  # sample channels, beside the first, the last, and those at extreme heights
 _LEVEL = 1e-2  # sine of an angle below which rays count as level
 _BEYOND_BEAM = 0.05  # sine by which a sample pixel may lie outside the beam
@@ -72,11 +70,21 @@ def delays_s(
     out_s = one_way_s(points_m, tx_m)
     if velocity is None:
         return out_s + (out_s if np.array_equal(tx_m, rx_m) else one_way_s(points_m, rx_m))
-    delay_s = 2 * out_s
-    for _ in range(FLIGHT_STEPS):
-        flight_s = np.where(np.isfinite(delay_s), delay_s, 0.0)
-        delay_s = out_s + one_way_s(points_m, rx_m + velocity[channels] * flight_s[:, None])
-    return delay_s
+
+    def arrived_s(flight_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the delays to where receivers are after some time."""
+        flight_s = np.where(np.isfinite(flight_s), flight_s, 0.0)
+        return out_s + one_way_s(points_m, rx_m + velocity[channels] * flight_s[:, None])
+
+    # Delays change little, and almost linearly, with this time: a secant finds where they agree.
+    first_s = arrived_s(2 * out_s)
+    second_s = arrived_s(first_s)
+    with np.errstate(invalid="ignore"):  # where there is no ray
+        step_s = first_s - 2 * out_s
+        ratio = np.divide(
+            second_s - first_s, step_s, out=np.zeros_like(step_s), where=np.abs(step_s) > _SAME_S
+        )
+        return first_s + (second_s - first_s) / (1 - ratio)
 
 
 def traced_s(
