@@ -16,11 +16,15 @@ from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.fourier import turned
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.data.simplify import SHARE
-from clsas.engine.data.sound_speed import SoundSpeed
-from clsas.engine.data.validate import ArgumentError
 from clsas.engine.signal.interpolation import MOST_TAPS, Readout
-from clsas.engine.water.ray_delays import RaySample, at_speed, straight_m, times_s
-from clsas.engine.water.rays import Rays, rays, shadow
+from clsas.engine.water.ray_delays import (
+    RaySample,
+    at_speed,
+    rays_between,
+    straight_m,
+    times_s,
+)
+from clsas.engine.water.rays import rays
 
 _NODES = 36  # distances from which the change of a range axis follows; 64 leave the same error
 _DEGREE = 28  # of the polynomial through them
@@ -152,21 +156,21 @@ class Change:
         speed = float(profile.at(level))
         tx_z, rx_z, flight_s = lines.tx_m[:, 2], lines.rx_m[:, 2], np.zeros(lines.channels)
         if lines.rx_velocity_m_s is not None:  # heights when the echoes of the middle arrive
-            out_s = _times(profile, middle_m, tx_z, level)
+            out_s = times_s(profile, middle_m, tx_z, level)
             flight_s = 2 * out_s
             for _ in range(_FLIGHT_STEPS):
                 rx_z = lines.rx_m[:, 2] + flight_s * lines.rx_velocity_m_s[:, 2]
-                flight_s = out_s + _times(profile, middle_m, rx_z, level)
+                flight_s = out_s + times_s(profile, middle_m, rx_z, level)
         given = np.stack([tx_z, rx_z, np.broadcast_to(middle_m, tx_z.shape)], axis=1)
         triples, kinds = np.unique(given, axis=0, return_inverse=True)
         kinds, pairs, middle_m = kinds.reshape(-1), triples[:, :2], triples[:, 2:]
-        arriving = _rays_to(profile, middle_m, pairs, level)
+        arriving = rays_between(profile, middle_m, pairs, level)
         # Heights from which straight rays reach the level in the direction of the real ones.
         apparent = level - middle_m * arriving.other_slope_s_m / arriving.slowness_s_m
 
         distance = (near + far + (far - near) * chebyshev.chebpts2(_NODES)) / 2
         heights, which = np.unique(pairs, return_inverse=True)
-        times = _times(profile, distance, heights[:, None], level)
+        times = times_s(profile, distance, heights[:, None], level)
         delay = times[which.reshape(pairs.shape)].sum(axis=1)
         range_m = np.hypot(distance, apparent[..., None] - level).mean(axis=1)
         delay_m = speed * delay / 2
@@ -291,28 +295,6 @@ def _limits_m(sample: RaySample, level_m: float) -> tuple[float, float]:
         if not rays(profile, np.array([far]), z, level_m).exists.all():
             far = distance.max()
     return float(near), float(far)
-
-
-def _times(
-    profile: SoundSpeed, distance_m: NDArray[np.float64], z_m: NDArray[np.float64], level_m: float
-) -> NDArray[np.float64]:
-    """Return the travel times from heights to distances on a level; both arrays broadcast."""
-    return times_s(profile, _rays_to(profile, distance_m, z_m, level_m), z_m, level_m)
-
-
-def _rays_to(
-    profile: SoundSpeed, distance_m: NDArray[np.float64], z_m: NDArray[np.float64], level_m: float
-) -> Rays:
-    """Return the rays from heights to distances on a level; raise ValueError if one is missing."""
-    found = rays(profile, distance_m, z_m, level_m)
-    if not found.exists.all():
-        dark = ~found.exists
-        distance, z = (
-            float(np.broadcast_to(each, dark.shape)[dark][0]) for each in (distance_m, z_m)
-        )
-        why = shadow(profile, distance, z, level_m)
-        raise ArgumentError("sound_speed", "lead a direct ray to every pixel", hint=why)
-    return found
 
 
 def _scaled(range_m: NDArray[np.float64], limits_m: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -90,36 +90,24 @@ def delays_s(
 def traced_s(
     profile: SoundSpeed, points_m: NDArray[np.float64], antennas_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the travel times between pairs of points and antennas, [n], seconds.
-
-    Raises
-    ------
-    ValueError
-        If no direct ray connects a pair.
-    """
-    offset = points_m - antennas_m
-    distance = np.hypot(offset[:, 0], offset[:, 1])
-    found = rays(profile, distance, antennas_m[:, 2], points_m[:, 2])
-    if not found.exists.all():
-        dark = np.flatnonzero(~found.exists)
-        nearest = dark[distance[dark].argmin()]
-        place = distance[nearest], antennas_m[nearest, 2], points_m[nearest, 2]
-        why = shadow(profile, *map(float, place))
-        raise ArgumentError("sound_speed", "lead a direct ray to every pixel", hint=why)
-    return times_s(profile, found, antennas_m[:, 2], points_m[:, 2])
+    """Return the travel times between pairs of points and antennas, [n], seconds."""
+    distance_m = np.hypot(*(points_m[:, :2] - antennas_m[:, :2]).T)
+    return times_s(profile, distance_m, antennas_m[:, 2], points_m[:, 2])
 
 
 def times_s(
     profile: SoundSpeed,
-    found: Rays,
+    distance_m: NDArray[np.float64],
     one_z_m: NDArray[np.float64],
     other_z_m: NDArray[np.float64] | float,
 ) -> NDArray[np.float64]:
-    """Return the times of rays between heights, with what thinning the profile left out, seconds.
+    """Return the travel times between heights; arguments broadcast as those of `rays_between`.
 
-    By Fermat's principle, rays of the thinned profile serve for the given one. Where a ray falls at
-    an angle, its time errs by the vertical error over the sine, at the lower end less the upper.
+    What thinning the profile left out is added. By Fermat's principle, rays of the thinned profile
+    serve for the given one. Where a ray falls at an angle, its time errs by the vertical error over
+    the sine, at the lower end less the upper.
     """
+    found = rays_between(profile, distance_m, one_z_m, other_z_m)
     time_s = found.time_s
     if len(profile.depth_m) <= FEW:
         return time_s
@@ -130,6 +118,31 @@ def times_s(
             error_s, sine, out=np.zeros_like(sine), where=np.abs(sine) > _LEVEL
         )
     return time_s
+
+
+def rays_between(
+    profile: SoundSpeed,
+    distance_m: NDArray[np.float64],
+    one_z_m: NDArray[np.float64],
+    other_z_m: NDArray[np.float64] | float,
+) -> Rays:
+    """Return the rays between heights at some distances.
+
+    Raises
+    ------
+    ValueError
+        If no direct ray connects a pair.
+    """
+    found = rays(profile, distance_m, one_z_m, other_z_m)
+    if not found.exists.all():
+        dark = ~found.exists
+        distance, one_z, other_z = (
+            np.broadcast_to(each, dark.shape)[dark] for each in (distance_m, one_z_m, other_z_m)
+        )
+        nearest = distance.argmin()
+        why = shadow(profile, *(float(each[nearest]) for each in (distance, one_z, other_z)))
+        raise ArgumentError("sound_speed", "lead a direct ray to every pixel", hint=why)
+    return found
 
 
 def in_beam(
