@@ -18,8 +18,6 @@ from clsas.engine.water.ray_times import RayTimes
 from clsas.engine.water.rays import rays
 
 _MOVED_AT_ONCE = 1 << 15  # pixels whose apparent positions are found together; bounds memory
-_NEWTON_STEPS = 3  # the first one leaves micrometres for antennas decimetres apart
-_LEAST_SLOPE = 1e-3  # of range over height; below it a pixel is level with the antennas
 _AROUND = 0.02  # share of a distance, over which the curvature of rays is measured
 
 
@@ -51,8 +49,9 @@ def apparent_grid(grid: Grid, lines: RangeLines, sample: RaySample, change: Chan
         some = slice(first, first + _MOVED_AT_ONCE)
         z_m = moved_m[some, 2]
         delay_s = np.sum([times.between(distance_m[some], z, z_m) for z in real_z_m], axis=0)
-        # The sample shows that there are rays to all pixels that channels see.
-        delay_s = np.where(np.isfinite(delay_s), delay_s, 0.0)
+        # The sample shows that there are rays to all pixels that channels see. Others stay near.
+        straight_s = 2 * distance_m[some] / change.sound_speed_m_s
+        delay_s = np.where(np.isfinite(delay_s), delay_s, straight_s)
         channel, away_m = nearest[some], moved_m[some, :2] - sample.centre_m
         moved_m[some, :2] += bend * (z_m - change.level_m)[:, None] * away_m
         range_m = change.ranges_m(channel, delay_s[:, None])[:, 0]
@@ -73,20 +72,12 @@ def _heights(
 ) -> NDArray[np.float64]:
     """Return heights at some ranges of a transmitter and a receiver above each other, [n].
 
-    Newton's method starts at the height that one antenna between them gives.
+    They lie on an ellipse, on the side of the level.
     """
-    middle_m = sum(antennas_z_m) / 2
-    side = np.sign(middle_m - level_m)
-    height_m = middle_m - side * np.sqrt(np.maximum(range_m**2 - aside_m**2, 0.0))
-    for _ in range(_NEWTON_STEPS):
-        below_m = [each - height_m for each in antennas_z_m]
-        paths_m = [np.hypot(aside_m, each) for each in below_m]
-        excess_m = sum(paths_m) / 2 - range_m
-        slope = -sum(b / p for b, p in zip(below_m, paths_m, strict=True)) / 2
-        height_m = height_m - np.divide(
-            excess_m, slope, out=np.zeros_like(height_m), where=np.abs(slope) > _LEAST_SLOPE
-        )
-    return height_m
+    middle_m, apart_m = sum(antennas_z_m) / 2, (antennas_z_m[0] - antennas_z_m[1]) / 2
+    square = np.maximum(range_m**2 - aside_m**2 - apart_m**2, 0.0)
+    below_m = np.sqrt(square / (1 - (apart_m / range_m) ** 2))
+    return middle_m - np.sign(middle_m - level_m) * below_m
 
 
 def _at_heights(lines: RangeLines, tx_z_m: float, rx_z_m: float) -> RangeLines:
