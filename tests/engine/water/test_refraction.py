@@ -69,6 +69,18 @@ def test_delays_are_those_of_independent_rays():
     assert np.abs(found - 2 * ranges_m(times, points, TRACK) / 1500).max() < 1e-13
 
 
+@pytest.mark.parametrize(("velocity", "most_s"), [([1.8, 0.1, -0.2], 1e-13), ([40, 60, -5], 1e-8)])
+def test_moving_receivers_are_where_they_are_when_echoes_arrive(velocity, most_s):
+    tx, rx = array()
+    lines = over(tx=tx, rx=rx, velocity=velocity)
+    channel = np.arange(lines.channels)
+    points = GRID.at(np.random.default_rng(5).integers(GRID.size, size=lines.channels))
+    found = delays_s(lines, channel, points)
+    moved = rx + found[:, None] * np.array(velocity)
+    at_rest = delays_s(over(tx=tx, rx=moved), channel, points)
+    assert np.abs(found - at_rest).max() < most_s
+
+
 def heaving():
     turn = np.linspace(0, 9, len(TRACK))
     return TRACK + np.stack([0 * turn, 0.3 * np.sin(turn), 0.4 * np.cos(turn)], axis=1)
