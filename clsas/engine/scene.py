@@ -134,13 +134,15 @@ class Scene:
 
     @cached_property
     def spectrum(self) -> Spectrum:
-        """Spectrum of the lines."""
-        return measure_spectrum(self.lines, self.line_energy)
+        """Spectrum of the lines, with the weight that frequencies have in the image."""
+        return measure_spectrum(self.lines, self.grid, self.line_energy)
 
     @cached_property
     def ambiguity(self) -> Ambiguity:
         """Errors that the lines themselves cause, whatever the method."""
-        return ambiguity(self.lines, self.grid, self.spectrum, self.beam, self.along)
+        return ambiguity(
+            self.lines, self.grid, self.spectrum, self.line_energy, self.beam, self.along
+        )
 
     @cached_property
     def surface(self) -> Surface:

@@ -114,7 +114,7 @@ def lines_of_point(
     spectrum = measure_spectrum(lines)
     frequency = fft.fftfreq(lines.length)
     from_centre = np.abs((frequency - spectrum.centre + 0.5) % 1 - 0.5)
-    band = np.sqrt(np.interp(from_centre, spectrum.frequency, spectrum.power))
+    band = np.sqrt(np.interp(from_centre, spectrum.frequency, spectrum.share))
     band[from_centre > 0.5 / spectrum.oversampling] = 0.0
     pulse = fft.fftshift(fft.ifft(band))
     # The lines need not end where those of the recording do, and fade before they end.

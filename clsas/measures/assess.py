@@ -441,7 +441,7 @@ def errors_without(inputs: Inputs) -> dict[str, _Error]:
     # Frequencies of the band with equal shares of the power, in cycles per metre of range.
     spectrum = measure_spectrum(lines)
     shares = (np.arange(_FREQUENCIES // 2) + 0.5) / (_FREQUENCIES // 2)
-    away = np.interp(shares, np.cumsum(spectrum.power), spectrum.frequency)
+    away = np.interp(shares, np.cumsum(spectrum.share), spectrum.frequency)
     beside = np.concatenate([-away, away]) / lines.range_step_m
     cycles_per_m = cycles_per_m_at(lines, spectrum.centre) + beside
     middle_m = band_wavelength_m(lines, spectrum.centre)

@@ -154,7 +154,7 @@ class Correlator:
         """
         lags = np.arange(-_SPECKLE_LAGS, _SPECKLE_LAGS + 1)
         turns = np.cos(2 * np.pi * np.outer(lags, self.spectrum.frequency))
-        correlated = (turns @ self.spectrum.power) ** 2
+        correlated = (turns @ self.spectrum.share) ** 2
         return np.array(
             [
                 n / float(np.sum(correlated * np.maximum(1 - np.abs(lags) / n, 0.0)))
@@ -228,7 +228,7 @@ class Correlator:
         if self.swath.element_length_m is not None:
             # Frequencies that represent equal shares of the power.
             quantiles = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES
-            share = np.cumsum(self.spectrum.power)
+            share = np.cumsum(self.spectrum.share)
             away = np.interp(quantiles, share / share[-1], self.spectrum.frequency) / self.step_m
             band = np.concatenate([self.cycles_per_m - away[::-1], self.cycles_per_m + away])
             aligned = alignment(geometry, band, half_width)

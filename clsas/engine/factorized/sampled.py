@@ -117,10 +117,10 @@ class SampledScene:
         if track is None:
             return None
         outside = min(OUTSIDE * allowed_power, _MOST_OUTSIDE)
-        occupied = spectrum.frequency[np.cumsum(spectrum.power) < 1 - outside]
+        occupied = spectrum.frequency[np.cumsum(spectrum.share) < 1 - outside]
         half_band = (occupied[-1] if len(occupied) else 0.5) / lines.range_step_m
         centre = cycles_per_m_at(lines, spectrum.centre)
-        mean_square = spectrum.power @ spectrum.frequency**2
+        mean_square = spectrum.share @ spectrum.frequency**2
         power = energy / max(float(energy.mean()), 1e-300) if energy.any() else 1 + energy
         return cls(
             scene,
@@ -249,7 +249,7 @@ class SampledScene:
         The phase is positive, whatever its sign in the lines.
         """
         spectrum = self.scene.spectrum
-        found, power = spectrum.frequency, spectrum.power
+        found, power = spectrum.frequency, spectrum.share
         found = spectrum.centre + np.concatenate([-found[::-1], found])
         cycles_per_m = np.abs(cycles_per_m_at(self.scene.lines, found))
         share = np.concatenate([power[::-1], power]) / 2

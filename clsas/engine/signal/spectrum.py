@@ -10,6 +10,9 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from clsas.engine.data import validate
+from clsas.engine.data.geometry import pairwise_range_m
+from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at, some_channels
 
 MEASURED_CHANNELS = 256
@@ -29,6 +32,10 @@ OUTSIDE = 0.1
 _OUTSIDE_BAND = (1e-8, 1e-6, 1e-4)
 _COMPETING = 0.5  # width of a gap over that of the guard band from which on they may be mistaken
 _CLOSING = 1 / 300  # cycles per sample around the point opposite the centre, which may alias
+_COHERENT_CYCLES = 2.0  # phase over the aperture up to which common parts add coherently
+_COHERENT_POINTS = 3  # sampled along either side of the grid; twice as many change nothing
+# Number of the strongest coherent frequencies that are evaluated; half as many change nothing.
+_COHERENT_FREQUENCIES = 256
 _FEW_FREQUENCIES = 4.0  # errors of a single frequency have up to 5 times the predicted power
 _LOUDEST = 16  # loudest channels, sampled as well because clicks occur in few lines
 _SUMMABLE = (1e-20, 1e38)  # energies that float32 squares and sums without loss
@@ -53,9 +60,8 @@ class Spectrum:
         Sample rate over the width of the occupied band.
     aliasing : float
         Relative error power from aliasing, if the band fills the whole sampled band.
-    competing_gap : float
-        Width of a gap within the band that might as well be the guard band, cycles per sample; 0
-        without one.
+    line_power : float64 [n] or None
+        Share of the power of the lines, if `power` includes that of the image.
     """
 
     centre: float
@@ -63,7 +69,7 @@ class Spectrum:
     power: NDArray[np.float64]
     oversampling: float = np.inf
     aliasing: float = 0.0
-    competing_gap: float = 0.0
+    line_power: NDArray[np.float64] | None = None
 
     @property
     def scatter(self) -> float:
@@ -71,7 +77,12 @@ class Spectrum:
 
         It is largest if the power lies at few frequencies, where errors do not average out.
         """
-        return 1 + _FEW_FREQUENCIES * float(np.sum(self.power**2))
+        return 1 + _FEW_FREQUENCIES * float(np.sum(self.share**2))
+
+    @property
+    def share(self) -> NDArray[np.float64]:
+        """Share of the power of the lines at every distance, float64 [n]; the sum is 1."""
+        return self.power if self.line_power is None else self.line_power
 
     @property
     def bin_width(self) -> float:
@@ -89,28 +100,50 @@ class Spectrum:
             Share of the power that is shifted by -n, ..., n times `bin_width`.
         """
         most = len(shares) // 2
-        both_sides = np.convolve(np.concatenate([self.power[::-1], self.power]) / 2, shares)
-        below, above = np.split(both_sides, 2)
+
+        def widened(power: NDArray[np.float64]) -> NDArray[np.float64]:
+            both_sides = np.convolve(np.concatenate([power[::-1], power]) / 2, shares)
+            below, above = np.split(both_sides, 2)
+            return below[::-1] + above
+
         more = self.frequency[-1] + self.bin_width * np.arange(1, most + 1)
-        frequency = np.concatenate([self.frequency, more])
-        return replace(self, frequency=frequency, power=below[::-1] + above)
+        return replace(
+            self,
+            frequency=np.concatenate([self.frequency, more]),
+            power=widened(self.power),
+            line_power=None if self.line_power is None else widened(self.line_power),
+        )
 
 
-def measure_spectrum(lines: RangeLines, energy: NDArray[np.float64] | None = None) -> Spectrum:
+def measure_spectrum(
+    lines: RangeLines, grid: Grid | None = None, energy: NDArray[np.float64] | None = None
+) -> Spectrum:
     """Return the mean power spectrum of lines, relative to the middle of their occupied band.
 
-    `energy` is the `line_energy` of the lines, if it is known.
+    With a grid, frequencies that add up coherently in its image get the weight that they have
+    there, and a warning is issued if the band cannot be told from its complement. `energy` is the
+    `line_energy` of the lines, if it is known.
     """
     frequency, power, faded = _mean_power(lines, MEASURED_CHANNELS, energy)
     centre, width, left_out, gap = _occupied_band(frequency, faded)
+    if grid is not None and gap:
+        validate.warn(
+            f"the band of the lines wraps around half the sample rate, and has a gap of {gap:.0%} "
+            f"of the sample rate or more beside a guard band of {1 - width:.0%}. Which of them "
+            "lies within the band is not known: if it is the wider one, the image is in error. Mix "
+            "the middle of the band to 0 Hz"
+        )
     distance = _distance(frequency, centre)
+    share = _histogram(distance, power)
+    if grid is not None:
+        power = np.maximum(power, _image_power(lines, grid, frequency, power))
     return Spectrum(
         centre,
         (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES),
         _histogram(distance, power),
         oversampling=1 / width,
         aliasing=left_out + _aliasing(distance, faded, width),
-        competing_gap=gap,
+        line_power=share,
     )
 
 
@@ -218,6 +251,52 @@ def _histogram(distance: NDArray[np.float64], power: NDArray[np.float64]) -> NDA
     return found + np.bincount(lower + 1, above, _FREQUENCIES)
 
 
+def _image_power(
+    lines: RangeLines, grid: Grid, frequency: NDArray[np.float64], power: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the share of the power of an image that each frequency of the lines contributes.
+
+    Signals near 0 Hz that are common to all channels, such as a constant offset in lines on their
+    carrier, add up coherently in the whole image. Their power grows with the square of the number
+    of channels, while that of echoes from all over the scene grows with the number. The gain is
+    measured by coherent summation of some channels at some pixels, and extrapolated to all
+    channels.
+    """
+    some = some_channels(lines.channels)
+    if len(some) < 2:
+        return power
+    part = lines.select(some)
+    range_m = pairwise_range_m(
+        grid.spread(_COHERENT_POINTS),
+        part.tx_m,
+        part.rx_m,
+        part.rx_velocity_m_s,
+        part.sound_speed_m_s,
+    )
+    phase_per_m = cycles_per_m_at(lines, frequency)
+    spread_m = float(np.ptp(range_m, axis=1).max())
+    coherent = np.flatnonzero(np.abs(phase_per_m) * spread_m < _COHERENT_CYCLES)
+    if not coherent.size or coherent.size == len(power):
+        return power
+    strongest = np.argsort(power[coherent])[::-1][:_COHERENT_FREQUENCIES]
+    coherent = coherent[strongest]
+    # Spectra of the lines with phases relative to range 0.
+    scale = _largest_part(part.samples) or 1.0
+    turns = np.exp(-2j * np.pi * np.outer(np.arange(lines.length), frequency[coherent]))
+    scaled = (part.samples.view(np.float32) / scale).view(np.complex64)
+    spectra = scaled @ turns
+    spectra *= np.exp(-2j * np.pi * np.outer(part.first_range_m, phase_per_m[coherent]))
+    spectra *= np.exp(2j * np.pi * part.carrier_cycles_per_m * part.first_range_m)[:, None]
+    steering = np.exp(2j * np.pi * range_m[..., None] * phase_per_m[coherent])
+    summed = np.mean(np.abs(np.einsum("pcf,cf->pf", steering, spectra)) ** 2, axis=0)
+    alone = np.sum(np.abs(spectra) ** 2, axis=0)
+    gain = np.divide(summed, alone, out=np.ones_like(summed), where=alone > 0) - 1
+    gain = 1 + gain * (lines.channels - 1) / (len(some) - 1)
+    found = power.copy()
+    found[coherent] *= np.maximum(gain, 0.0)
+    return found / found.sum()
+
+
 def _aliasing(distance: NDArray[np.float64], power: NDArray[np.float64], width: float) -> float:
     """Return the error power due to aliasing of the power opposite the centre, in a full band.
 
@@ -247,7 +326,7 @@ def power_spectrum(lines: RangeLines) -> tuple[NDArray[np.float64], NDArray[np.f
 
 def occupied_band(spectrum: Spectrum, outside: float) -> tuple[float, float]:
     """Return centre and half width of the band that contains all but a share of the power."""
-    bins = np.searchsorted(np.cumsum(spectrum.power), 1 - outside)
+    bins = np.searchsorted(np.cumsum(spectrum.share), 1 - outside)
     return spectrum.centre, float(min((bins + 1) / (2 * len(spectrum.power)), 0.5))
 
 

@@ -49,7 +49,7 @@ def test_velocities_that_differ_widen_the_band():
     # Towards the grid at v, ranges grow by v/c less: the carrier's share of a cycle per sample.
     shift = velocity[:, 1].std() / 1500 * roots.sampled.scene.lines.carrier_cycles_per_m
     wide, narrow = (
-        np.sqrt(each.power @ each.frequency**2) / roots.sampled.scene.lines.range_step_m
+        np.sqrt(each.share @ each.frequency**2) / roots.sampled.scene.lines.range_step_m
         for each in (
             roots.stretch.spectrum(roots.sampled.scene.spectrum),
             roots.sampled.scene.spectrum,
@@ -65,7 +65,7 @@ def test_shifts_keep_the_power():
     assert shares == pytest.approx([0.0625, 0.1875, 0, 0, 0, 0, 0.75, 0, 0])
     shifted = spectrum.shifted(shares)
     assert shifted.power.sum() == pytest.approx(spectrum.power.sum())
-    assert shifted.power.sum() == pytest.approx(1.0)
+    assert shifted.share.sum() == pytest.approx(1.0)
     assert len(shifted.frequency) == len(shifted.power) == len(spectrum.power) + len(shares) // 2
 
 

@@ -36,12 +36,12 @@ def coherent_ratio_db(lines, grid):
 @pytest.mark.parametrize("x_m", [4.8, *also(4.4)])
 def test_points_that_the_beam_hardly_covers_make_dark_images(x_m):
     lines, grid = bright_where_coverage_ends(x_m)
-    spectrum = measure_spectrum(lines)
+    spectrum = measure_spectrum(lines, grid)
     found = brightness(lines, grid, spectrum, BEAM, BEAM.directions(lines))
     assert 10 * np.log10(found) == pytest.approx(coherent_ratio_db(lines, grid), abs=4)
 
 
 def test_points_that_the_beam_covers_make_bright_images():
     lines, grid = bright_where_coverage_ends(0.0)
-    spectrum = measure_spectrum(lines)
+    spectrum = measure_spectrum(lines, grid)
     assert brightness(lines, grid, spectrum, BEAM, BEAM.directions(lines)) == 1

@@ -1,3 +1,5 @@
+import warnings
+
 import numpy as np
 import pytest
 from cases import noise
@@ -5,6 +7,7 @@ from cases import noise
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, band_wavelength_m
 from clsas.engine.signal.spectrum import measure_spectrum
+from clsas.selftest.reference import ideal
 
 GRID = Grid.plane((-0.1, 0.1, 3), (15, 15.2, 3))
 
@@ -110,7 +113,7 @@ ALL = slice(None)
 )
 def test_gaps_belong_to_the_band_where_half_the_sample_rate_is_quiet(parts, centre, width):
     lines = bands(*parts)
-    spectrum = measure_spectrum(lines)
+    spectrum = measure_spectrum(lines, GRID)
     assert spectrum.centre == pytest.approx(centre, abs=0.01)
     assert 1 / spectrum.oversampling == pytest.approx(width, abs=0.01)
 
@@ -126,7 +129,44 @@ def test_gaps_belong_to_the_band_where_half_the_sample_rate_is_quiet(parts, cent
     ids=["no gap", "a narrow gap", "a gap half as wide", "two gaps alike"],
 )
 def test_a_band_that_wraps_is_unwrapped_unless_two_gaps_compete(parts, centre, says):
-    spectrum = measure_spectrum(bands(*parts))
-    assert bool(spectrum.competing_gap) == says
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        spectrum = measure_spectrum(bands(*parts), GRID)
+    assert bool(caught) == says
+    assert all(
+        "the band of the lines wraps around half the sample rate" in str(c.message) for c in caught
+    )
     if centre is not None:
         assert abs((spectrum.centre - centre + 0.5) % 1 - 0.5) < 0.015
+
+
+@pytest.mark.slow
+def test_a_common_offset_weighs_as_in_the_image():
+    """The offset adds up in phase over the image, while echoes from everywhere do not."""
+    x_m = 0.02 * np.arange(200)
+    track = np.column_stack([x_m, 0 * x_m, 0 * x_m])
+    band = noise(200, 1000, occupied=0.1, centre=0.35)
+    band /= np.sqrt(np.mean(np.abs(band) ** 2))
+    # A little below 0 Hz too, so that nothing else lies as far from the centre as 0 Hz.
+    band += 0.1 * noise(200, 1000, occupied=0.02, centre=-0.2, seed=1)
+    offset = np.full(band.shape, np.sqrt(1e-3), complex)
+    grid = Grid.plane((1.5, 2.5, 20), (12.0, 13.0, 20))
+
+    def share_at_zero(samples, *grids):
+        lines = RangeLines(samples, 10.0, 0.005, track, track, 0.0, 1500.0)
+        spectrum = measure_spectrum(lines, *grids)
+        assert 1 - 1e-9 <= spectrum.power.sum() <= 2
+        near = np.abs(spectrum.frequency - abs(spectrum.centre)) < 0.02
+        return spectrum.power[near].sum(), ideal(lines, grid.positions_m())
+
+    alone, _ = share_at_zero(band + offset)
+    weighed, image = share_at_zero(band + offset, grid)
+    _, of_offset = share_at_zero(offset, grid)
+    in_image = np.linalg.norm(of_offset) ** 2 / np.linalg.norm(image) ** 2
+    assert alone == pytest.approx(1e-3, rel=0.2)
+    assert in_image > 50 * alone
+    assert weighed == pytest.approx(in_image, rel=0.3)
+    # Offsets that differ from channel to channel do not add up.
+    turns = np.exp(2j * np.pi * np.random.default_rng(0).uniform(size=(200, 1)))
+    scattered, _ = share_at_zero(band + offset * turns, grid)
+    assert scattered < 3e-3
