@@ -29,7 +29,7 @@ from clsas.engine.data import validate
 from clsas.engine.data.beam import MOST_TRACK_PINGS, SHORTEST_LEG, BeamWindow
 from clsas.engine.data.declared import Number
 from clsas.engine.data.digests import Without, digest
-from clsas.engine.data.grid import Grid
+from clsas.engine.data.grid import Grid, bounding_box
 from clsas.engine.data.lines import RangeLines, reached_m
 from clsas.engine.data.sound_speed import range_bounds_m
 from clsas.engine.data.validate import ArgumentError
@@ -441,8 +441,7 @@ class SurveyVisibility:
         """Return between which ranges every channel may contribute to a grid, metres."""
         centre_m, half_m = bounding_box(grid)
         geometry = self.survey.geometry
-        radius_m = float(np.linalg.norm(np.abs(half_m).sum(axis=0)))
-        near_m, far_m = reached_m(geometry, centre_m, radius_m)
+        near_m, far_m = reached_m(geometry, centre_m, half_m)
         if (profile := geometry.sound_speed) is not None:
             near_m, far_m = range_bounds_m(profile, near_m, far_m, geometry.sound_speed_m_s)
         return near_m, far_m
@@ -495,22 +494,6 @@ class SurveyVisibility:
         # The beam leaves the farthest point of the box last, or the nearest if it points ahead.
         distance_m = away_m + radius_m if low < 0 else max(away_m - radius_m, 0.0)
         return bool(direction @ offset_m + extent_m < low * distance_m)
-
-
-def bounding_box(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the centre of a box around a grid, and half its edges as vectors [n, 3], metres."""
-    if grid.points_m is not None:
-        low, high = (edge(grid.points_m, axis=(0, 1)) for edge in (np.min, np.max))
-        return (low + high) / 2, np.diag((high - low) / 2)
-    rows, columns = grid.shape
-    origin_m, row_step_m, column_step_m = grid.vectors_m
-    half_m = np.array([row_step_m * (rows - 1), column_step_m * (columns - 1)]) / 2
-    centre_m = origin_m + half_m.sum(axis=0)
-    if grid.height_m is None:
-        return centre_m, half_m
-    low, high = grid.height_m.min(), grid.height_m.max()
-    up = np.array([0.0, 0.0, 1.0])
-    return centre_m + up * (low + high) / 2, np.concatenate([half_m, [up * (high - low) / 2]])
 
 
 PatchSource = SurveyVisibility | tuple[StampedFiles, str | None]

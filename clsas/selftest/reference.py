@@ -69,7 +69,7 @@ def same_interpolator(
     ) -> NDArray[np.complex128]:
         return interpolated(samples, position, interpolator, resampling)
 
-    return _sum_channels(lines, points_m, evaluate, progress, beam)
+    return _sum_channels(decision.crop.of(lines), points_m, evaluate, progress, beam)
 
 
 def ideal(

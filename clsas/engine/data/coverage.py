@@ -70,7 +70,7 @@ def reaches(
 
     # The full test: may any channel receive from any of the boxes that contain the pixels?
     for centre_m, sides_m in zip(*_boxes(grid), strict=True):
-        near_m, far_m = reached_m(lines, centre_m, float(np.linalg.norm(sides_m)))
+        near_m, far_m = reached_m(lines, centre_m, np.diag(sides_m))
         reached = (far_m >= lines.first_range_m) & (near_m <= lines.last_range_m)
         if track is not None and reached.any():
             reached &= track.touching(Boxes.equal(centre_m[None], np.diag(sides_m)))[0]

@@ -510,6 +510,22 @@ def _check_steps(
         raise ArgumentError("row_step_m", allowed, f"{row_step_m} m")
 
 
+def bounding_box(grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the centre of a box around a grid, and half its edges as vectors [n, 3], metres."""
+    if grid.points_m is not None:
+        low, high = grid.bounds_m
+        return (low + high) / 2, np.diag((high - low) / 2)
+    rows, columns = grid.shape
+    origin_m, row_step_m, column_step_m = grid.vectors_m
+    half_m = np.array([row_step_m * (rows - 1), column_step_m * (columns - 1)]) / 2
+    centre_m = origin_m + half_m.sum(axis=0)
+    if grid.height_m is None:
+        return centre_m, half_m
+    low, high = grid.height_m.min(), grid.height_m.max()
+    up = np.array([0.0, 0.0, 1.0])
+    return centre_m + up * (low + high) / 2, np.concatenate([half_m, [up * (high - low) / 2]])
+
+
 def without_heights(grid: Grid) -> Grid:
     """Return the plane of a height map, or the grid itself if it has no heights."""
     return replace(grid, height_m=None)

@@ -716,13 +716,37 @@ def antennas_of(
 
 
 def reached_m(
-    lines: RangeLines, centre_m: NDArray[np.float64], radius_m: float
+    lines: RangeLines, centre_m: NDArray[np.float64], half_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return between which ranges lines must have samples to contribute to a ball, [channels]."""
-    antennas = lines.tx_m, lines.rx_m, lines.rx_velocity_m_s, lines.sound_speed_m_s
-    range_m = pairwise_range_m(centre_m[None], *antennas)[0]
-    beyond_m = radius_m * steepest(lines) + REACH * lines.range_step_m
-    return range_m - beyond_m, range_m + beyond_m
+    """Return between which ranges lines must have samples to contribute to a box, [channels].
+
+    Parameters
+    ----------
+    lines : RangeLines
+    centre_m : float64 [3]
+        Centre of the box.
+    half_m : float64 [n, 3]
+        Half of its edges as vectors. If they are not orthogonal, the result is that of an
+        orthogonal box around it.
+    """
+    axes = np.linalg.qr(half_m.T, mode="complete").Q
+    extent_m = np.abs(half_m @ axes).sum(axis=0)
+    near_m, far_m = np.zeros(lines.channels), np.zeros(lines.channels)
+    for antennas_m in (lines.tx_m, lines.rx_m):
+        away_m = np.abs((antennas_m - centre_m) @ axes)
+        near_m += np.linalg.norm(np.maximum(away_m - extent_m, 0.0), axis=1) / 2
+        far_m += np.linalg.norm(away_m + extent_m, axis=1) / 2
+    beyond_m = REACH * lines.range_step_m
+    if lines.rx_velocity_m_s is not None:
+        # Motion changes the ranges to the box nearly as much as that to its centre. Per metre from
+        # there the change differs by at most twice the speed over that of sound.
+        antennas = lines.tx_m, lines.rx_m
+        velocity = lines.rx_velocity_m_s, lines.sound_speed_m_s
+        moved_m = pairwise_range_m(centre_m[None], *antennas, *velocity)[0]
+        moved_m -= pairwise_range_m(centre_m[None], *antennas)[0]
+        near_m, far_m = near_m + moved_m, far_m + moved_m
+        beyond_m += 3 * (steepest(lines) - 1) * float(np.linalg.norm(extent_m))
+    return near_m - beyond_m, far_m + beyond_m
 
 
 def steepest(lines: RangeLines) -> float:

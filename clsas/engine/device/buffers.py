@@ -27,7 +27,7 @@ GUARD = 16
 GIVEN_BYTES = 64 << 20
 """Largest size of the lines that are on a device at once before they are upsampled."""
 _LINE_ITEMS = 64  # work-items that share a line if each has one lane
-_LINES_AT_ONCE = 32  # lines that are upsampled together, so that they stay in a core's cache
+_SAMPLES_AT_ONCE = 1 << 16  # that are upsampled together, so that they stay in a core's cache
 
 
 # Shapes and sizes: a run allocates from them, and a plan adds them up.
@@ -289,7 +289,8 @@ def upsampled_lines(
         parts[0, some, inside] = upsampled.real
         parts[1, some, inside] = upsampled.imag
 
-    for _ in in_threads(fill, slices(slice(0, len(samples)), _LINES_AT_ONCE)):
+    at_once = max(_SAMPLES_AT_ONCE // resampling.upsampled_period, 1)
+    for _ in in_threads(fill, slices(slice(0, len(samples)), at_once)):
         pass
     return padded
 

@@ -36,6 +36,7 @@ from clsas.engine.exact.layout import (
 from clsas.engine.scene import Scene
 from clsas.engine.signal import interpolation
 from clsas.engine.signal.ambiguity import BEST_DB
+from clsas.engine.signal.cropping import Crop
 from clsas.engine.signal.interpolation import Interpolator, Resampling
 
 ACCURACY_DB = -60.0
@@ -83,8 +84,10 @@ class Decision:
     ----------
     layout : Tiles, Groups or GroupsEstimate
         Parts into which the grid is divided.
+    crop : Crop
+        Samples of the lines that are needed.
     interpolator, resampling : Interpolator, Resampling
-        Interpolation of range lines, and the upsampling before it.
+        Interpolation of these, and the upsampling before it.
     phase_terms : int
         Number of terms of the polynomials for sine and cosine.
     one_cubic : bool
@@ -93,6 +96,7 @@ class Decision:
     """
 
     layout: Tiles | Groups | GroupsEstimate
+    crop: Crop
     interpolator: Interpolator
     resampling: Resampling
     phase_terms: int
@@ -186,6 +190,13 @@ def decide(
     else:
         layout = gather(grid, radius_m, width)
 
+    # Upsample only what pixels need. Corrections of ranges are not known here.
+    crop = Crop.whole(lines)
+    if scene.is_reached and scene.water.corrections is None:
+        is_fixed = taps is not None and upsampling is not None
+        error_db = BEST_ACCURACY_DB if is_fixed else accuracy_db
+        crop = Crop.to_grid(lines, grid, spectrum, error_db)
+
     # Interpolate as fast as what is left of the allowed error permits.
     costs = lookup_costs(device)
 
@@ -199,7 +210,7 @@ def decide(
         scene.ambiguity.rest_db(accuracy_db, 0.0 if estimate else scene.left_out_error),
         taps=taps,
         other_error=math.hypot(geometry_error, kernels.phase_error(phase_terms)),
-        pixels_per_sample=grid.size / lines.length,
+        pixels_per_sample=grid.size / crop.length,
         lookup_cost=lookup_cost,
     )
     interpolator = choose(upsampling=upsampling)
@@ -208,9 +219,9 @@ def decide(
     if upsampling is None and rounding > geometry_error * interpolator.upsampling:
         enough = min(rounding / geometry_error, interpolation.MOST_UPSAMPLING)
         interpolator = choose(upsampling=enough)
-    resampling = interpolation.resampling(lines.length, interpolator, spectrum)
+    resampling = interpolation.resampling(crop.length, interpolator, spectrum)
     if isinstance(layout, GroupsEstimate):
-        return Decision(layout, interpolator, resampling, phase_terms, one_cubic=False)
+        return Decision(layout, crop, interpolator, resampling, phase_terms, one_cubic=False)
 
     _check_distances(antennas_m, layout)
     one_cubic = False
@@ -218,7 +229,7 @@ def decide(
         nearest_m = max(layout.nearest_m(lines.phase_centres_m) - layout.radius_m, SAME_PLACE_M)
         error = layout.one_cubic_error(beam, nearest_m, wavelength_m(lines))
         one_cubic = error <= geometry_error * fullness
-    return Decision(layout, interpolator, resampling, phase_terms, one_cubic)
+    return Decision(layout, crop, interpolator, resampling, phase_terms, one_cubic)
 
 
 def fitting_tiles(

@@ -137,7 +137,7 @@ class ExactImager:
                 first, end = int(needed[visible].min()), int(needed[visible].max())
                 needed = np.where(visible[:, None], needed - np.int32(first), needed)
                 some = slice(channels.start + first, channels.start + end)
-                block = lines.select(some)
+                block = self.decision.crop.of(lines, some)
                 backprojection.upload_lines(block, some)
 
                 for parts in slices(band, blocks.parts_at_once):

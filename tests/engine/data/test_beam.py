@@ -252,8 +252,9 @@ def test_the_references_weigh_each_channel(normalise):
     whole = prepare(lines, grid, beam=beam, **FINE)
     wanted = 0
     for channel, weight in enumerate(np.moveaxis(weights, -1, 0)):
-        alone = lines.select([channel])
-        wanted += weight * reference.same_interpolator(alone, whole.decision, where)
+        crop = dataclasses.replace(whole.crop, first=whole.crop.first[[channel]])
+        alone = lines.select([channel]), whole.but(crop=crop).decision
+        wanted += weight * reference.same_interpolator(*alone, where)
     if normalise:
         wanted = (
             np.where(weights.any(axis=-1), 10 / np.maximum(weights.sum(axis=-1), 1e-9), 0) * wanted
