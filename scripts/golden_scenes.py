@@ -660,11 +660,14 @@ def layers(record: Record) -> None:
     record.image("factorized", clsas.factorize(lines, given.grid, -45))
 
 
+ALONE = {"memory_bytes": 64 << 20}  # too little for more than one patch at a time
+
+
 def mosaic_in_memory(record: Record) -> None:
     """Form a mosaic of exact patches, and one of factorized patches."""
     given = long(shape=(140, 150), tx_m=LONG[:200])
     for how in ({"accuracy_db": -50}, {"tolerance_db": -45}):
-        found = clsas.mosaic(given.lines, given.grid, patches=(2, 3), **how)
+        found = clsas.mosaic(given.lines, given.grid, patches=(2, 3), **ALONE, **how)
         (name, asked_db), *_ = how.items()
         record.image(name, found.image(), given, within_db=asked_db)
 
@@ -675,7 +678,7 @@ def mosaic_in_store(record: Record) -> None:
     with tempfile.TemporaryDirectory() as folder:
         found = clsas.mosaic(
             given.lines, given.grid, Path(folder) / "mosaic.zarr", beam=given.beam,
-            patches=(2, 2), accuracy_db=-50,
+            patches=(2, 2), accuracy_db=-50, **ALONE,
         )  # fmt: skip
         record.image("image", found.image(), given, within_db=-50)
         record.number("patches", len(clsas.Store(Path(folder) / "mosaic.zarr").records()))

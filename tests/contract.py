@@ -127,8 +127,9 @@ def _factorizer(tolerance_db, half):
 
 def _patchwise(scene, device, **options):
     patches = mosaic(
-        scene.lines, scene.grid, beam=scene.beam, device=device, accuracy_db=-70, patches=(2, 3)
-    )
+        scene.lines, scene.grid, beam=scene.beam, device=device, accuracy_db=-70, patches=(2, 3),
+        memory_bytes=64 << 20,  # too little for more than one patch at a time
+    )  # fmt: skip
     return patches.image(**options)
 
 

@@ -486,7 +486,8 @@ class MosaicTable(Table):
         ),
     ] = None
     memory_mib: Annotated[
-        int | None, Count(unit="MiB", help="Memory for one patch.", default="1024")
+        int | None,
+        Count(unit="MiB", help="Memory for patches that are formed together.", default="1024"),
     ] = None
 
     def build(self, folder: Path) -> dict[str, Any]:

@@ -38,7 +38,7 @@ from clsas.mosaics.levels import (
 )
 
 FORMAT = "clsas mosaic"
-VERSION = 7
+VERSION = 8
 """Version of stores. Those of other versions are refused."""
 
 REPAIR = "; run `clsas.mosaic` with the same inputs to repair it"
@@ -403,6 +403,9 @@ def stored_digest(path: Path) -> str:
 class Record:
     """Record of how a finished patch was formed, and of defects of its data.
 
+    Neighbouring patches are formed together, in a block. Plan, memory, predicted error and
+    certificate are those of the block; times are the patch's share of its times.
+
     Attributes
     ----------
     channels : int
@@ -420,7 +423,7 @@ class Record:
     predicted_seconds, plan_seconds, read_seconds, seconds : float
         Predicted time of imaging; measured times of planning, of reading lines, and in total, s.
     memory_bytes : int
-        Predicted memory.
+        Predicted memory of the block.
     device, driver : str
         Device that formed the patch, and its driver.
     plan : dict or None
@@ -428,13 +431,16 @@ class Record:
         an exact image or an empty patch.
     has_pixels : bool
         True if any pixel is not 0.
+    share : float
+        Share of the patch in the pixels of its block; 0 if only other patches of the block have
+        pixels that are not 0.
     certificate : Certificate or None
-        Measured error of the patch, with the worst pixels counted from its corner; of heights, that
+        Measured error of the block, with the worst pixels counted from its corner; of heights, that
         of the bank whose image has the larger error. None if it was not measured.
     unmeasured : str
         Why the error could not be measured; empty if it was, or was not to be.
     misses : tuple of str
-        Predicted and measured errors of earlier images of the patch, which were formed again
+        Predicted and measured errors of earlier images of the block, which was formed again
         because the mosaic missed its tolerance.
     heights : dict or None
         How the heights were measured: the share of `valid` pixels, the median of `looks`, the
@@ -456,6 +462,7 @@ class Record:
     driver: str = ""
     plan: dict[str, Any] | None = None
     has_pixels: bool = False
+    share: float = 1.0
     certificate: Certificate | None = field(default=None, compare=False)
     unmeasured: str = ""
     misses: tuple[str, ...] = ()
@@ -528,13 +535,14 @@ def requested_db(request: Mapping[str, Any]) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class MosaicCertificate:
-    """Measured error of a mosaic, and of each of its patches.
+    """Measured error of a mosaic, and of the blocks in which its patches were formed.
 
     Attributes
     ----------
     whole : Certificate
         Error of all certified patches together.
     patches : dict of (row, column) to Certificate
+        Error of the block of each certified patch.
     of_patches : int
         Number of finished patches with pixels that are not 0, certified or not.
     """
@@ -554,7 +562,8 @@ class MosaicCertificate:
         if not known:
             return None
         count = sum(record.has_pixels for record in records.values())
-        return cls(of_parts(list(known.values())), known, count)
+        shares = [records[index].share for index in known]
+        return cls(of_parts(list(known.values()), shares), known, count)
 
     @property
     def error_db(self) -> float:
@@ -572,15 +581,15 @@ class MosaicCertificate:
 
     @property
     def worst(self) -> PatchIndex:
-        """The patch whose error is the largest relative to its own power."""
+        """The first patch of the block whose error is the largest relative to its own power."""
         return max(self.patches, key=lambda index: self.patches[index].error)
 
     def describe(self, tolerance_db: float | None = None) -> str:
-        """Return the error of the whole and of the worst patch as a line of text."""
+        """Return the error of the whole and of the worst block as a line of text."""
         row, column = self.worst
         worst_db = self.patches[self.worst].error_db
-        text = f"{self.whole.describe(tolerance_db)}; at worst {worst_db:.1f} dB in patch "
-        text += f"{row},{column}"
+        text = f"{self.whole.describe(tolerance_db)}; at worst {worst_db:.1f} dB in the block of "
+        text += f"patch {row},{column}"
         if len(self.patches) < self.of_patches:
             text += f"; {len(self.patches)} of {self.of_patches} patches measured"
         return text

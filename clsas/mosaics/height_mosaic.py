@@ -61,7 +61,7 @@ from clsas.mosaics.devices import open_devices, thread_device
 from clsas.mosaics.document import PARTS_OF_B, PatchIndex, Record
 from clsas.mosaics.levels import LAYERS, SHADOWED
 from clsas.mosaics.mosaic import Mosaic, beam_of_mosaic, inputs_of, warn_of_window
-from clsas.mosaics.patches import Layout, PatchWindow, aligned_shape, with_margin
+from clsas.mosaics.patches import Block, Layout, aligned_shape, with_margin
 from clsas.mosaics.relief_shadows import mask_shadows, of_shadows
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import PatchSource, Survey, SurveyVisibility, largest_gap_m, open_survey
@@ -247,6 +247,7 @@ def mosaic_heights(
         _form=partial(measure_patch, banks, grid, request, margin, opened),
         _complete=partial(_complete, opened),
         _visibility=banks[0].visibility,
+        _block_shape=patch_shape,
         _store=opened,
         _inputs=inputs,
         _devices=devices,
@@ -373,16 +374,18 @@ def measure_patch(
     request: Request,
     margin: tuple[int, int],
     store: Store,
-    window: PatchWindow,
+    block: Block,
     _source: PatchSource,
     _missed: Record | None,
-) -> tuple[Record, None]:
+) -> list[tuple[Record, None]]:
     """Measure a patch of a grid with a margin, and write it to the store.
 
-    The banks do not grow, and no patch is measured again for its error. If the patch cannot be
-    imaged, a note of the ValueError names it.
+    Blocks have one patch each, because the margin depends on it. The banks do not grow, and no
+    patch is measured again for its error. If the patch cannot be imaged, a note of the ValueError
+    names it.
     """
     start = time.perf_counter()
+    ((window, _),) = block.patches()
     rows, columns, inside = with_margin(window, margin, grid.shape)
     wide = grid.window(rows, columns)
     pixels: NDArray[np.complex64] = np.zeros(window.grid.shape, np.complex64)
@@ -403,10 +406,10 @@ def measure_patch(
             known["has_pixels"] = holds_any(pixels)
         record = Record(**known, seconds=time.perf_counter() - start)
     except ValueError as error:
-        error.add_note(f"patch {window.row},{window.column}")
+        error.add_note(str(block))
         raise
     store.write(*window[1:], pixels, record, layers)
-    return record, None
+    return [(record, None)]
 
 
 def _results(
@@ -461,7 +464,7 @@ def _seen(
     missing = lost | lost_too
     known |= {
         "missing_channels": int(np.count_nonzero(missing)),
-        "gap_m": largest_gap_m(first, missing),
+        "gap_m": largest_gap_m(first.phase_centres_m, missing),
         "read_seconds": time.perf_counter() - start,
     }
     if missing.all():

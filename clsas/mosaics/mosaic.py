@@ -1,12 +1,13 @@
-"""Mosaics: images of any size, formed patch by patch on one or several devices or machines.
+"""Mosaics: images of any size, formed block by block on one or several devices or machines.
 
 `mosaic` checks its arguments and opens the survey and the store. Iterating over the `Mosaic` that
-it returns hands the patches to the devices of this process or to the workers of a cluster, also
-while files are added to the survey. `form_patch` forms one of them: every patch is planned and
-imaged by itself, from the channels and samples that it needs.
+it returns hands blocks of patches to the devices of this process or to the workers of a cluster,
+also while files are added to the survey. `form_block` forms one of them: every block is planned,
+imaged and certified as a whole, from the channels and samples that it needs.
 
-A patch in a store (`clsas.mosaics.store`) is finished once it has a record, which is written after
-its pixels. If a mosaic is interrupted, the next run forms only the patches that are not finished.
+What is stored is a patch. In a store (`clsas.mosaics.store`) it is finished once it has a record,
+which is written after its pixels. If a mosaic is interrupted, the next run forms only the blocks
+with patches that are not finished.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -75,7 +77,7 @@ from clsas.mosaics.document import (
     is_there,
     requested_db,
 )
-from clsas.mosaics.patches import Layout, PatchWindow, aligned_shape, patch_shape_of
+from clsas.mosaics.patches import Block, Layout, aligned_shape, patch_shape_of
 from clsas.mosaics.store import Store
 from clsas.mosaics.survey import (
     END,
@@ -103,9 +105,10 @@ REQUESTS = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
 MEMORY_BYTES = 1 << 30
 """Default memory of one patch: a plain choice, which suits laptops and small GPUs."""
 
-_LARGEST_SIDE = 4096  # pixels; such a patch takes seconds, and larger ones gain nothing
+_MOST_PIXELS = 4096**2  # of a block; such a block takes seconds, and larger ones gain nothing
 _SMALLEST_SIDE = 128  # pixels; reading and planning smaller patches takes longer than imaging
-_MOST_ON_CLUSTER = 1000  # patches submitted at once: enough for any cluster, few to wait for
+_SAMPLED = 32  # patches or blocks whose memory is predicted, evenly spread; a plain choice
+_MOST_ON_CLUSTER = 1000  # blocks submitted at once: enough for any cluster, few to wait for
 
 
 def mosaic(
@@ -126,7 +129,7 @@ def mosaic(
     on_miss: Annotated[str, ON_MISS] = "refine",
     follow_s: Annotated[float | None, FOLLOW] = None,
 ) -> Mosaic:
-    """Return a mosaic, an image of any size that is formed patch by patch.
+    """Return a mosaic, an image of any size that is formed and stored in patches.
 
     No patch is formed before you iterate over the result or call its `image`::
 
@@ -147,17 +150,18 @@ def mosaic(
     tolerance_db, tolerance_wavelengths, stages
         See `clsas.plan`. The default is a tolerance of -50 dB.
     accuracy_db : float, optional
-        Accuracy of exact backprojection of every patch, see `clsas.backproject`.
+        Accuracy of exact backprojection, see `clsas.backproject`.
     beam : BeamWindow, optional
         Weights of the channels. If the beam's direction follows the track, it is computed from the
         whole track, not only from the part near a patch. In a store that may grow, since its
         folder contains no file named `end`, `track_pings` is 101 by default.
     patches : (rows, columns), optional
         Number of patches along both axes; the last ones may be smaller. By default patches are as
-        large as memory allows, up to 4096 x 4096 pixels.
+        large as memory allows, up to 16.8 million pixels. Smaller patches hardly take longer,
+        because neighbours are formed together.
     memory_bytes : int, optional
-        Memory of one patch, on host and device together; 1 GiB by default. Exact backprojection
-        needs the device's buffers in addition, of up to 1024 upsampled lines.
+        Memory of patches that are formed together, on host and device; 1 GiB by default. Exact
+        backprojection needs the device's buffers in addition, of up to 1024 upsampled lines.
     device : Device, str or int, or a sequence of them, optional
         Devices that work side by side. By default all GPUs if there are several, else the device
         that `choose` returns. Must be left out with a `client`, each of whose
@@ -166,12 +170,12 @@ def mosaic(
         Client of a Dask cluster whose workers form the patches. They must be able to open `source`
         and `store` under the same paths.
     certificate : bool, optional
-        Whether the errors of the patches are measured, as by `clsas.certify`. By default, that of a
-        patch is measured if planning and forming it take 0.1 s or more, except with `stages` or
+        Whether errors are measured, as by `clsas.certify`. By default, that of a block of patches
+        is measured if planning and forming it take 0.1 s or more, except with `stages` or
         `tolerance_wavelengths`.
     on_miss : {"refine", "warn", "raise"}
         What to do if the measured error of the whole mosaic exceeds the tolerance beyond doubt:
-        form the patches that exceed it most again, by better plans and then exactly, until the
+        form the blocks that exceed it most again, by better plans and then exactly, until the
         whole meets the tolerance, with a warning; warn; or raise ToleranceError.
     follow_s : float, optional
         Wait for files to be added to the folder `source`, until it contains a file named `end` or
@@ -213,9 +217,13 @@ def mosaic(
 
     Notes
     -----
-    Patches are formed independently of each other. The error that is predicted for each patch is
-    within the tolerance, and so is the difference of neighbours along their border. The tolerance
-    applies to the measured error of all patches together.
+    Neighbouring patches are formed together, in blocks that are as large as `memory_bytes` allows,
+    up to 16.8 million pixels, but no larger than leaves one to each device or worker. Blocks are
+    formed independently of each other. Every patch is a block while a survey is followed, so that
+    it is formed as soon as possible, and with `stages`, which state how each patch is divided.
+
+    The error that is predicted for each block is within the tolerance, and so is the difference of
+    neighbours along their border. The tolerance applies to the measured error of all together.
 
     Examples
     --------
@@ -280,6 +288,10 @@ def mosaic(
         patch_shape = stored.patch_shape
     if patch_shape is None:
         patch_shape = _choose_patch_shape(visibility, grid, memory_bytes)
+    block_shape = patch_shape
+    if growth is None and "stages" not in request:
+        workers = len(devices) if client is None else sum(client.nthreads().values())
+        block_shape = _choose_block_shape(visibility, grid, patch_shape, memory_bytes, workers)
     finished: dict[PatchIndex, Record] = {}
     if stored is not None:
         stored.begin(inputs, grid, patch_shape)
@@ -293,7 +305,8 @@ def mosaic(
         grid,
         patch_shape,
         finished,
-        _form=partial(form_patch, request, memory_bytes, stored, asked["certificate"]),
+        _block_shape=block_shape,
+        _form=partial(form_block, request, memory_bytes, stored, asked["certificate"]),
         _complete=None if stored is None else stored.complete_levels,
         _visibility=visibility,
         _store=stored,
@@ -415,31 +428,73 @@ def _choose_patch_shape(
     ValueError
         If not even the smallest patches fit.
     """
-    side = _LARGEST_SIDE
-    needed = 0
-    while side >= _SMALLEST_SIDE:
-        # Make the patches as equal as possible, and levels end at their borders.
-        height, width = aligned_shape(grid.shape, [math.ceil(n / side) for n in grid.shape])
-        most = 0
-        for row in (0, grid.shape[0] - 1):
-            top, left = row // height * height, grid.shape[1] // 2 // width * width
-            window = grid.window(slice(top, top + height), slice(left, left + width))
-            visible = visibility.channels(window)
-            if visible.any():
-                count, length = visibility.survey.extent(visible, *visibility.ranges_m(window))
-                most = max(most, count * length)
-        # Upsampled lines and stages on the device take about one and a half times the lines.
-        needed = _host_bytes(1, most, height * width) + 12 * most + (64 << 20)
-        if needed <= memory_bytes:
-            return height, width
-        side //= 2
-    raise ArgumentError(
-        "memory_bytes",
-        f"be at least {needed / 2**20:.0f} MiB for the smallest patches, of {height} x {width} "
-        "pixels",
-        f"{memory_bytes / 2**20:.3g} MiB",
-        "raise it or give `patches`",
-    )
+    for parts in _divisions(grid.shape):
+        shape = aligned_shape(grid.shape, parts)
+        needed = _needed_bytes(visibility, Layout(grid, shape))
+        if needed <= memory_bytes and math.prod(shape) <= _MOST_PIXELS:
+            break
+        if max(shape) <= _SMALLEST_SIDE:
+            raise ArgumentError(
+                "memory_bytes",
+                f"be at least {needed / 2**20:.0f} MiB for the smallest patches, of "
+                f"{reprs.by(shape)} pixels",
+                f"{memory_bytes / 2**20:.3g} MiB",
+                "raise it or give `patches`",
+            )
+    return shape
+
+
+def _choose_block_shape(
+    visibility: SurveyVisibility,
+    grid: Grid,
+    patch_shape: tuple[int, int],
+    memory_bytes: int,
+    workers: int,
+) -> tuple[int, int]:
+    """Return the number of pixels of the largest blocks of patches that fit into memory.
+
+    There are at least as many as there are workers, unless there are fewer patches.
+    """
+    patches = Layout(grid, patch_shape).shape
+    for parts in _divisions(grid.shape):
+        rows, columns = (
+            math.ceil(count / part) * pixels
+            for count, part, pixels in zip(patches, parts, patch_shape, strict=True)
+        )
+        if (rows, columns) == patch_shape:
+            break
+        layout = Layout(grid, (rows, columns))
+        if (
+            rows * columns <= _MOST_PIXELS
+            and len(layout) >= workers
+            and _needed_bytes(visibility, layout) <= memory_bytes
+        ):
+            break
+    return rows, columns
+
+
+def _divisions(shape: tuple[int, ...]) -> Iterator[tuple[int, int]]:
+    """Yield numbers of parts along rows and columns, each time halving the parts' longer side."""
+    rows = columns = 1
+    while True:
+        yield rows, columns
+        if shape[0] / rows >= shape[1] / columns:
+            rows *= 2
+        else:
+            columns *= 2
+
+
+def _needed_bytes(visibility: SurveyVisibility, layout: Layout) -> int:
+    """Return the memory that patches or blocks are predicted to need, from some of them."""
+    most, indices = 0, list(layout.indices())
+    for index in indices[:: math.ceil(len(indices) / _SAMPLED)]:
+        window = layout.window(index).grid
+        visible = visibility.channels(window)
+        if visible.any():
+            count, length = visibility.survey.extent(visible, *visibility.ranges_m(window))
+            most = max(most, count * length)
+    # Upsampled lines and stages on the device take about one and a half times the lines.
+    return _host_bytes(1, most, math.prod(layout.patch_shape)) + 12 * most + (64 << 20)
 
 
 def inputs_of(
@@ -461,7 +516,7 @@ def inputs_of(
 
 @dataclass(frozen=True, eq=False)
 class Mosaic:
-    """An image of any size, to be formed patch by patch or, with `image`, as a whole.
+    """An image of any size, to be formed patch after patch or, with `image`, as a whole.
 
     Iterating over the mosaic yields every `Patch` as soon as it is finished, and once more if it is
     formed again. A second iteration forms only the patches that the store lacks.
@@ -475,7 +530,8 @@ class Mosaic:
     grid : Grid
         Grid of the whole mosaic.
     patch_shape : (rows, columns)
-        Number of pixels of a patch; the last patches along each axis may be smaller.
+        Number of pixels of a patch; the last patches along each axis may be smaller. Patches are
+        formed together with their neighbours, several at a time.
     shape : (rows, columns)
         Number of patches.
     finished : dict of (row, column) to Record
@@ -490,7 +546,8 @@ class Mosaic:
     grid: Grid
     patch_shape: tuple[int, int]
     finished: dict[PatchIndex, Record]
-    _form: Callable[[PatchWindow, PatchSource, Record | None], tuple[Record, Image | None]]
+    _block_shape: tuple[int, int]  # pixels of the patches that are formed together
+    _form: Callable[[Block, PatchSource, Record | None], Sequence[tuple[Record, Image | None]]]
     _complete: Callable[[], object] | None  # called once all patches are finished
     _visibility: SurveyVisibility  # the survey when the mosaic was requested
     _store: Store | None
@@ -541,7 +598,7 @@ class Mosaic:
     def __iter__(self) -> Generator[Patch, None, None]:
         """Form the patches that are not finished, and yield each of them.
 
-        If the whole then misses its tolerance, its worst patches are formed again.
+        If the whole then misses its tolerance, its worst blocks of patches are formed again.
 
         Raises
         ------
@@ -550,7 +607,7 @@ class Mosaic:
         OSError
             If the store cannot be written, for example on a full disk. Finished patches remain.
         ValueError
-            If a patch cannot be imaged; the message names the patch.
+            If patches cannot be imaged; a note of the error names them.
 
         Warns
         -----
@@ -559,7 +616,7 @@ class Mosaic:
             measured.
         """
         survey = GrowingSurvey(self._visibility, self._growth, self._store, self._inputs)
-        layout, finished = self._layout, self.finished
+        layout, finished, blocks = self._layout, self.finished, Layout(self.grid, self._block_shape)
         # Patches to form, with the records of those images that missed the tolerance
         todo: dict[PatchIndex, Record | None] = dict.fromkeys(
             index for index in layout.indices() if index not in finished
@@ -571,20 +628,21 @@ class Mosaic:
         if self._client is not None:  # a cluster returns only records
             executor, most_running = self._client.get_executor(pure=False), _MOST_ON_CLUSTER
         else:
-            # One more than there are threads, since finished patches stay in memory until taken.
-            workers = max(min(len(self._devices), len(layout)), 1)
+            # One more than there are threads, since finished blocks stay in memory until taken.
+            workers = max(min(len(self._devices), len(blocks)), 1)
             executor, most_running = device_threads(workers, self._devices), workers + 1
-        running: dict[Future, PatchIndex] = {}
+        running: dict[Future, list[PatchIndex]] = {}
         try:
-            ready = survey.ready(layout, todo)
+            ready = self._in_blocks(survey.ready(layout, todo))
             while True:
                 while ready and len(running) < most_running:
-                    index = ready.popleft()
-                    missed = todo.pop(index)
+                    number, wanted = ready.popleft()
+                    missed = _worst_of(map(todo.pop, wanted))
+                    grid, _, _, rows, columns = blocks.window(number)
+                    block = Block(grid, rows, columns, self.patch_shape, wanted)
                     source = survey.visibility if self._client is None else survey.for_workers()
                     with uninterrupted():
-                        future = executor.submit(self._form, layout.window(index), source, missed)
-                        running[future] = index
+                        running[executor.submit(self._form, block, source, missed)] = wanted
                 if not running and not todo and survey.has_ended:
                     certificate = MosaicCertificate.of(records)
                     todo = self._worst(certificate, records)
@@ -594,23 +652,24 @@ class Mosaic:
                         self._report(certificate, records, misses)
                         return
                     misses = misses or [certificate.describe()]
-                    ready = survey.ready(layout, todo)
+                    ready = self._in_blocks(survey.ready(layout, todo))
                     continue
                 timeout_s = None if survey.has_ended and running else POLL_S
                 done = wait(running or [Future()], timeout_s)
-                latest = [index for future, index in running.items() if future in done]
+                latest = [i for future, wanted in running.items() if future in done for i in wanted]
                 for future in [future for future in running if future in done]:
                     with uninterrupted():
-                        index = running.pop(future)
-                        record, image = future.result()
-                    records[index] = record
-                    if self._store is not None:
-                        finished[index] = record
-                    yield self._patch(index, record, image)
+                        formed = dict(zip(running.pop(future), future.result(), strict=True))
+                        latest_records = {index: record for index, (record, _) in formed.items()}
+                        records |= latest_records
+                        if self._store is not None:
+                            finished |= latest_records
+                    for index, (record, image) in formed.items():
+                        yield self._patch(index, record, image)
 
                 # A patch that is running is checked when it is finished.
                 has_news = survey.update()
-                busy = set(running.values())
+                busy = set(chain.from_iterable(running.values()))
                 outdated = [
                     index
                     for index in (records if survey.channels > checked else latest)
@@ -621,12 +680,12 @@ class Mosaic:
                 checked = survey.channels
                 if has_news or outdated:
                     todo |= dict.fromkeys(outdated)
-                    ready = survey.ready(layout, todo)
+                    ready = self._in_blocks(survey.ready(layout, todo))
         finally:
             # If the caller stops early, patches that have been started are still completed.
             with uninterrupted():
                 begun = {future for future in running if not future.cancel()}
-            # Wait for patches that this process's threads have begun. A cluster may be gone by now.
+            # Wait for blocks that this process's threads have begun. A cluster may be gone by now.
             left = begun if self._client is None else set()
             while left:
                 left = left - wait(left)
@@ -635,14 +694,21 @@ class Mosaic:
                 if self._client is None and self._store is not None:
                     for future in begun:
                         if future.exception() is None:
-                            finished[running[future]] = future.result()[0]
+                            results = zip(running[future], future.result(), strict=True)
+                            finished |= {index: record for index, (record, _) in results}
+
+    def _in_blocks(
+        self, indices: Iterable[PatchIndex]
+    ) -> deque[tuple[PatchIndex, list[PatchIndex]]]:
+        """Return patches by the block that contains them."""
+        return deque(self._layout.grouped(indices, self._block_shape).items())
 
     def _worst(
         self, certificate: MosaicCertificate | None, records: dict[PatchIndex, Record]
     ) -> dict[PatchIndex, Record | None]:
         """Return the patches to form again so that the whole meets its tolerance, worst first.
 
-        They are as few as can suffice, if nothing of their errors is left.
+        They are those of as few blocks as can suffice, if nothing of their errors is left.
         """
         worst: dict[PatchIndex, Record | None] = {}
         if certificate is None or self._tolerance_db is None or self._on_miss != "refine":
@@ -652,16 +718,20 @@ class Mosaic:
         allowed = power(self._tolerance_db)
         whole = certificate.whole.of_pixels * certificate.whole.power
         left = whole * (certificate.whole.error - allowed)
-        errors = {
-            index: each.of_pixels * each.power * each.error
-            for index, each in certificate.patches.items()
-        }
-        for index in sorted(errors, key=errors.__getitem__, reverse=True):
-            record = records[index]
-            is_best = record.is_exact and record.misses
-            if left > 0 and not is_best and certificate.patches[index].error > allowed:
-                worst[index] = record
-                left -= errors[index]
+        blocks = []
+        for _, indices in self._in_blocks(certificate.patches):
+            error, improved = 0.0, {}
+            for index in indices:
+                record, each = records[index], certificate.patches[index]
+                is_best = record.is_exact and record.misses
+                if each.error > allowed and not is_best:
+                    error += record.share * each.of_pixels * each.power * each.error
+                    improved[index] = record
+            blocks.append((error, improved))
+        for error, improved in sorted(blocks, key=lambda block: block[0], reverse=True):
+            if left > 0:
+                worst |= improved
+                left -= error
         return worst
 
     def _report(
@@ -746,7 +816,7 @@ class Mosaic:
             left_out=tuple(dict.fromkeys(e for each in known for e in each.left_out)),
             device=", ".join(dict.fromkeys(each.device for each in known)),
             version=__version__,
-            lines_digest=digest(sorted(each.lines_digest for each in known)),
+            lines_digest=digest(sorted({each.lines_digest for each in known})),
             certificate=None if certificate is None else certificate.of_all,
             misses=tuple(
                 f"patch {row},{column}: {miss}"
@@ -763,6 +833,12 @@ class Mosaic:
     def _patch(self, index: PatchIndex, record: Record, formed: Image | None) -> Patch:
         grid, row, column, rows, columns = self._layout.window(index)
         return Patch(row, column, rows, columns, grid, record, formed, self._store)
+
+
+def _worst_of(records: Iterable[Record | None]) -> Record | None:
+    """Return the record of the image that missed its tolerance by most, or None without any."""
+    known = [(each.certificate.error, each) for each in records if each and each.certificate]
+    return max(known, key=lambda pair: pair[0])[1] if known else None
 
 
 def _is_outdated(
@@ -828,23 +904,23 @@ class Patch:
         return Image(self._store.read(self.rows, self.columns), self.grid)
 
 
-def form_patch(
+def form_block(
     request: dict[str, Any],
     memory_bytes: int,
     store: Store | None,
     certificate: bool | None,
-    window: PatchWindow,
+    block: Block,
     source: PatchSource,
     missed: Record | None,
-) -> tuple[Record, Image | None]:
-    """Form one patch and write it to the store.
+) -> list[tuple[Record, Image | None]]:
+    """Form a block, write its wanted patches to the store, and return them.
 
-    If its image missed the tolerance, as its record says, it is formed by a better plan, and the
-    next time exactly.
+    If its image missed the tolerance, as the record of a patch says, it is formed by a better plan,
+    and the next time exactly.
 
-    With a client, the arguments are pickled with every patch: one of `REQUESTS` with its value, and
-    no samples. A worker process returns no image: the main process reads the pixels from the store.
-    If the patch cannot be imaged, a note of the ValueError names it.
+    With a client, the arguments are pickled with every block: one of `REQUESTS` with its value, and
+    no samples. A worker process returns no images: the main process reads them from the store. If
+    the block cannot be imaged, a note of the ValueError names its patches.
     """
     in_process = isinstance(source, SurveyVisibility)
     try:
@@ -853,16 +929,58 @@ def form_patch(
         else:
             device = process_device()
             visibility = opened_visibility(*source)
-        record, image = _image(
-            request, memory_bytes, certificate, visibility, window.grid, device, missed
+        record, image, missing = _image(
+            request, memory_bytes, certificate, visibility, block.grid, device, missed
         )
     except ValueError as error:
-        error.add_note(f"patch {window.row},{window.column}")
+        error.add_note(str(block))
         raise
-    if store is not None:
-        place = (window.row, window.column, window.rows, window.columns)
-        store.write(*place, image.pixels, record)
-    return record, image if in_process else None
+
+    patches, size = [], 0
+    for window, inside in block.patches():
+        visible, pixels = visibility.channels(window.grid), image.pixels[inside]
+        if missing[visible].all():  # no channel receives from here
+            pixels = np.zeros(pixels.shape, np.complex64)
+        counted = pixels.size if holds_any(pixels) or not record.has_pixels else 0
+        patches.append((window, pixels, visible, counted))
+        size += counted
+    found: list[tuple[Record, Image | None]] = []
+    for window, pixels, visible, counted in patches:
+        if (window.row, window.column) not in block.wanted:
+            continue
+        own = _record_of_patch(record, counted / size, visibility, visible, missing)
+        if store is not None:
+            store.write(*window[1:], pixels, own)
+        formed = image.formed if own.has_pixels else None
+        found.append((own, Image(pixels, window.grid, formed) if in_process else None))
+    return found
+
+
+def _record_of_patch(
+    record: Record,
+    share: float,
+    visibility: SurveyVisibility,
+    visible: NDArray[np.bool_],
+    missing: NDArray[np.bool_],
+) -> Record:
+    """Return the record of a patch that has a share of its block, from that of the block.
+
+    `visible` and `missing` are the channels of the survey that may contribute to the patch, and
+    those without samples.
+    """
+    lost = missing[visible]
+    of_patch: dict[str, Any] = {
+        "channels": len(lost),
+        "missing_channels": int(np.count_nonzero(lost)),
+        "gap_m": largest_gap_m(visibility.phase_centres_m[visible], lost),
+        "share": share,
+    }
+    if not share:
+        names = ("survey_channels", "device", "driver")
+        return Record(**of_patch, **{name: getattr(record, name) for name in names})
+    times = ("predicted_seconds", "plan_seconds", "read_seconds", "seconds")
+    of_patch |= {name: share * getattr(record, name) for name in times}
+    return replace(record, **of_patch)
 
 
 def _image(
@@ -873,36 +991,35 @@ def _image(
     grid: Grid,
     device: Device,
     missed: Record | None,
-) -> tuple[Record, Image]:
-    """Return the image of one patch and the record of how it was formed."""
+) -> tuple[Record, Image, NDArray[np.bool_]]:
+    """Return how a block was formed, its image, and which channels of the survey lack samples."""
     start = time.perf_counter()
     survey, visible = visibility.survey, visibility.channels(grid)
+    missing = np.zeros(survey.channels, bool)
     fields: dict[str, Any] = {
+        "channels": int(np.count_nonzero(visible)),
         "survey_channels": survey.channels,
         "device": device.info.label,
         "driver": device.info.driver,
-        "channels": int(np.count_nonzero(visible)),
     }
 
-    def empty() -> tuple[Record, Image]:
+    def empty() -> tuple[Record, Image, NDArray[np.bool_]]:
         pixels: NDArray[np.complex64] = np.zeros(grid.shape, np.complex64)
-        return Record(**fields, seconds=time.perf_counter() - start), Image(pixels, grid)
+        record = Record(**fields, seconds=time.perf_counter() - start)
+        return record, Image(pixels, grid), missing
 
     if not visible.any():
         return empty()
-    lines, missing = survey.read(visible, *visibility.ranges_m(grid))
-    fields |= {
-        "missing_channels": int(np.count_nonzero(missing)),
-        "gap_m": largest_gap_m(lines, missing),
-        "read_seconds": time.perf_counter() - start,
-    }
-    if missing.all():
+    lines, lost = survey.read(visible, *visibility.ranges_m(grid))
+    missing[visible] = lost
+    fields["read_seconds"] = time.perf_counter() - start
+    if lost.all():
         return empty()
     beam = visibility.beam
     if beam is not None and visibility.along is not None:
-        beam = replace(beam, along=visibility.along[visible][~missing])
-    if missing.any():
-        lines = lines.select(~missing)
+        beam = replace(beam, along=visibility.along[visible][~lost])
+    if lost.any():
+        lines = lines.select(~lost)
     if not reaches(lines, grid, beam, None if beam is None else beam.along):
         return empty()
 
@@ -936,7 +1053,7 @@ def _image(
         certificate=record.certificate,
         misses=record.misses,
     )
-    return record, replace(image, formed=formed)
+    return record, replace(image, formed=formed), missing
 
 
 def _formed(
@@ -948,14 +1065,14 @@ def _formed(
     device: Device,
 ) -> tuple[Image, dict[str, Any]]:
     """Return the image of some lines, and the fields of its record that describe the method."""
-    patch_bytes = _host_bytes(lines.channels, lines.length, grid.size)
-    if patch_bytes >= memory_bytes:
+    block_bytes = _host_bytes(lines.channels, lines.length, grid.size)
+    if block_bytes >= memory_bytes:
         raise ArgumentError(
             "memory_bytes",
-            f"be more than {patch_bytes / 2**20:.1f} MiB for {grid.shape[0]} x {grid.shape[1]} "
+            f"be more than {block_bytes / 2**20:.1f} MiB for {grid.shape[0]} x {grid.shape[1]} "
             f"pixels from {lines.channels} lines of {lines.length} samples",
             f"{memory_bytes / 2**20:.1f} MiB",
-            "use smaller patches",
+            "raise it or use smaller patches",
         )
     accuracy_db = None
     if "accuracy_db" in request or is_soon_done(lines, grid, device):
@@ -967,11 +1084,11 @@ def _formed(
         imager = SceneImager(scene, ExactImage(accuracy_db), device, warned=True, keep=False)
         assert imager.decision is not None
         error_db = max(accuracy_db, imager.decision.error_db(scene))
-        how = {"predicted_error_db": error_db, "memory_bytes": patch_bytes}
+        how = {"predicted_error_db": error_db, "memory_bytes": block_bytes}
         return imager.form(lines), how
 
     before = time.perf_counter()
-    available = min(memory_bytes - patch_bytes, device.info.usable_bytes)
+    available = min(memory_bytes - block_bytes, device.info.usable_bytes)
     asked = Request(lines, grid, **request, beam=beam, memory_bytes=available)
     scene, chosen, track = planned(asked, device, doubts=False)
     # The beam's directions would be most of a record.
@@ -980,12 +1097,12 @@ def _formed(
         "plan_seconds": time.perf_counter() - before,
         "predicted_error_db": chosen.predicted_error_db,
         "predicted_seconds": chosen.predicted_seconds,
-        "memory_bytes": patch_bytes + int(chosen.memory_bytes),
+        "memory_bytes": block_bytes + int(chosen.memory_bytes),
         "plan": json.loads(replace(chosen, beam=beam).to_json()),
     }
     return form(scene, chosen, device, track=track, warned=True), how
 
 
 def _host_bytes(channels: int, length: int, pixels: int) -> int:
-    """Return the bytes for the lines and pixels of a patch, each with one working copy."""
+    """Return the bytes for the lines and pixels of a block, each with one working copy."""
     return 2 * 8 * (channels * length + pixels)

@@ -1,10 +1,10 @@
-"""Division of a mosaic into patches."""
+"""Division of a mosaic into patches, which are stored, and into blocks, which are formed."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ class PatchWindow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """A grid divided into patches.
+    """A grid divided into patches, or into blocks of them.
 
     Attributes
     ----------
@@ -64,6 +64,63 @@ class Layout:
         """Yield the indices of all patches, row by row."""
         rows, columns = self.shape
         return itertools.product(range(rows), range(columns))
+
+    def grouped(
+        self, indices: Iterable[PatchIndex], block_shape: tuple[int, int]
+    ) -> dict[PatchIndex, list[PatchIndex]]:
+        """Return patches by the index of the block that contains them."""
+        found: dict[PatchIndex, list[PatchIndex]] = {}
+        for index in indices:
+            row, column = (
+                number * side // of_block
+                for number, side, of_block in zip(index, self.patch_shape, block_shape, strict=True)
+            )
+            found.setdefault((row, column), []).append(index)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Rectangle of neighbouring patches that are formed together.
+
+    Attributes
+    ----------
+    grid : Grid
+        Pixels of the block.
+    rows, columns : slice
+        Where they lie in the mosaic.
+    patch_shape : (rows, columns)
+        Number of pixels of a patch.
+    wanted : sequence of (row, column)
+        Patches to return and to store. The others are finished already.
+    """
+
+    grid: Grid
+    rows: slice
+    columns: slice
+    patch_shape: tuple[int, int]
+    wanted: Sequence[PatchIndex]
+
+    def patches(self) -> Iterator[tuple[PatchWindow, tuple[slice, slice]]]:
+        """Yield every patch, wanted or not, and where it lies in the block."""
+        layout, corner = Layout(self.grid, self.patch_shape), (self.rows.start, self.columns.start)
+        for index in layout.indices():
+            window = layout.window(index)
+            inside = window.rows, window.columns
+            row, column = (
+                first // side + number
+                for first, side, number in zip(corner, self.patch_shape, index, strict=True)
+            )
+            rows, columns = (
+                slice(first + part.start, first + part.stop)
+                for first, part in zip(corner, inside, strict=True)
+            )
+            yield PatchWindow(window.grid, row, column, rows, columns), inside
+
+    def __str__(self) -> str:
+        """Return which patches these are, in words."""
+        names = [f"{window.row},{window.column}" for window, _ in self.patches()]
+        return f"patch {names[0]}" if len(names) == 1 else f"patches {names[0]} to {names[-1]}"
 
 
 def with_margin(

@@ -637,19 +637,15 @@ def beam_json(beam: BeamWindow) -> str:
     return json.dumps(asdict(beam), default=lambda value: value.tolist())
 
 
-def largest_gap_m(lines: RangeLines, missing: NDArray[np.bool_]) -> float:
+def largest_gap_m(phase_centres_m: NDArray[np.float64], missing: NDArray[np.bool_]) -> float:
     """Return the longest distance of phase centres along the track, or 0 if it is not a gap.
 
     A gap is longer than three median distances. Missing channels cause gaps too.
     """
-    there = ~missing
-    if np.count_nonzero(there) < 2:
+    if np.count_nonzero(~missing) < 2:
         return 0.0
-    every_m, some_m = (
-        np.unique(lines.phase_centres_m[each], axis=0) for each in (np.ones_like(there), there)
-    )
-    axis = np.ptp(every_m, axis=0).argmax()
-    steps_m = np.diff(np.sort(every_m[:, axis]))
+    along_m = phase_centres_m[:, np.ptp(phase_centres_m, axis=0).argmax()]
+    steps_m = np.diff(np.sort(along_m))
     median_m = float(np.median(steps_m[steps_m > 0])) if steps_m.any() else 0.0
-    longest_m = float(np.diff(np.sort(some_m[:, axis])).max(initial=0.0))
+    longest_m = float(np.diff(np.sort(along_m[~missing])).max(initial=0.0))
     return longest_m if longest_m > _PATCH_GAP * median_m else 0.0

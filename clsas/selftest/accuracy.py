@@ -30,6 +30,7 @@ _DIVIDED = Costs(pixel_ns=1e6, point_ns=1e6)
 """Costs that make exact imaging look slow, so that plans divide even small images."""
 _FAR_M = (1e7, -1e7, 1e7)
 _WAVENUMBER_DB = -60.0  # bound for the wavenumber image, for which no accuracy can be requested
+_ONE_PATCH_BYTES = 64 << 20  # memory of a mosaic, too little for several patches at a time
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ def form(imager: str, known: Known, asked_db: float, device: Device) -> Image:
     if imager == "mosaic":
         return mosaic(
             lines, grid, tolerance_db=asked_db, beam=beam, patches=(2, 2), device=device,
-            certificate=False,
+            certificate=False, memory_bytes=_ONE_PATCH_BYTES,
         ).image()  # fmt: skip
     if imager == "wavenumber":
         return wavenumber(lines, grid, beam=beam)

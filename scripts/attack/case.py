@@ -43,6 +43,7 @@ shape = "hann"
 
 [mosaic]
 patches = [6, 8]
+memory_mib = 66  # for about four patches at a time
 """
 
 PATCHES = 48

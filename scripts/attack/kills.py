@@ -4,11 +4,11 @@
 
 Every run is killed at a random moment: while it starts, or after some patches. Either all of its
 processes are killed, or only the main process, or one worker. After every kill the finished patches
-and their levels must equal those of a mosaic that was never killed. After 10 kills the run may
-finish. The store must then equal the other bit by bit, with all levels, and there must be no
-temporary files. Exports of the finished mosaic as GeoTIFF and as a viewer, and of a radar image as
-SICD, are killed too: the file or folder before must still be there, or the whole new one. In all
-other cases the exit code is 1.
+and their levels must equal those of a mosaic of as many workers that was never killed. After 10
+kills the run may finish. The store must then equal the other bit by bit, with all levels, and there
+must be no temporary files. Exports of the finished mosaic as GeoTIFF and as a viewer, and of a
+radar image as SICD, are killed too: the file or folder before must still be there, or the whole new
+one. In all other cases the exit code is 1.
 """
 
 from __future__ import annotations
@@ -172,15 +172,13 @@ def main() -> None:
 def attack(folder: Path, workers: int, kills: int, chance: random.Random) -> None:
     """Kill runs with a number of workers until there have been `kills` kills."""
     scene, log = write_scene(folder), folder / "log"
-    reference = folder / "reference.zarr"
-    # The first run, in one process, also simulates the lines. Its mosaic is the reference.
-    subprocess.run(command(scene, reference), check=True, capture_output=True)
-    first = Store.opened(reference)
+    reference = folder / f"reference-{workers}.zarr"
+    # The first run, in one process, also simulates the lines.
+    subprocess.run(command(scene, folder / "first.zarr"), check=True, capture_output=True)
     start = time.monotonic()
-    subprocess.run(
-        command(scene, folder / f"timed-{workers}.zarr", workers), check=True, capture_output=True
-    )
+    subprocess.run(command(scene, reference, workers), check=True, capture_output=True)
     usual_s = time.monotonic() - start
+    first = Store.opened(reference)
     done, stores, tally = 0, 0, {}
     while done < kills:
         path = folder / f"{workers}-{stores}.zarr"

@@ -2,8 +2,8 @@
 """THESIS section 7.1, range-dependent factorization: one plan for a scene, or one for each patch.
 
 Scenes end at the same range and begin at 1/1.5 to 1/16 of it. Each is imaged with a single plan, as
-patches of equal extent in range, as `clsas.mosaic` divides scenes, and as bands between whose ends
-ranges grow by the same factor. The lines of patches and bands are cut to their ranges.
+patches of equal extent in range, and as bands between whose ends ranges grow by the same factor.
+The lines of patches and bands are cut to their ranges.
 """
 
 from __future__ import annotations
@@ -98,7 +98,18 @@ def bands(grid: clsas.Grid, ratio: float) -> list[clsas.Grid]:
     number = parts_of(ratio)
     edges_m = near_m * ratio ** (np.arange(1, number) / number)
     row_m = (grid.bounds_m[1][1] - near_m) / rows
-    edges = [0, *np.rint((edges_m - near_m) / row_m).astype(int).tolist(), rows]
+    return cut(grid, (edges_m - near_m) / row_m)
+
+
+def patches(grid: clsas.Grid, ratio: float) -> list[clsas.Grid]:
+    """Return as many parts of equal extent."""
+    number = parts_of(ratio)
+    return cut(grid, np.arange(1, number) / number * grid.shape[0])
+
+
+def cut(grid: clsas.Grid, rows: np.ndarray) -> list[clsas.Grid]:
+    """Return the parts of a grid between some rows."""
+    edges = [0, *np.rint(rows).astype(int).tolist(), grid.shape[0]]
     return [
         grid.window(slice(start, stop), slice(0, grid.shape[1])) for start, stop in pairwise(edges)
     ]
@@ -151,15 +162,15 @@ def measured(
     grid, beam, number = scene.grid(ratio), scene.system.beam, parts_of(ratio)
     lines = scene.lines(grid)
 
-    def mosaic(part: clsas.Grid, patches: int) -> clsas.Mosaic:
+    def mosaic(part: clsas.Grid) -> clsas.Mosaic:
         return clsas.mosaic(
-            lines, part, tolerance_db=TOLERANCE_DB, beam=beam, patches=(patches, 1), device=device
+            lines, part, tolerance_db=TOLERANCE_DB, beam=beam, patches=(1, 1), device=device
         )
 
     mosaics = {
-        "one plan": [mosaic(grid, 1)],
-        f"{number} patches": [mosaic(grid, number)],
-        f"{number} bands": [mosaic(part, 1) for part in bands(grid, ratio)],
+        "one plan": [mosaic(grid)],
+        f"{number} patches": [mosaic(part) for part in patches(grid, ratio)],
+        f"{number} bands": [mosaic(part) for part in bands(grid, ratio)],
     }
     runs: dict[str, list[Run]] = {name: [] for name in mosaics}
     for name in [*mosaics, *(repeats * [*mosaics])]:  # in turns, the first ones untimed

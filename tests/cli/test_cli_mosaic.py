@@ -21,9 +21,9 @@ from clsas.cli import main, mosaics
 from clsas.files.scene_files import read_scene
 
 ROOT = Path(__file__).parents[2]
-# The case that scripts/attack takes apart, with fewer pixels and patches.
+# The case that scripts/attack takes apart, with fewer pixels and patches, and no bound of memory.
 SCENE = runpy.run_path(str(ROOT / "scripts" / "attack" / "case.py"))["SCENE"]
-for many, few in {"= 140": "= 80", "= 2052": "= 100", "[6, 8]": "[2, 2]"}.items():
+for many, few in {"= 140": "= 80", "= 2052": "= 100", "[6, 8]": "[2, 2]", "memory": "#"}.items():
     assert many in SCENE
     SCENE = SCENE.replace(many, few)
 
@@ -83,7 +83,8 @@ def test_the_same_command_goes_on(made):
 def test_ctrl_c_keeps_what_is_finished(made, tmp_path, workers):
     """It ends with 130, and the same command goes on."""
     command = ["mosaic", made[0] / "scene.toml", "--lines", lines_of(made)]
-    command += ["-o", tmp_path / "a.zarr", "--patches", "10x8", *workers]
+    command += ["-o", tmp_path / "a.zarr", "--patches", "10x8", "--memory-mib", "64"]
+    command += ["--on-miss", "warn", *workers]
     code, stderr = interrupted(command, "patch ")
     assert code == 130
     assert stderr.splitlines()[-1] == "Interrupted"
@@ -128,15 +129,14 @@ def test_lines_grid_and_beam_from_the_command_line(made, tmp_path):
 @pytest.mark.slow
 def test_processes_of_this_machine(made, tmp_path):
     pytest.importorskip("distributed")
-    stdout, stderr = run(
-        "mosaic", made[0] / "scene.toml", "--lines", lines_of(made),
-        "-o", tmp_path / "a.zarr", "--workers", "2",
-    )  # fmt: skip
+    command = "mosaic", made[0] / "scene.toml", "--lines", lines_of(made), "--memory-mib", "64"
+    run(*command, "-o", tmp_path / "alone.zarr")
+    stdout, stderr = run(*command, "-o", tmp_path / "together.zarr", "--workers", "2")
     assert "4 formed" in stdout
     assert sum(line.startswith("patch ") for line in stderr.splitlines()) == 4
     ours, theirs = (
-        clsas.Store.opened(path).image().pixels
-        for path in (tmp_path / "a.zarr", made[0] / "scene.zarr")
+        clsas.Store.opened(tmp_path / f"{name}.zarr").image().pixels
+        for name in ("alone", "together")
     )
     np.testing.assert_array_equal(ours, theirs)
 

@@ -339,6 +339,21 @@ def test_parts_add_up_to_the_whole():
     assert of_parts([parts[0]] * 9).upper_db < parts[0].upper_db
 
 
+def test_shares_of_a_part_count_once():
+    """All of them are the part, and some of them are as if fewer of its pixels had been drawn."""
+    names = ("pixels", "of_pixels", "seconds", "power", "error", "error_variance", "error_third")
+    part = clsas.Certificate(64, 1000, 0.1, 2.0, 1e-5, 1e-12, 1e-19)
+    other = clsas.Certificate(80, 500, 0.2, 3.0, 2e-5, 2e-12, 3e-19)
+    shared = of_parts([part, other, part, part], [0.5, 1, 0.2, 0.3])
+    whole = of_parts([part, other])
+    for name in names:
+        assert getattr(shared, name) == pytest.approx(getattr(whole, name)), name
+    half = of_parts([part], [0.5])
+    fewer = clsas.Certificate(32, 500, 0.05, 2.0, 1e-5, 2e-12, 4e-19)
+    for name in names:
+        assert getattr(half, name) == pytest.approx(getattr(fewer, name)), name
+
+
 def test_a_certificate_describes_itself():
     found = clsas.Certificate(256, 10**6, 0.21, 1.0, 10**-5.231, 2e-13, 1e-20)
     assert repr(found) == "Certificate(error -52.3 dB, at most -51.7 dB, 256 pixels in 210 ms)"

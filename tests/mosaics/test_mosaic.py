@@ -32,6 +32,7 @@ from clsas.engine.data.validate import ClsasWarning
 from clsas.engine.device.device import list_devices
 from clsas.engine.factorized import measured_costs, planner
 from clsas.engine.factorized.costs import Costs, KnownCosts
+from clsas.mosaics import mosaic as mosaics
 from clsas.mosaics.devices import claim_device
 from clsas.mosaics.document import Document, Record
 from clsas.mosaics.patches import Layout
@@ -48,6 +49,7 @@ GRID = Grid.plane((-4, 4, 80), (30, 40, 60))
 LINES = lines_over(GRID, along_x(160, 0.05), carrier_hz=100e3, step_m=0.03)
 BEAM = BeamWindow(8.0, "hann")
 REQUEST = {"accuracy_db": -70, "beam": BEAM, "patches": (2, 4)}
+ALONE = {"memory_bytes": 64 << 20}  # too little for more than one patch at a time
 
 
 @pytest.fixture(scope="module")
@@ -65,11 +67,14 @@ def test_work_grows_as_the_number_of_patches(monkeypatch):
     count = mock.Mock(side_effect=Layout.window)
     monkeypatch.setattr(Layout, "window", lambda *arguments: count(*arguments))
     monkeypatch.setattr(
-        "clsas.mosaics.mosaic.form_patch", lambda *_: (Record(1, LINES.channels), None)
+        "clsas.mosaics.mosaic.form_block",
+        lambda *arguments: [(Record(1, LINES.channels), None)] * len(arguments[4].wanted),
     )
-    formed = clsas.mosaic(LINES, GRID, accuracy_db=-40, patches=(20, 20))
+    formed = clsas.mosaic(LINES, GRID, accuracy_db=-40, patches=(20, 20), **ALONE)
+    before = count.call_count
     assert len(list(formed)) == 400
-    assert count.call_count == 2 * 400  # when a patch is submitted, and when it is handed out
+    # When a patch is submitted, and when it is handed out
+    assert count.call_count - before == 2 * 400
 
 
 @pytest.mark.slow
@@ -96,7 +101,7 @@ def test_patches_of_one_device_come_in_order(monkeypatch):
     monkeypatch.setattr(
         "clsas.mosaics.mosaic.wait", lambda futures, timeout: set(wait(futures).done)
     )
-    wish = REQUEST | {"patches": (6, 8)}
+    wish = REQUEST | {"patches": (6, 8)} | ALONE
     patches = [(patch.row, patch.column) for patch in clsas.mosaic(LINES, GRID, **wish)]
     assert patches == list(np.ndindex(6, 8))
 
@@ -184,10 +189,11 @@ class TestFactorized:
         """Return the exact image and the patches of the mosaic."""
         patches = []
         mosaic = clsas.mosaic(
-            scene[0], cls.GRID, tolerance_db=cls.TOLERANCE_DB, beam=cls.BEAM, patches=(2, 2)
-        )
-        with pytest.MonkeyPatch.context() as patch:  # plan every patch, however small
-            patch.setattr(planner, "SEARCH_S", 0.0)
+            scene[0], cls.GRID, tolerance_db=cls.TOLERANCE_DB, beam=cls.BEAM, patches=(2, 2),
+            **ALONE,
+        )  # fmt: skip
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(planner, "SEARCH_S", 0.0)  # plan every patch, however small
             return mosaic.image(patches.append), patches
 
     @pytest.mark.slow
@@ -440,10 +446,79 @@ def test_lost_pings_are_flagged():
     assert ("a gap of 0.55 m along the track",) in flags
 
 
+class TestBlocks:
+    """Neighbouring patches are planned, formed and certified together."""
+
+    @pytest.fixture
+    def formed(self, monkeypatch):
+        """Return the shapes of the images that are formed."""
+        form, shapes = mosaics.SceneImager.form, []
+
+        def watched(imager, lines):
+            shapes.append(imager.scene.grid.shape)
+            return form(imager, lines)
+
+        monkeypatch.setattr(mosaics.SceneImager, "form", watched)
+        return shapes
+
+    def test_neighbours_are_one_image(self, formed, exact, tmp_path):
+        path, patches = tmp_path / "a.zarr", []
+        mosaic = clsas.mosaic(LINES, GRID, path, **REQUEST, certificate=True)
+        image = mosaic.image(patches.append)
+        assert formed == [GRID.shape]
+        assert relative_error_db(image, exact) < -65
+        records = [patch.record for patch in patches]
+        assert sum(record.share for record in records) == pytest.approx(1)
+        (drawn,) = {record.certificate.pixels for record in records}
+        for whole in (image.formed.certificate, Store.opened(path).certificate().whole):
+            assert (whole.pixels, whole.of_pixels) == (drawn, GRID.size)
+            for name in ("error", "error_variance", "error_third", "power", "seconds"):
+                expected = getattr(records[0].certificate, name)
+                assert getattr(whole, name) == pytest.approx(expected), name
+
+    def test_only_missing_patches_are_written(self, formed, tmp_path):
+        """They are formed with their neighbours, so that they are what they were."""
+        path = tmp_path / "a.zarr"
+        before = clsas.mosaic(LINES, GRID, path, **REQUEST).image()
+        kept = path / "patches" / "1.1" / "zarr.json"
+        written = kept.stat().st_mtime_ns
+        (path / "patches" / "1.2" / "zarr.json").unlink()
+        again = list(clsas.mosaic(LINES, GRID, path, **REQUEST))
+        assert [(patch.row, patch.column) for patch in again] == [(1, 2)]
+        assert formed == [GRID.shape] * 2
+        assert kept.stat().st_mtime_ns == written
+        np.testing.assert_array_equal(Store.opened(path).image().pixels, before.pixels)
+
+    def test_a_block_fits_into_memory(self, formed):
+        most = 28 * LINES.samples.size + 16 * GRID.size
+        wish = REQUEST | {"beam": BeamWindow(2.0), "memory_bytes": (64 << 20) + 3 * most // 4}
+        list(clsas.mosaic(LINES, GRID, **wish))
+        assert 1 < len(formed) < 8
+        assert sum(np.prod(formed, axis=1)) == GRID.size
+
+    def test_every_worker_has_a_block(self, file, tmp_path):
+        wish = REQUEST | {"patches": (6, 8)}
+        for threads, most in ((1, 1), (3, 8), (20, 48), (1000, 48)):
+            client = SimpleNamespace(get_executor=None, nthreads=lambda n=threads: {"a": n})
+            path = tmp_path / f"{threads}.zarr"
+            mosaic = clsas.mosaic(file, GRID, path, client=client, **wish)
+            count = len(mosaic._in_blocks(np.ndindex(6, 8)))
+            assert min(threads, 48) <= count <= most
+
+    def test_a_patch_of_zeros_has_no_share(self):
+        grid = Grid.plane((-4, 120, 64), (30, 40, 20))
+        wish = REQUEST | {"patches": (1, 4)}
+        first, *others = clsas.mosaic(LINES, grid, **wish, certificate=True)
+        assert first.record.share == 1
+        assert first.record.certificate.of_pixels == grid.size
+        for patch in others:
+            assert (patch.record.share, patch.record.certificate) == (0, None)
+
+
 class TestOnceMore:
     @pytest.mark.slow
     def test_what_the_store_has_is_not_formed_again(self, file, tmp_path, exact):
-        mosaic = clsas.mosaic(file, GRID, tmp_path / "a.zarr", **REQUEST)
+        mosaic = clsas.mosaic(file, GRID, tmp_path / "a.zarr", **REQUEST, **ALONE)
         running = iter(mosaic)
         first = next(running)
         running.close()
@@ -466,7 +541,7 @@ class TestResuming:
     @pytest.mark.slow
     def test_what_is_finished_is_kept(self, file, tmp_path, exact):
         path = tmp_path / "image.zarr"
-        running = iter(clsas.mosaic(file, GRID, path, **REQUEST))
+        running = iter(clsas.mosaic(file, GRID, path, **REQUEST, **ALONE))
         for _ in range(3):
             next(running)
         running.close()
@@ -510,7 +585,7 @@ class TestResuming:
         """
         import pickle
 
-        wish = REQUEST | {"patches": (6, 8)}
+        wish = REQUEST | {"patches": (6, 8)} | ALONE
         (tmp_path / "wish").write_bytes(pickle.dumps((GRID, wish)))
         formed = []
         for left in reversed(range(kills + 1)):
@@ -693,7 +768,7 @@ def test_a_full_disk_keeps_what_is_finished(file, tmp_path):
     """
     import pickle
 
-    (tmp_path / "wish").write_bytes(pickle.dumps((GRID, REQUEST)))
+    (tmp_path / "wish").write_bytes(pickle.dumps((GRID, REQUEST | ALONE)))
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(program)], cwd=tmp_path, text=True,
         capture_output=True, check=True,
@@ -737,7 +812,11 @@ def test_a_store_that_is_read_only(tmp_path):
 def test_devices_side_by_side(exact):
     infos = list_devices()[:2]
     mosaic = clsas.mosaic(
-        LINES, GRID, **(REQUEST | {"patches": (6, 8)}), device=[info.index for info in infos]
+        LINES,
+        GRID,
+        **(REQUEST | {"patches": (6, 8)}),
+        device=[info.index for info in infos],
+        **ALONE,
     )
     patches = []
     assert relative_error_db(mosaic.image(patches.append), exact) < -65
@@ -748,7 +827,7 @@ class TestDistributed:
     @pytest.mark.slow
     def test_a_worker_that_dies_is_made_up_for(self, file, tmp_path):
         distributed = pytest.importorskip("distributed")
-        for _ in clsas.mosaic(file, GRID, tmp_path / "local.zarr", **REQUEST):
+        for _ in clsas.mosaic(file, GRID, tmp_path / "local.zarr", **REQUEST, **ALONE):
             pass
         with (
             mock.patch.dict(os.environ),  # Dask changes it while it starts a worker again
@@ -760,7 +839,7 @@ class TestDistributed:
             first = next(iter(client.run(os.getpid).values()))
             places = []
             path = tmp_path / "distributed.zarr"
-            for patch in clsas.mosaic(file, GRID, path, client=client, **REQUEST):
+            for patch in clsas.mosaic(file, GRID, path, client=client, **REQUEST, **ALONE):
                 places.append((patch.row, patch.column))
                 if len(places) == 2:
                     os.kill(first, signal.SIGKILL)
@@ -772,7 +851,7 @@ class TestDistributed:
 
     def test_only_workers_need_a_device(self, file, tmp_path, monkeypatch):
         monkeypatch.setattr("clsas.engine.device.device._raw_devices", list)
-        client = SimpleNamespace(get_executor=None)
+        client = SimpleNamespace(get_executor=None, nthreads=dict)
         mosaic = clsas.mosaic(file, GRID, tmp_path / "a.zarr", client=client, **REQUEST)
         assert len(mosaic) == 8
 

@@ -18,7 +18,8 @@ from clsas.selftest import extremes
 
 pytest.importorskip("zarr")
 
-REQUEST = {"tolerance_db": -40, "patches": (2, 2), "certificate": True}
+REQUEST = {"tolerance_db": -40, "patches": (2, 2), "certificate": True, "memory_bytes": 64 << 20}
+"""Memory for one patch at a time."""
 BRIGHTEST, BRIGHT = (0, 1), (1, 0)  # patches of the scene
 
 
@@ -68,7 +69,7 @@ def test_the_whole_pools_its_patches(known, tmp_path):
     assert whole.error_db == pytest.approx(known.error_db(image.pixels), abs=1.5)
     assert found.worst == max(patches, key=lambda index: patches[index].certificate.error)
     row, column = found.worst
-    assert f"dB in patch {row},{column}" in repr(mosaic)
+    assert f"dB in the block of patch {row},{column}" in repr(mosaic)
     for index, record in clsas.Store.opened(tmp_path / "a.zarr").records().items():
         assert record == patches[index]
         before, after = patches[index].certificate, record.certificate

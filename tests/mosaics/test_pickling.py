@@ -42,7 +42,8 @@ def test_a_mosaic_goes_to_another_process(platform):
 @pytest.mark.slow
 def test_another_process_goes_on_with_the_store(tmp_path):
     clsas.save(tmp_path / "lines.h5", LINES)
-    mosaic = clsas.mosaic(tmp_path / "lines.h5", GRID, tmp_path / "image.zarr", patches=(2, 2))
+    wish = {"patches": (2, 2), "memory_bytes": 64 << 20}  # for one patch at a time
+    mosaic = clsas.mosaic(tmp_path / "lines.h5", GRID, tmp_path / "image.zarr", **wish)
     patch = next(iter(mosaic))
     read = pickle.loads(pickle.dumps(patch))
     np.testing.assert_array_equal(read.image, patch.image)

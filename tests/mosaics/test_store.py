@@ -155,7 +155,7 @@ def test_a_store_without_checksums_is_refused_by_its_version(path):
     document["attributes"]["version"] = 1
     (path / "zarr.json").write_text(json.dumps(document))
     for work in (Store.opened, lambda path: clsas.mosaic(LINES, GRID, path, **REQUEST)):
-        with pytest.raises(ValueError, match="version 1, but this clsas works with version 7"):
+        with pytest.raises(ValueError, match="version 1, but this clsas works with version 8"):
             work(path)
 
 

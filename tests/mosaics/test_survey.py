@@ -128,12 +128,12 @@ def test_channels_without_samples_are_told(tmp_path):
 
 def test_gaps_between_pings():
     none = np.zeros(120, bool)
-    assert largest_gap_m(LINES, none) == 0
+    assert largest_gap_m(LINES.phase_centres_m, none) == 0
     missing = none.copy()
     missing[60:64] = True
-    assert largest_gap_m(LINES, missing) == pytest.approx(0.25)
+    assert largest_gap_m(LINES.phase_centres_m, missing) == pytest.approx(0.25)
     dropped = LINES.select(~missing)
-    assert largest_gap_m(dropped, np.zeros(116, bool)) == pytest.approx(0.25)
+    assert largest_gap_m(dropped.phase_centres_m, np.zeros(116, bool)) == pytest.approx(0.25)
 
 
 def growing_track(case):

@@ -153,20 +153,35 @@ def scaled(certificate: Certificate | None, factor: float) -> Certificate | None
     return replace(certificate, power=factor**2 * certificate.power)
 
 
-def of_parts(parts: Sequence[Certificate]) -> Certificate:
-    """Return the certificate of an image from those of its parts, without a list of pixels."""
-    total = math.fsum(part.of_pixels * part.power for part in parts)
-    shares = [part.of_pixels * part.power / total for part in parts]
-    size = sum(part.of_pixels for part in parts)
+def of_parts(parts: Sequence[Certificate], kept: Sequence[float] | None = None) -> Certificate:
+    """Return the certificate of an image from those of its parts, without a list of pixels.
+
+    Parameters
+    ----------
+    parts : sequence of Certificate
+    kept : sequence of float, optional
+        Share of each part that belongs to the image; by default the whole part. A share counts as
+        if it had been measured at that share of the pixels drawn, so that the shares of a part add
+        up to the part.
+    """
+    kept = [1.0] * len(parts) if kept is None else kept
+    sizes = [share * part.of_pixels for share, part in zip(kept, parts, strict=True)]
+    powers = [size * part.power for size, part in zip(sizes, parts, strict=True)]
+    total, size = math.fsum(powers), math.fsum(sizes)
+
+    def added(name: str) -> float:
+        return math.fsum(k * getattr(part, name) for k, part in zip(kept, parts, strict=True))
 
     def summed(name: str, order: int) -> float:
-        values = (getattr(part, name) for part in parts)
-        return math.fsum(share**order * value for share, value in zip(shares, values, strict=True))
+        return math.fsum(
+            (power / total) ** order * getattr(part, name) / share ** (order - 1)
+            for share, power, part in zip(kept, powers, parts, strict=True)
+        )
 
     return Certificate(
-        pixels=sum(part.pixels for part in parts),
-        of_pixels=size,
-        seconds=math.fsum(part.seconds for part in parts),
+        pixels=max(round(added("pixels")), 1),
+        of_pixels=round(size),
+        seconds=added("seconds"),
         power=total / size,
         error=summed("error", 1),
         error_variance=summed("error_variance", 2),
