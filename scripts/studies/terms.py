@@ -79,6 +79,10 @@ def errors_without(field: str) -> Callable:
     return lambda result, *_: replace(result, errors=replace(result.errors, **{field: 0.0}))
 
 
+def without(**fields: Any) -> Callable:
+    return lambda result, *_: replace(result, **fields)
+
+
 def without_beam(result: Any, *arguments: Any) -> Any:
     """Return what `errors_of_tree` returns if weights do not change between virtual channels."""
     *before, beam_cycles, device = arguments
@@ -114,6 +118,9 @@ TERMS = {
     "aperture filters": Term(
         {TREE: lambda result, *_: (replace(result[0], aperture_filters=0.0), result[1])},
         (f"{SPACING}.of_stage",), inline=5, field="aperture_filters",
+    ),
+    "aperture filters: equal signs on sheets": Term(
+        {f"{SPACING}.of_stage": without(biases=[])}, inline=12
     ),
     "spacing": Term(
         {TREE: lambda result, *_: (replace(result[0], spacing=0.0), (0.0,) * len(result[1]))},
@@ -177,9 +184,18 @@ TERMS = {
     "margin of 1 dB": Term({"factorized.errors.MARGIN_DB": 0.0}, inline=2),
     "margin: few channels": Term({"factorized.errors._FEW_CHANNELS": (0.0, 0.0)}, inline=7),
     "margin: few frequencies": Term({"signal.spectrum._FEW_FREQUENCIES": 0.0}, inline=8),
+    "few resolution cells": Term(
+        {"signal.ambiguity.scatter": constant(1.0)},
+        ("signal.ambiguity.independent_pixels",),
+        ("signal.ambiguity.scatter", "signal.ambiguity.independent_pixels"), inline=18,
+    ),
     "dark images": Term(
         {"signal.ambiguity.brightness": constant(1.0)},
         code=("signal.ambiguity.brightness", "signal.ambiguity._brightness_of_groups"), inline=30,
+    ),
+    "coherent frequencies": Term(
+        {"signal.spectrum._image_power": lambda _, lines, grid, frequency, power: power},
+        code=("signal.spectrum._image_power",), inline=12,
     ),
     "beam: sweeps unevenly": Term(
         {"factorized.planner.sweeps_once": constant(True)},

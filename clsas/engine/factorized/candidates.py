@@ -252,8 +252,9 @@ class _Candidates:
         if filters_db is None:
             return None
         if trial.most_root not in self._sizes:
-            rungs = self.rungs[: trial.most_root + 1]
-            self._sizes[trial.most_root] = all_sizes(self.roots, rungs, self.conditions.device)
+            most = self.rungs[trial.most_root]
+            within = [side for side in self.rungs if side[0] <= most[0] and side[1] <= most[1]]
+            self._sizes[trial.most_root] = all_sizes(self.roots, within, self.conditions.device)
         division = search(
             self._sizes[trial.most_root],
             filters_db,

@@ -139,8 +139,12 @@ def errors_of_tree(
         for level, (side, denser) in enumerate(zip(sides, oversampling, strict=True))
     ]
     by_stage = tuple(stage.uneven for stage in found)
+    # Filters of few taps attenuate steering functions. The mean attenuation is common to all
+    # interpolations on a sheet, along and across and in every stage, so that its amplitudes add.
+    bias = np.array([each for stage in found for each in stage.biases])
+    in_common = float(max(bias.sum() ** 2 - bias @ bias, 0.0))
     errors = ErrorBudget(
-        aperture_filters=sum(stage.of_filter for stage in found),
+        aperture_filters=sum(stage.of_filter for stage in found) + in_common,
         spacing=sum(by_stage),
         leaves=float(leaf_error(spacing.roots, np.array([sides[-1]]), device)[0]),
     )
@@ -382,10 +386,13 @@ class StageErrors:
         Error power of the filter along the aperture. On a sheet, virtual channels are everywhere as
         dense as the largest phase rate of any line along it and across it requires. Where phases
         turn more slowly, the error is below the filter's worst.
+    biases : list of float
+        On a sheet, the biases of the filter along and across it.
     """
 
     uneven: float
     of_filter: float
+    biases: list[float]
 
 
 class SpacingErrors:
@@ -414,7 +421,7 @@ class SpacingErrors:
         else:
             self._lines = {"track": (_line_of_track(roots),)}
         self._samples: dict[tuple[_Line, Side, bool, tuple[float, ...]], _Samples | None] = {}
-        self._found: dict[tuple[_Line, SpacedStage, tuple[float, ...]], float] = {}
+        self._found: dict[tuple[_Line, SpacedStage, tuple[float, ...]], tuple[float, float]] = {}
 
     def of_stage(self, stage: SpacedStage) -> StageErrors:
         """Return the errors of a stage, over the relief of the grid.
@@ -424,22 +431,25 @@ class SpacingErrors:
         surface = self.roots.sampled.scene.surface
         worst = power(stage.aperture.error_db)
         reliefs, share = reliefs_of(surface, stage.side, self.roots.side)
-        uneven, of_filter = 0.0, 0.0 if self._is_sheet else worst
+        uneven, of_filter, biases = 0.0, 0.0 if self._is_sheet else worst, []
         for lines in self._lines.values():
-            errors = [
-                np.array([self._error(line, stage, each) for each in reliefs]) for line in lines
-            ]
+            found = [[self._error(line, stage, each) for each in reliefs] for line in lines]
+            errors = [np.array([error for error, _ in of_line]) for of_line in found]
             above = [mean_over_relief(np.maximum(each - worst, 0.0), share) for each in errors]
             uneven += sum(above) / len(lines)
             if self._is_sheet:
                 below = [mean_over_relief(np.minimum(each, worst), share) for each in errors]
                 of_filter += sum(below) / len(lines)
-        return StageErrors(uneven, of_filter)
+                biases.append(float(np.mean([of_line[0][1] for of_line in found])))
+        return StageErrors(uneven, of_filter, biases)
 
-    def _error(self, line: _Line, stage: SpacedStage, extents: tuple[float, ...]) -> float:
+    def _error(
+        self, line: _Line, stage: SpacedStage, extents: tuple[float, ...]
+    ) -> tuple[float, float]:
         """Return the relative error power of steering functions in the subimages of a stage.
 
-        It is 1, as large as the image, if no beam touches a subimage.
+        The second result is the bias: the mean error in the direction of the exact functions, over
+        their power. The error is 1, as large as the image, if no beam touches a subimage.
         """
         if (line, stage, extents) in self._found:
             return self._found[line, stage, extents]
@@ -449,7 +459,7 @@ class SpacingErrors:
             self._samples[key] = self._sampled(*key)
         samples = self._samples[key]
         if samples is None:
-            return 1.0
+            return 1.0, 0.0
         virtual = line.virtual_channels(samples.points, stage, extents, samples.coordinate)
         steering = self._steering(line, samples, weighted, virtual.coordinate)
         steering = steering.reshape(-1, steering.shape[-1])
@@ -461,11 +471,12 @@ class SpacingErrors:
         )
         exact = samples.exact
         wrong = (interpolate @ steering).reshape(exact.shape) - exact
-        error, total = (
-            float(samples.count @ np.einsum("nsp,nsp->n", each, each, dtype=np.float64))
-            for each in (wrong, exact)
+        error, bias, total = (
+            float(samples.count @ np.einsum("nsp,nsp->n", *each, dtype=np.float64))
+            for each in ((wrong, wrong), (wrong, exact), (exact, exact))
         )
-        self._found[line, stage, extents] = error / max(total, 1e-30)
+        total = max(total, 1e-30)
+        self._found[line, stage, extents] = error / total, bias / total
         return self._found[line, stage, extents]
 
     def _sampled(
