@@ -85,7 +85,8 @@ def test_other_lines_are_warned_of(folder):
 def test_the_error_of_a_mosaic_is_measured_once_it_is_finished(folder, lines, tmp_path):
     image = clsas.load(folder / "image.h5")
     store, given = tmp_path / "a.zarr", folder / "lines.h5"
-    mosaic = clsas.mosaic(lines, image.grid, store, tolerance_db=-40, beam=BEAM, patches=(4, 2))
+    request = {"tolerance_db": -40, "beam": BEAM, "patches": (4, 2)}
+    mosaic = clsas.mosaic(lines, image.grid, store, **request, memory_bytes=64 << 20)
     unfinished = iter(mosaic)
     next(unfinished)
     unfinished.close()
