@@ -131,8 +131,9 @@ def plan(
     of each into fewer, virtual ones, stage by stage [1]_. The search tries numbers of stages, taps
     of filters, and sizes of subimages, each of which is twice as large as the one before it. It
     predicts the time of each factorization from counts of its operations, and the error from the
-    sum of the powers of independent contributions (`Plan.errors`). The plan is the fastest factorization whose predicted error, with a margin for
-    the scatter of measured ones, is within the tolerance.
+    sum of the powers of independent contributions (`Plan.errors`). The plan is the fastest
+    factorization whose predicted error, with a margin for the scatter of measured ones, is within
+    the tolerance.
 
     Range errors that are spread evenly between minus and plus w wavelengths turn phases by up to
     4 pi w. The relative rms error is therefore 4 pi w/sqrt(3), and ::
