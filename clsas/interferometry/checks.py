@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import validate
+from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.declared import Number, Span
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, antennas_of
 from clsas.engine.data.validate import ArgumentError
+from clsas.engine.factorized.planner import TOLERANCE
 from clsas.interferometry.baseline import Baseline
-from clsas.interferometry.errors import UnmeasurableError
+from clsas.interferometry.coherence import LEAST_LOOKS, Window
 
 _APART = 0.1  # relative change of the distance between banks that waves of the track may cause
 _MOST_CYCLES = 1e3  # of phase within the search; more need more planes than anyone has time for
@@ -50,6 +54,50 @@ KNOWN_HEIGHT = Number(
     default="not known",
 )
 """Declares the height of a level seabed."""
+
+
+class UnmeasurableError(ArgumentError):
+    """Two banks do not show the heights of a grid, as the message explains."""
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """A request for heights; see `clsas.heights`.
+
+    Attributes
+    ----------
+    search_m : (lowest, highest)
+    window_m : float or None
+        Side of the windows; None for the default.
+    tolerance_db, least_coherence : float
+    beam : BeamWindow or None
+    """
+
+    search_m: tuple[float, float]
+    window_m: float | None
+    tolerance_db: float
+    least_coherence: float
+    beam: BeamWindow | None
+
+    @classmethod
+    def checked(
+        cls,
+        grid: Grid,
+        search_m: ArrayLike,
+        window_m: float | None,
+        tolerance_db: float,
+        least_coherence: float,
+        beam: BeamWindow | None,
+    ) -> Self:
+        """Return the request; raise TypeError or ValueError unless it is valid for a grid."""
+        search = SEARCH.check("search_m", search_m)
+        tolerance_db = TOLERANCE.check("tolerance_db", tolerance_db)
+        least_coherence = COHERENCE.check("least_coherence", least_coherence)
+        validate.instance("beam", beam, BeamWindow, type(None))
+        if window_m is not None:
+            window_m = WINDOW.check("window_m", window_m)
+            window_within(grid, window_m)
+        return cls(search, window_m, tolerance_db, least_coherence, beam)
 
 
 def check_grid(grid: Grid) -> None:
@@ -224,3 +272,24 @@ def _check_decorrelation(
             f"the height of ambiguity is {ambiguity_m:.2g} m and a level seabed has a coherence of "
             f"at most {max(left, 0):.2f}, less than `least_coherence` = {least_coherence:g}",
         )
+
+
+def window_within(grid: Grid, window_m: float) -> Window:
+    """Return the window of about `window_m`; raise ValueError unless it fits into a grid."""
+    _, *steps_m = grid.vectors_m
+    sides_m = [
+        n * float(np.linalg.norm(step))
+        for n, step in zip(grid.shape, steps_m, strict=True)
+        if n > 1  # the window of a single row is that row
+    ]
+    if not sides_m:
+        raise ArgumentError("grid", "have more than one pixel")
+    validate.number("window_m", window_m, "m", above=0.0, most=min(sides_m))
+    return Window.of(grid, window_m)
+
+
+def check_looks(window_m: float, looks: float) -> None:
+    """Raise UnmeasurableError if a window has too few looks to estimate a coherence."""
+    if looks < LEAST_LOOKS:
+        allowed = f"contain at least {LEAST_LOOKS:g} independent samples of the images"
+        raise UnmeasurableError("window_m", allowed, f"{window_m:g} m, which contains {looks:.1f}")

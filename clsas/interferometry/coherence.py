@@ -23,10 +23,12 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import maximum_filter, uniform_filter1d
 
 from clsas.engine.data.grid import Grid
-from clsas.interferometry.errors import UnmeasurableError
+
+Images = tuple[NDArray[np.complex64], NDArray[np.complex64]]
+"""Pixels of the images of both banks, [rows, columns]."""
 
 UNIFORM_SD_RAD = math.pi / math.sqrt(3)
 """Standard deviation of a phase that is uniform over a cycle, as without any coherence."""
@@ -78,6 +80,10 @@ class Window:
         """
         down = uniform_filter1d(values, self.rows, axis=-2, mode="constant")
         return uniform_filter1d(down, self.columns, axis=-1, mode="constant") * self.pixels
+
+    def any_of(self, values: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return whether any value in the window around every pixel is true."""
+        return np.asarray(maximum_filter(values, self.sides, mode="constant"))
 
     def fullness(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
         """Return the share of the window around every pixel that lies within an image."""
@@ -196,10 +202,3 @@ def noise_coherence(looks: NDArray | float, probability: float) -> NDArray[np.fl
     1999).
     """
     return np.sqrt(1 - probability ** (1 / np.maximum(np.asarray(looks) - 1, 1e-9)))
-
-
-def check_looks(window_m: float, looks: float) -> None:
-    """Raise UnmeasurableError if a window has too few looks to estimate a coherence."""
-    if looks < LEAST_LOOKS:
-        allowed = f"contain at least {LEAST_LOOKS:g} independent samples of the images"
-        raise UnmeasurableError("window_m", allowed, f"{window_m:g} m, which contains {looks:.1f}")

@@ -1,70 +1,66 @@
 """Heights of the seabed from two banks of receivers.
 
-The method has two steps. A sweep finds, along curves of equal range, the heights at which the
-banks agree (`clsas.interferometry.sweep`); large windows decide between the cycles of the phase.
-Both banks are then imaged on that relief, and the remaining phase corrects it
-(`clsas.interferometry.refinement`), with a plane fitted in every window
-(`clsas.interferometry.planes`). Passes end when corrections are below the deviation.
+One image of a plane per bank shows the banks at all heights along curves of equal range
+(`clsas.interferometry.curves`). A sweep finds the heights at which they agree
+(`clsas.interferometry.sweep`); large windows decide between the cycles of the phase. The phase that
+remains corrects them, with a plane fitted in every window (`clsas.interferometry.refinement`). Both
+banks are then imaged on the relief, and corrections end when they are below the deviation.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Annotated, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import affine_transform
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.georeference import placed
-from clsas.engine.data.grid import Grid
+from clsas.engine.data.grid import Grid, without_heights
+from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at
 from clsas.engine.device.device import Device, open_device
 from clsas.engine.factorized.planner import TOLERANCE
 from clsas.engine.promise import report
 from clsas.engine.signal.spectrum import measure_spectrum
-from clsas.interferometry.baseline import Baseline, Lattice, sight_lattice
+from clsas.interferometry.baseline import Baseline, Lattice, in_pixels, sight_lattice
 from clsas.interferometry.checks import (
     COHERENCE,
     HEIGHTS_TOLERANCE_DB,
     SEARCH,
     WINDOW,
+    Request,
     check_echoes,
     check_geometry,
     check_grid,
+    check_looks,
     check_pair,
 )
-from clsas.interferometry.coherence import (
-    Window,
-    check_looks,
-    effective_looks,
-    noise_coherence,
-)
-from clsas.interferometry.doubts import Doubts, end_of, larger_m
+from clsas.interferometry.coherence import Images, Window, effective_looks, noise_coherence
+from clsas.interferometry.curves import CurveImages, Curves, spacing_m
 from clsas.interferometry.pair import Pair
-from clsas.interferometry.refinement import PASSES, Refined, filled, refine
-from clsas.interferometry.request import Request
+from clsas.interferometry.refinement import PASSES, Refined, View, filled, refine
 from clsas.interferometry.result import Heights
 from clsas.interferometry.shadows import in_shadow
 from clsas.interferometry.side_lobes import from_elsewhere, point_response
-from clsas.interferometry.sweep import STEPS_PER_CYCLE, Curves, Relief, sweep
-from clsas.interferometry.task import Task
+from clsas.interferometry.sweep import STEPS_PER_CYCLE, Doubts, Relief, end_of, relief_of, sweep
 
 LEAST_COHERENCE = 0.5
 """Default of the smallest coherence with a valid height."""
 
 _LOOKS = 50.0  # in the default window: a deviation of 0.1 rad at a coherence of 0.7
 _TRIAL_PIXELS = 9  # side of the window that measures the density of samples; arbitrary
-# Pixels along the side of a window in the sweep, about as many as independent samples. Twice as
-# many make 93.0 % instead of 92.4 % of simulated dunes valid and take four times as long.
-_SWEPT_PIXELS = 5
-# Least error of the images of the sweep, dB, as a phase 0.03 rad. With -40 dB the same pixels are
-# valid, and volumes that banks with separate transmitters see take four times as long.
-_SWEPT_DB = -30.0
+# Curves along the side of a window, about twice as many as independent samples. With half as many,
+# heights found on the relief differ from those on the curves by half a deviation, and another pass
+# is needed. The sweep takes every other curve; all of them would make 0.6 % more of simulated dunes
+# valid and take four times as long.
+_CURVES, _SWEPT = 10, 2
 # Half a cycle, in deviations of the height that the magnitude of the coherence shows: 0.1 % of the
 # cycles are wrong at the least coherence. Half the value loses a tenth of simulated dunes, twice
 # the value gives the same heights.
@@ -72,6 +68,9 @@ _CYCLE_SD = 3.3
 # Share of the incoherent curves that the sweep takes for coherent. Each adds a surface at a random
 # height, which looks like layover. Passes on the relief use the threshold of the coherence itself.
 _FALSE_ALARM = 0.05
+# Blur of the images of the plane, in windows, from which on others are formed on the relief that
+# the sweep found.
+_MOST_BLUR = 0.5
 
 
 def heights(
@@ -271,27 +270,30 @@ def measured(
     UnmeasurableError
         If the geometry or the images do not show heights.
     """
-    task, images, window_m, window, looks = _begun(pair, grid, request)
-    heights_m = _sweep_heights(task.search_m, task.ambiguity_m)
-    total = len(heights_m) + PASSES
+    task = Task.of(pair, grid, request)
+    offset_m = _sweep_heights(request.search_m, task.ambiguity_m)
+    total = len(offset_m) + PASSES
     report = progress or (lambda done, total: None)
-    relief, doubts = _first_relief(
-        task, images, window_m, heights_m, lambda done: report(done, total)
-    )
-    sights = sight_lattice(task.baseline, grid, task.search_m)
+    relief_m, known, doubts = _first_relief(task, offset_m, lambda done: report(done, total))
+
+    plane, formed, seconds = without_heights(grid), list[Image](), list[float]()
+
+    def images_at(relief_m: NDArray[np.float64]) -> Images:
+        on_relief, started = plane.with_height(relief_m), time.perf_counter()
+        formed[:] = [pair.image(bank, on_relief) for bank in (pair.a, pair.b)]
+        seconds[:] = [time.perf_counter() - started]
+        return formed[0].pixels, formed[1].pixels
+
+    sights = sight_lattice(task.baseline, grid, request.search_m)
+    view = View(plane, sights, task.window, task.looks, request.least_coherence, task.ambiguity_m)
     refined = refine(
-        replace(task, pair=pair),
-        relief,
-        sights,
-        window,
-        looks,
-        lambda done: report(len(heights_m) + done, total),
+        images_at, relief_m, known, view, lambda done: report(len(offset_m) + done, total)
     )
     report(total, total)
-    response = point_response(task.pair, task.level)
-    power = np.abs(refined.image.pixels.astype(np.complex128)) ** 2
-    valid = refined.valid & ~from_elsewhere(power, response, window)
-    hidden = in_shadow(task.plane, refined.offset_m, refined.sd_m, valid, sights, window)
+    power = np.abs(formed[0].pixels.astype(np.complex128)) ** 2
+    response = point_response(task.straight, task.level)
+    valid = refined.valid & ~from_elsewhere(power, response, task.window)
+    hidden = in_shadow(plane, refined.offset_m, refined.sd_m, valid, sights, task.window)
     found = Heights(
         refined.offset_m,
         refined.sd_m,
@@ -299,9 +301,9 @@ def measured(
         valid & ~hidden,
         refined.looks,
         refined.m_per_rad,
-        refined.image,
-        window_m,
-        refined.certificate,
+        formed[0],
+        task.window_m,
+        pair.certificate(*formed, *seconds),
     )
     return Measured(found, refined, sights, doubts)
 
@@ -316,89 +318,150 @@ def windows(pair: Pair, grid: Grid, request: Request) -> tuple[float, Window, Wi
     window, large : Window
         Windows of the heights, and those that decide between cycles of the phase.
     """
-    task, _, window_m, window, looks = _begun(pair, grid, request)
-    large = _large_window(looks, window, task.relative_band, task.least_coherence)
-    return window_m, window, large
+    task = Task.of(pair, grid, request)
+    return task.window_m, task.window, task.large_window(task.looks, task.window)
 
 
-class _Begun(NamedTuple):
-    """The task, images on the plane, and the window with its effective number of looks."""
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Two banks, the grid whose heights they measure, and what follows from both.
 
-    task: Task
-    images: tuple[NDArray[np.complex64], NDArray[np.complex64]]
+    Attributes
+    ----------
+    straight : Pair
+        The banks in homogeneous water. Rays are exact only in the last images.
+    grid : Grid
+        A plane, or a height map from which the search starts.
+    request : Request
+    baseline : Baseline
+        How the banks see the grid.
+    relative_band : float
+        Bandwidth over the frequency in its middle.
+    ambiguity_m : float
+        Height of ambiguity.
+    level : Grid
+        The plane of the grid, raised by its mean height.
+    window_m : float
+    window : Window
+    looks : float
+        Effective number of looks of a window.
+    """
+
+    straight: Pair
+    grid: Grid
+    request: Request
+    baseline: Baseline
+    relative_band: float
+    ambiguity_m: float
+    level: Grid
     window_m: float
     window: Window
     looks: float
 
+    @classmethod
+    def of(cls, pair: Pair, grid: Grid, request: Request) -> Self:
+        """Return the task; raise UnmeasurableError if geometry or images show no heights."""
+        straight = pair.straightened(grid)
+        spectrum = measure_spectrum(straight.a)
+        cycles_per_m = float(cycles_per_m_at(straight.a, spectrum.centre))
+        relative_band = 1 / (spectrum.oversampling * straight.a.range_step_m * abs(cycles_per_m))
+        baseline = Baseline.of(straight.a, straight.b, straight.beam, cycles_per_m)
+        ambiguity_m = check_geometry(
+            baseline, grid, request.search_m, relative_band, request.least_coherence
+        )
+        mean_m = 0.0 if grid.height_m is None else float(grid.height_m.mean())
+        level = replace(without_heights(grid), origin_m=grid.vectors_m[0] + [0.0, 0.0, mean_m])
+        images = straight.images(level)
+        window_m = request.window_m or _default_window_m(images, grid)
+        window = Window.of(grid, window_m)
+        looks = effective_looks(images, window)
+        check_looks(window_m, looks)
+        return cls(
+            straight, grid, request, baseline, relative_band, ambiguity_m, level, window_m, window,
+            looks,
+        )  # fmt: skip
 
-def _begun(pair: Pair, grid: Grid, request: Request) -> _Begun:
-    """Return what images of the plane show; raise UnmeasurableError if they show no heights."""
-    # Rays are exact on the relief that is refined. A sweep needs no more than nearly right ones.
-    straight = pair.straightened(grid)
-    task = _task(straight, grid, request.search_m, request.least_coherence)
-    images = straight.images(task.level)
-    window_m = request.window_m
-    if window_m is None:
-        window_m = _default_window_m(images, grid)
-    window = Window.of(grid, window_m)
-    looks = effective_looks(images, window)
-    check_looks(window_m, looks)
-    return _Begun(task, images, window_m, window, looks)
+    def large_window(self, looks: float, window: Window) -> Window:
+        """Return the window that decides between cycles of the phase.
 
-
-def _task(pair: Pair, grid: Grid, search_m: tuple[float, float], least_coherence: float) -> Task:
-    """Return the task; raise UnmeasurableError unless the geometry shows heights."""
-    spectrum = measure_spectrum(pair.a)
-    cycles_per_m = float(cycles_per_m_at(pair.a, spectrum.centre))
-    band_cycles_per_m = 1 / (spectrum.oversampling * pair.a.range_step_m)
-    baseline = Baseline.of(pair.a, pair.b, pair.beam, cycles_per_m)
-    relative_band = band_cycles_per_m / abs(cycles_per_m)
-    ambiguity_m = check_geometry(baseline, grid, search_m, relative_band, least_coherence)
-    return Task(pair, grid, search_m, least_coherence, baseline, relative_band, ambiguity_m)
+        From the magnitude of the coherence alone, N looks determine the difference of two ranges to
+        sqrt(3/(2 N)) sqrt(1 - g^2)/(pi g) range resolutions (Bamler and Eineder 2005). Half a cycle
+        is half the relative bandwidth of a range resolution.
+        """
+        least = self.request.least_coherence
+        per_look = math.sqrt(1.5 * (1 - least**2)) / (math.pi * least)
+        needed = (_CYCLE_SD * per_look / (self.relative_band / 2)) ** 2
+        return window.scaled(math.sqrt(max(needed / looks, 1)))
 
 
 def _first_relief(
-    task: Task,
-    images: tuple[NDArray[np.complex64], NDArray[np.complex64]],
-    window_m: float,
-    heights_m: NDArray[np.float64],
-    progress: Callable[[int], None],
-) -> tuple[Relief, Doubts]:
-    """Return the relief that a sweep over heights finds, from some rows and columns of the grid.
+    task: Task, offset_m: NDArray[np.float64], progress: Callable[[int], None]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], Doubts]:
+    """Return the relief that images of a plane show, where it is known, and doubts about it."""
+    grid, window_m, request = task.grid, task.window_m, task.request
+    step_m = window_m / _CURVES
+    across_m = spacing_m(task.baseline, task.level, task.relative_band)
+    every = max(round(step_m / across_m), 1)
+    fine = Curves.over(task.baseline, grid, request.search_m, (across_m, step_m))
+    validate.memory("grid and search_m", 8 * len(offset_m) * fine.grid.size // every)
+    images = CurveImages.of(task.straight, fine, every)
+    curves = images.curves
 
-    `images` are those on a level surface, which show how many independent samples there are.
-    """
-    every = max(min(Window.of(task.grid, window_m).sides) // _SWEPT_PIXELS, 1)
-    few = slice(None, None, every)
-    coarser = task.grid.window(few, few)
-    small = Window.of(coarser, window_m)
-    looks = effective_looks(tuple(each[few, few] for each in images), small)
-    large = _large_window(looks, small, task.relative_band, task.least_coherence)
-    large_m = None
-    if task.search_m[1] - task.search_m[0] > task.ambiguity_m:
-        large_m = larger_m(coarser, large)
-    curves = Curves.over(task.baseline, coarser, heights_m)
-    validate.memory("grid and search_m", 32 * len(heights_m) * curves.grid.size)
-    found = sweep(task.pair.within(_SWEPT_DB), curves, small, large, progress)
-    reliable = found.coherence >= noise_coherence(looks, _FALSE_ALARM / len(heights_m))
-    end = end_of(found) if reliable.mean() > 2 * _FALSE_ALARM else None
-    rows, columns = (np.arange(math.ceil((n - 1) / every) + 1.0) for n in task.grid.shape)
-    relief = found.relief(rows, columns, reliable, task.ambiguity_m)
-    return (
-        _finer(relief, every, task.grid.shape),
-        Doubts(end, large_m, task.ambiguity_m),
-    )
+    few = images.few(_SWEPT)
+    small = Window.of(few.curves.grid, window_m)
+    looks = effective_looks(few.at(0.0), small)
+    large = task.large_window(looks, small)
+    swept = sweep(few, few.curves.start_m(grid), offset_m, small, large, progress)
+    reliable = swept.coherence >= noise_coherence(looks, _FALSE_ALARM / len(offset_m))
+    end = end_of(swept) if reliable.mean() > 2 * _FALSE_ALARM else None
+    side_m, large_m = large.rows * float(np.linalg.norm(few.curves.grid.vectors_m[1])), None
+    if np.ptp(request.search_m) > task.ambiguity_m and side_m > min(_sides_m(grid)):
+        large_m = side_m
+    doubts = Doubts(end, large_m, task.ambiguity_m)
+
+    height_m = _closer(filled(swept.height_m, reliable), (_SWEPT, _SWEPT), curves.grid.shape)
+    reliable = _closer(reliable.astype(np.float32), (_SWEPT, _SWEPT), curves.grid.shape) > 0.5
+    blur_m = curves.blur_m(height_m)[reliable]
+    if blur_m.size and np.median(blur_m) > _MOST_BLUR * window_m:
+        formed_m = _closer(height_m, (every, 1), fine.grid.shape)
+        images = CurveImages.of(task.straight, fine, every, formed_m)
+    window = Window.of(curves.grid, window_m)
+    view = View(
+        curves.grid, curves.sights, window, effective_looks(images.at(0.0), window),
+        request.least_coherence, task.ambiguity_m,
+    )  # fmt: skip
+    found_m = refine(images.at, height_m, window.any_of(reliable), view).relief_m
+    relief = relief_of(curves.moved(found_m), found_m, reliable, task.ambiguity_m)
+    return *_at_pixels(relief, curves, window, grid), doubts
 
 
-def _finer(relief: Relief, every: int, shape: tuple[int, ...]) -> Relief:
-    """Return the relief of a grid whose pixels are `every` times as close."""
-    if every == 1:
-        return relief
-    rows, columns = (np.arange(n) / every for n in shape)
-    nearest = np.ix_(rows.round().astype(int), columns.round().astype(int))
-    known_m = filled(relief.offset_m, relief.surfaces == 1)
-    at = np.broadcast_arrays(rows[:, None], columns)
-    return Relief(map_coordinates(known_m, at, order=1), relief.surfaces[nearest])
+def _closer(values: NDArray, factors: tuple[int, int], shape: tuple[int, ...]) -> NDArray:
+    """Return values on rows and columns that are closer by factors, interpolated linearly."""
+    scale = 1 / np.array(factors)
+    return np.asarray(affine_transform(values, scale, output_shape=shape, order=1, mode="nearest"))
+
+
+def _at_pixels(
+    relief: Relief, curves: Curves, window: Window, grid: Grid
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return a relief at the pixels of a grid, above its plane, and where it is known."""
+    origin_m, *steps_m = grid.vectors_m
+    first = in_pixels(curves.grid, origin_m[:2] - curves.grid.vectors_m[0][:2])
+    steps = in_pixels(curves.grid, np.array(steps_m)[:, :2]).T
+
+    def at_pixels(values: NDArray, order: int) -> NDArray:
+        return np.asarray(
+            affine_transform(
+                values, steps, first, output_shape=grid.shape, order=order, mode="nearest"
+            )
+        )
+
+    found_once = relief.surfaces == 1
+    # Single curves may be missing. Where a window reaches known heights, it decides by itself.
+    known = window.any_of(found_once) & (relief.surfaces < 2)
+    height_m = at_pixels(filled(relief.height_m, found_once), 1)
+    plane_m = without_heights(grid).positions_m()[..., 2]
+    return height_m + curves.level_m - plane_m, at_pixels(known.astype(np.uint8), 0) > 0
 
 
 def _sweep_heights(search_m: tuple[float, float], ambiguity_m: float) -> NDArray[np.float64]:
@@ -412,25 +475,20 @@ def _sweep_heights(search_m: tuple[float, float], ambiguity_m: float) -> NDArray
 def _default_window_m(images: tuple[NDArray, NDArray], grid: Grid) -> float:
     """Return the side of windows with about `_LOOKS` independent samples, metres."""
     steps_m = [float(np.linalg.norm(step)) for step in grid.vectors_m[1:]]
-    most_m = min(n * step_m for n, step_m in zip(grid.shape, steps_m, strict=True))
+    most_m = min(_sides_m(grid))
     trial = Window.of(grid, min(_TRIAL_PIXELS * max(steps_m), most_m))
     pixel_m2 = math.prod(steps_m)
     looks_per_m2 = effective_looks(images, trial) / (trial.pixels * pixel_m2)
     return min(math.sqrt(_LOOKS / looks_per_m2), most_m)
 
 
-def _large_window(
-    looks: float, window: Window, relative_band: float, least_coherence: float
-) -> Window:
-    """Return the window that decides between cycles of the phase.
-
-    From the magnitude of the coherence alone, N looks determine the difference of two ranges to
-    sqrt(3/(2 N)) sqrt(1 - g^2)/(pi g) range resolutions (Bamler and Eineder 2005). Half a cycle is
-    half the relative bandwidth of a range resolution.
-    """
-    per_look = math.sqrt(1.5 * (1 - least_coherence**2)) / (math.pi * least_coherence)
-    needed = (_CYCLE_SD * per_look / (relative_band / 2)) ** 2
-    return window.scaled(math.sqrt(max(needed / looks, 1)))
+def _sides_m(grid: Grid) -> tuple[float, float]:
+    """Return the lengths of the sides of a plane or height map, metres."""
+    down, across = (
+        n * float(np.linalg.norm(step))
+        for n, step in zip(grid.shape, grid.vectors_m[1:], strict=True)
+    )
+    return down, across
 
 
 def _warn(refined: Refined) -> None:

@@ -11,10 +11,10 @@ from clsas.engine.data import reprs, validate
 from clsas.engine.data.grid import Grid, check_one_grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.validate import ArgumentError
+from clsas.interferometry.checks import check_looks, window_within
 from clsas.interferometry.coherence import (
     Moments,
     Window,
-    check_looks,
     debiased,
     effective_looks,
     phase_sd_rad,
@@ -182,17 +182,3 @@ def _check_share(window: Window, grid: Grid) -> None:
             f"{100 * share:.0f} %: looks may be 1.6 times too many, and `phase_sd_rad` 0.8 times "
             "its true value"
         )
-
-
-def window_within(grid: Grid, window_m: float) -> Window:
-    """Return the window of about `window_m`; raise ValueError unless it fits into a grid."""
-    _, *steps_m = grid.vectors_m
-    sides_m = [
-        n * float(np.linalg.norm(step))
-        for n, step in zip(grid.shape, steps_m, strict=True)
-        if n > 1  # the window of a single row is that row
-    ]
-    if not sides_m:
-        raise ArgumentError("grid", "have more than one pixel")
-    validate.number("window_m", window_m, "m", above=0.0, most=min(sides_m))
-    return Window.of(grid, window_m)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.certificate import Certificate
@@ -16,6 +15,7 @@ from clsas.engine.device.device import Device
 from clsas.engine.imaging import Imager
 from clsas.engine.promise import is_wanted, measured_if_possible
 from clsas.engine.water.refraction import homogeneous
+from clsas.interferometry.coherence import Images
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Pair:
     beam: BeamWindow | None
     device: Device
 
-    def images(self, grid: Grid) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+    def images(self, grid: Grid) -> Images:
         """Return the pixels of both banks' images."""
         return self.image(self.a, grid).pixels, self.image(self.b, grid).pixels
 
@@ -65,11 +65,6 @@ class Pair:
                 return None
             found.append(each)
         return max(found, key=lambda each: each.error)
-
-    def within(self, tolerance_db: float) -> Pair:
-        """Return the pair with a tolerance of at least so many decibels."""
-        least_db = tolerance_db if self.tolerance_db is None else self.tolerance_db
-        return replace(self, tolerance_db=max(tolerance_db, least_db), accuracy_db=None)
 
     def straightened(self, grid: Grid) -> Pair:
         """Return the pair in homogeneous water, unchanged without a profile of the sound speed.

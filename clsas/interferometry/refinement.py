@@ -1,36 +1,49 @@
-"""Heights from the remaining phase on a relief, pass by pass until they no longer change."""
+"""Heights from the phase that is left between two images on a relief.
+
+Let z = a b* be the product of two images on a relief of height h, and M the change of height per
+radian of phase. In a window around a pixel, the true height of pixel i is modelled as a plane,
+
+    h_i + M arg z_i = c_0 + c_1 r_i + c_2 s_i,
+
+with r and s the rows and columns from the middle. Linearised about the phase of sum z, the weighted
+least squares with weights Re(z_i exp(-j arg sum z)) is one Gauss-Newton step towards the maximum of
+the likelihood: a linear regression. Its sums are those of z times powers of r and s, which are
+computed for all windows at once. The plane is fitted to the height itself and not to the
+correction: repeated corrections would otherwise undo the averaging of the window, and the noise
+would grow from pass to pass.
+
+Passes over new images of the corrected relief end when corrections are below the deviation.
+"""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, distance_transform_edt
+from scipy.ndimage import distance_transform_edt
 
-from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.decibels import DEVIATION_PER_MEDIAN
 from clsas.engine.data.grid import Grid
-from clsas.engine.data.image import Image
+from clsas.engine.data.threads import in_threads
 from clsas.interferometry.baseline import Lattice
 from clsas.interferometry.coherence import (
+    Images,
+    Moments,
     Window,
     debiased,
     noise_coherence,
     phase_sd_rad,
 )
-from clsas.interferometry.planes import edge_growth, fit_planes
-from clsas.interferometry.sweep import Relief
-from clsas.interferometry.task import Task
 
 PASSES = 6
 """Most passes. Two or three are usual."""
 
-# Rms correction, in standard deviations; it then adds 4 % to the deviation. Half and twice the
-# value stop after the same pass on the reliefs of tests/interferometry.
-_CONVERGED = 0.3
+# Rms correction of the last pass, in standard deviations. The next one corrects a tenth of that.
+_CONVERGED = 1.0
 # Last correction of a pixel, in deviations, from which on it is not valid: its window reaches to
 # where the relief is unknown, and contains echoes of another height.
 _UNSETTLED = 2.0
@@ -52,6 +65,36 @@ _BENDING = 2.0
 # slopes of tests/interferometry. Evenly lit windows would have 0.32.
 _BEND_NOISE = 0.25
 _LEAST_FORESHORTENING = 0.2  # steeper slopes towards the sonar count as layover
+_RIDGE = 1e-4  # of the variance of rows and columns; keeps windows with little power solvable
+_LEAST_DETERMINANT = 1e-3  # relative to that of an evenly filled window
+# Rows of a strip, and windows of rows. Half and twice as many take the same time.
+_ROWS, _WINDOWS = 64, 4
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """How two banks see a surface, and which heights on it are valid.
+
+    Attributes
+    ----------
+    grid : Grid
+        The plane above which heights are measured.
+    sights : Lattice
+        K and the tangent of the curves of equal range; see `sight_lattice`.
+    window : Window
+    looks : float
+        Effective number of looks of a window on a level surface. They must not be measured on a
+        relief: its small errors shift the phase of neighbouring pixels, which then seem
+        uncorrelated.
+    least_coherence, ambiguity_m : float
+    """
+
+    grid: Grid
+    sights: Lattice
+    window: Window
+    looks: float
+    least_coherence: float
+    ambiguity_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +105,10 @@ class Refined:
     ----------
     offset_m, sd_m, coherence, looks, m_per_rad : float64
     valid : bool
-    image : Image
-        Image of the first bank on the relief of the last pass.
+    relief_m : float64
+        The heights, and the nearest ones where they are not known.
     correction : float
         Rms of the last correction, in standard deviations.
-    certificate : Certificate or None
-        Measured error of that bank's image in the last pass which errs more.
     """
 
     offset_m: NDArray[np.float64]
@@ -76,9 +117,8 @@ class Refined:
     looks: NDArray[np.float64]
     m_per_rad: NDArray[np.float64]
     valid: NDArray[np.bool_]
-    image: Image
+    relief_m: NDArray[np.float64]
     correction: float
-    certificate: Certificate | None = None
 
     @property
     def converged(self) -> bool:
@@ -87,53 +127,42 @@ class Refined:
 
 
 def refine(
-    task: Task,
-    relief: Relief,
-    sights: Lattice,
-    window: Window,
-    looks: float,
-    progress: Callable[[int], None],
+    images_at: Callable[[NDArray[np.float64]], Images],
+    relief_m: NDArray[np.float64],
+    known: NDArray[np.bool_],
+    view: View,
+    progress: Callable[[int], None] = lambda done: None,
 ) -> Refined:
     """Return heights, starting from those of a sweep.
 
     Parameters
     ----------
-    task : Task
-    relief : Relief
-        Heights above the grid that the sweep found.
-    sights : Lattice
-        K and the tangent of the curves, from `sight_lattice`.
-    window : Window
-    looks : float
-        Effective number of looks of a window on a level surface. They must not be measured on a
-        relief: its small errors shift the phase of neighbouring pixels, which then seem
-        uncorrelated.
+    images_at : callable
+        Returns both images on a relief.
+    relief_m : float64 [rows, columns]
+        Heights above the plane.
+    known : bool [rows, columns]
+        Where they are known, or decided by the windows themselves.
+    view : View
     progress : callable
         Called with the number of passes done.
     """
-    grid, start_m = task.plane, task.start_m
-    found_once = relief.surfaces == 1
-    # The sweep misses single curves. Where a window reaches known heights, it decides by itself.
-    known = binary_dilation(found_once, np.ones(window.sides)) & (relief.surfaces < 2)
+    window, shape = view.window, relief_m.shape
     # A slope that faces the sonar is imaged with more pixels per independent sample.
-    level_m = np.full(grid.shape, task.level_m)
-    _, level = sensitivity(grid, level_m, np.zeros((2, *grid.shape)), sights)
-    level_growth = edge_growth(window, grid.shape)
-    looks_on_plane = looks * window.fullness(grid.shape) / level
-    relief_m = first_m = start_m + filled(relief.offset_m, found_once)
-    slope_m = np.array(np.gradient(relief_m))
+    level_m = np.full(shape, float(relief_m.mean()))
+    _, level = sensitivity(view, level_m, np.zeros((2, *shape)))
+    level_growth = edge_growth(window, shape)
+    looks_on_plane = view.looks * window.fullness(shape) / level
+    first_m, slope_m = relief_m, np.array(np.gradient(relief_m))
     for done in range(1, PASSES + 1):
-        on_relief, started = grid.with_height(relief_m), time.perf_counter()
-        image, other = (task.pair.image(bank, on_relief) for bank in (task.pair.a, task.pair.b))
-        images, seconds = (image.pixels, other.pixels), time.perf_counter() - started
-        rad_m, facing = sensitivity(grid, relief_m, slope_m, sights)
-        planes = fit_planes(images, relief_m, -1 / rad_m, window)
+        rad_m, facing = sensitivity(view, relief_m, slope_m)
+        planes = fit_planes(images_at(relief_m), relief_m, -1 / rad_m, window)
         seen = looks_on_plane * np.maximum(facing, _LEAST_FORESHORTENING)
         coherence = debiased(planes.coherence, seen)
         sd_m = phase_sd_rad(coherence, seen / planes.growth) / np.abs(rad_m)
         valid = known & (facing > _LEAST_FORESHORTENING)
-        valid &= coherence >= np.maximum(task.least_coherence, noise_coherence(seen, _FALSE_ALARM))
-        valid &= np.abs(planes.height_m - first_m) < _CREDIBLE * task.ambiguity_m
+        valid &= coherence >= np.maximum(view.least_coherence, noise_coherence(seen, _FALSE_ALARM))
+        valid &= np.abs(planes.height_m - first_m) < _CREDIBLE * view.ambiguity_m
         valid &= planes.growth < _MOST_GROWTH * level_growth
         # Without noise, the sweep's heights are rougher than the deviation. Filling their windows
         # would make steps, which make the neighbours rough in turn.
@@ -146,38 +175,33 @@ def refine(
         correction = DEVIATION_PER_MEDIAN * median
         settled = valid & (change < _UNSETTLED)
         whole_sd_m = np.hypot(sd_m, displacement_m(planes.bend_m, sd_m, settled, window))
+        relief_m = filled(planes.height_m, usable)
+        slope_m = np.stack([planes.row_slope_m, planes.column_slope_m])
         found = Refined(
-            planes.height_m, whole_sd_m, coherence, seen, -1 / rad_m, settled, image, correction
+            planes.height_m, whole_sd_m, coherence, seen, -1 / rad_m, settled, relief_m, correction
         )
         progress(done)
         if found.converged:
             break
-        relief_m = start_m + filled(planes.height_m - start_m, usable)
-        slope_m = np.stack([planes.row_slope_m, planes.column_slope_m])
-    return replace(found, certificate=task.pair.certificate(image, other, seconds))
+    return found
 
 
 def sensitivity(
-    grid: Grid,
-    offset_m: NDArray[np.float64],
-    slope_m: NDArray[np.float64],
-    sights: Lattice,
+    view: View, offset_m: NDArray[np.float64], slope_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the change of phase per metre of height error, rad/m, and the foreshortening.
 
     Parameters
     ----------
-    grid : Grid
-        The plane.
+    view : View
     offset_m : float64 [rows, columns]
-        Heights above it.
+        Heights above its plane.
     slope_m : float64 [2, rows, columns]
         Their slopes, metres per row and per column.
-    sights : Lattice
     """
-    _, row_step_m, column_step_m = grid.vectors_m
-    rows, columns = map(np.arange, grid.shape)
-    rad_m, row_tangent, column_tangent = sights.over(rows, columns, offset_m)
+    _, row_step_m, column_step_m = view.grid.vectors_m
+    rows, columns = map(np.arange, view.grid.shape)
+    rad_m, row_tangent, column_tangent = view.sights.over(rows, columns, offset_m)
     facing = 1 - (slope_m[0] + row_step_m[2]) * row_tangent
     facing -= (slope_m[1] + column_step_m[2]) * column_tangent
     return rad_m / np.maximum(facing, _LEAST_FORESHORTENING), facing
@@ -219,3 +243,145 @@ def filled(values: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.
         return np.zeros_like(values)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     return values[tuple(nearest)]
+
+
+class Planes(NamedTuple):
+    """Planes in windows around every pixel, [rows, columns] each.
+
+    Attributes
+    ----------
+    height_m : float64
+        Height in the middle of the window.
+    row_slope_m, column_slope_m : float64
+        Slopes, metres per row and per column.
+    coherence : float64
+        Magnitude of the sample coherence.
+    growth : float64
+        Variance of the height in the middle, relative to that of a windowed mean.
+    roughness_m : float64
+        Rms distance of the relief from the plane.
+    bend_m : float64
+        Height in the middle of a plane fitted to the relief itself, above the relief.
+    """
+
+    height_m: NDArray[np.float64]
+    row_slope_m: NDArray[np.float64]
+    column_slope_m: NDArray[np.float64]
+    coherence: NDArray[np.float64]
+    growth: NDArray[np.float64]
+    roughness_m: NDArray[np.float64]
+    bend_m: NDArray[np.float64]
+
+
+def fit_planes(
+    images: Images,
+    height_m: NDArray[np.float64],
+    m_per_rad: NDArray[np.float64],
+    window: Window,
+) -> Planes:
+    """Return the planes that two images on a relief show.
+
+    Parameters
+    ----------
+    images : two complex64 [rows, columns]
+    height_m : float64 [rows, columns]
+        The relief.
+    m_per_rad : float64 [rows, columns]
+        Change M of the height per radian of phase.
+    window : Window
+    """
+    return _in_strips(partial(_fit, window=window), (*images, height_m, m_per_rad), window)
+
+
+def _fit(
+    a: NDArray[np.complex64],
+    b: NDArray[np.complex64],
+    height_m: NDArray[np.float64],
+    m_per_rad: NDArray[np.float64],
+    *,
+    window: Window,
+) -> Planes:
+    """Return the planes of some rows."""
+    moments = Moments.of(a, b, window)
+    magnitude = np.abs(moments.cross)
+    lit = magnitude > 1e-12 * magnitude.max(initial=0.0)
+    mean = np.where(lit, moments.cross, 1) / np.where(lit, magnitude, 1)
+    product = a.astype(np.complex128) * b.conj()
+    # Multiplied by this phase, sums have weights as real parts, and weights times phases relative
+    # to the mean as imaginary parts. Division by the sum of weights makes them means.
+    scale = mean.conj() / np.where(lit, magnitude, 1)
+    row, column = np.ogrid[tuple(map(slice, product.shape))]
+    column = column - product.shape[1] // 2  # smaller squares have smaller rounding errors
+
+    def means(values: NDArray) -> NDArray[np.complex128]:
+        return scale * window.sums(product * values)
+
+    of_row, of_column, of_height = means(row), means(column), means(height_m).real
+    r, s = of_row.real, of_column.real
+    spread = [max((side**2 - 1) / 12, 1e-6) for side in window.sides]
+    rr = means(row**2).real - r**2 + _RIDGE * spread[0]
+    ss = means(column**2).real - s**2 + _RIDGE * spread[1]
+    rs = means(row * column).real - r * s
+    determinant = rr * ss - rs**2
+    solvable = lit & (determinant > _LEAST_DETERMINANT * spread[0] * spread[1])
+    determinant[~solvable] = 1
+    rh = means(row * height_m).real - r * of_height
+    sh = means(column * height_m).real - s * of_height
+    ry, sy = rh + m_per_rad * of_row.imag, sh + m_per_rad * of_column.imag
+    row_slope_m = (ry * ss - sy * rs) / determinant
+    column_slope_m = (sy * rr - ry * rs) / determinant
+    r, s = r - row, s - column  # from the middle
+    change_m = m_per_rad * np.angle(mean)
+    middle_m = of_height + change_m - row_slope_m * r - column_slope_m * s
+    bend_m = of_height - height_m
+    bend_m -= (r * (rh * ss - sh * rs) + s * (sh * rr - rh * rs)) / determinant
+    growth = 1 + (r**2 * ss - 2 * r * s * rs + s**2 * rr) / determinant
+    squared = means(height_m**2).real - of_height**2 + change_m**2
+    squared += row_slope_m * (row_slope_m * rr + 2 * column_slope_m * rs - 2 * rh)
+    squared += column_slope_m * (column_slope_m * ss - 2 * sh)
+    return Planes(
+        np.where(solvable, middle_m, height_m),
+        np.where(solvable, row_slope_m, 0.0),
+        np.where(solvable, column_slope_m, 0.0),
+        np.where(solvable, np.abs(moments.coherence), 0.0),
+        np.where(solvable, np.maximum(growth, 1.0), 1.0),
+        np.where(solvable, np.sqrt(np.maximum(squared, 0.0)), 0.0),
+        np.where(solvable, bend_m, 0.0),
+    )
+
+
+def edge_growth(window: Window, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return the `growth` of evenly lit windows, which is more than 1 at the edges of an image."""
+    excess = []
+    for n, side in zip(shape, window.sides, strict=True):
+        first = np.maximum(np.arange(n) - side // 2, 0)
+        last = np.minimum(np.arange(n) + side // 2, n - 1)
+        variance = np.maximum(((last - first + 1) ** 2 - 1) / 12, 1e-6)
+        excess.append(((first + last) / 2 - np.arange(n)) ** 2 / variance)
+    return 1 + excess[0][:, None] + excess[1][None, :]
+
+
+def _in_strips(
+    function: Callable[..., Planes], arrays: tuple[NDArray, ...], window: Window
+) -> Planes:
+    """Return the results of a function of windows around every pixel.
+
+    Parameters
+    ----------
+    function : callable
+        Takes the arrays, some rows of them, and returns a named tuple of arrays of the same shape.
+        A result depends on the pixels within half a window.
+    arrays : arrays [rows, columns]
+    window : Window
+    """
+    rows, margin = len(arrays[0]), window.rows // 2
+    height = max(_ROWS, _WINDOWS * window.rows)
+
+    def strip(first: int) -> Planes:
+        last = min(first + height, rows)
+        begin, end = max(first - margin, 0), min(last + margin, rows)
+        found = function(*(each[begin:end] for each in arrays))
+        return Planes(*(each[first - begin : last - begin] for each in found))
+
+    parts = list(in_threads(strip, range(0, rows, height)))
+    return Planes(*(np.concatenate(each) for each in zip(*parts, strict=True)))

@@ -47,16 +47,16 @@ from clsas.interferometry.checks import (
     PATCH_PIXELS,
     SEARCH,
     WINDOW,
+    Request,
+    UnmeasurableError,
     check_grid,
     check_pair,
 )
 from clsas.interferometry.coherence import Window
-from clsas.interferometry.doubts import BEYOND
-from clsas.interferometry.errors import UnmeasurableError
+from clsas.interferometry.curves import Curves
 from clsas.interferometry.heights import LEAST_COHERENCE
 from clsas.interferometry.pair import Pair
-from clsas.interferometry.request import Request
-from clsas.interferometry.sweep import Curves
+from clsas.interferometry.sweep import BEYOND
 from clsas.mosaics.devices import open_devices, thread_device
 from clsas.mosaics.document import PARTS_OF_B, PatchIndex, Record
 from clsas.mosaics.levels import LAYERS, SHADOWED
@@ -487,9 +487,16 @@ def _swept(
     if visible.any():
         some = [bank.geometry.select(visible) for bank in banks]
         baseline = Baseline.of(some[0], some[1], _beam_of(first, request.beam, visible), 1.0)
-        every = [slice(None, None, max((n - 1) // _PLACES, 1)) for n in grid.shape]
-        reached = Curves.over(baseline, grid.window(*every), np.array(request.search_m)).grid
-        volume = _box(reached, request.search_m)
+        step_m = (
+            min(
+                n * float(np.linalg.norm(step))
+                for n, step in zip(grid.shape, grid.vectors_m[1:], strict=True)
+            )
+            / _PLACES
+        )
+        curves = Curves.over(baseline, grid, request.search_m, (step_m, step_m))
+        low_m, *_, high_m = curves.lattice.offset_m
+        volume = _box(curves.grid, (low_m, high_m))
         visible = first.visibility.channels(volume) | second.visibility.channels(volume)
     return visible, volume
 

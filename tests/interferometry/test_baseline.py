@@ -10,8 +10,8 @@ from scipy.optimize import least_squares
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.geometry import bistatic_range_m
 from clsas.interferometry.baseline import Baseline, sight_lattice
-from clsas.interferometry.refinement import sensitivity
-from clsas.interferometry.sweep import Curves
+from clsas.interferometry.coherence import Window
+from clsas.interferometry.refinement import View, sensitivity
 
 CYCLES_PER_M = 2 * 100e3 / 1500.0
 
@@ -68,38 +68,14 @@ def test_roll_turns_the_second_bank_about_the_first(baseline):
     assert change_rad[0] < 0 < change_rad[2]  # the bank moves away from what lies to port
 
 
-def test_curves_keep_the_range(baseline):
-    a, b = flat_banks()
-    offset_m = np.linspace(-2, 2, 13)
-    curves = Curves.over(baseline, GRID, offset_m)
-    assert curves.grid.shape[0] > GRID.shape[0] + 2 * 2 * 0.35 / 0.02
-    start_m = curves.grid.positions_m()[::40, ::30].reshape(-1, 3)
-    for index in (0, 6, 12):
-        points_m = curves.points_m(index)[::40, ::30].reshape(-1, 3)
-        assert points_m[:, 2] == pytest.approx(offset_m[index])
-        mean_m = [(ranges_m(a, each)[0] + ranges_m(b, each)[0]) / 2 for each in (start_m, points_m)]
-        assert np.abs(mean_m[1] - mean_m[0]).max() < 1e-3  # 1/25 of the range resolution
-
-
-def test_curves_through_pixels_pass_through_them(baseline):
-    offset_m = np.linspace(-1, 1, 7)
-    curves = Curves.over(baseline, GRID, offset_m)
-    for index in (0, 5):
-        rows, columns = curves.through(index, *(np.arange(float(n)) for n in GRID.shape))
-        places_m = curves.points_m(index)
-        near = np.rint(rows).astype(int), np.rint(columns).astype(int)
-        between = np.stack([rows, columns], axis=-1) - np.stack(near, axis=-1)
-        found_m = places_m[near][..., :2] + between[..., ::-1] * 0.02
-        assert found_m == pytest.approx(GRID.positions_m()[..., :2], abs=3e-4)
-
-
 def test_slopes_change_the_sensitivity(baseline):
     sights = sight_lattice(baseline, GRID, (-1, 1))
-    level, facing = sensitivity(GRID, np.zeros(GRID.shape), np.zeros((2, *GRID.shape)), sights)
+    view = View(GRID, sights, Window(9, 9), 20.0, 0.5, 2.06)
+    level, facing = sensitivity(view, np.zeros(GRID.shape), np.zeros((2, *GRID.shape)))
     assert facing == pytest.approx(1)
     slope_m = np.zeros((2, *GRID.shape))
     slope_m[0] = 0.5 * 0.02
-    steep, facing = sensitivity(GRID, np.zeros(GRID.shape), slope_m, sights)
+    steep, facing = sensitivity(view, np.zeros(GRID.shape), slope_m)
     # The depression at 32 m and an altitude of 12.06 m has a tangent of 0.377.
     assert facing[60, 40] == pytest.approx(1 - 0.5 * 0.377, abs=0.01)
     assert steep == pytest.approx(level / facing)

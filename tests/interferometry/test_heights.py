@@ -14,9 +14,9 @@ import clsas
 from clsas.engine import promise
 from clsas.engine.data.validate import ClsasWarning
 from clsas.engine.device.device import open_device
+from clsas.interferometry.checks import Request
 from clsas.interferometry.heights import heights, measure
 from clsas.interferometry.pair import Pair
-from clsas.interferometry.request import Request
 
 AMBIGUITY_M = 2.06  # 2 pi R/(k B): a wavelength of 15 mm, 34.2 m of range, 0.25 m between the banks
 WINDOW_M = 0.22

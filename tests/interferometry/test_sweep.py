@@ -3,7 +3,7 @@ import pytest
 
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.refinement import filled
-from clsas.interferometry.sweep import STEPS_PER_CYCLE, Sweep, likeliest
+from clsas.interferometry.sweep import STEPS_PER_CYCLE, likeliest, relief_of
 
 
 def volume(cycles, magnitude_at, shape=(20, 24), heights=31, random=None, noise=0.0):
@@ -53,27 +53,41 @@ def test_steps_of_one_and_a_half_cycles():
     assert found == pytest.approx(np.broadcast_to(step, found.shape), abs=0.6 / STEPS_PER_CYCLE)
 
 
-class Straight:
-    """Curves along columns, which pass a row further on for every 0.1 m of height."""
-
-    corner = (0, 0)
-    z_m = np.zeros((20, 6))
-    offset_m = 0.1 * np.arange(-10, 11)
-
-    def through(self, index, rows, columns):
-        return np.array(np.meshgrid(rows + index - 10, columns, indexing="ij"))
-
-
 @pytest.mark.parametrize(("drop_m", "seen"), [(0.3, True), (0.75, False), (1.2, False)])
 def test_no_pixel_lies_between_surfaces_that_a_cycle_separates(drop_m, seen):
     """The height of ambiguity is 1 m. Row 12 is below the edge in row 10, or on a steep slope."""
     height_m = np.where(np.arange(20) < 10, 0.0, -drop_m)[:, None] + np.zeros(6)
-    swept = Sweep(Straight(), height_m, np.ones((20, 6)), np.ones(21))
-    rows, columns = np.array([5.0, 12.0]), np.arange(6.0)
-    relief = swept.relief(rows, columns, np.ones((20, 6), bool), ambiguity_m=1.0)
-    assert relief.offset_m[0] == pytest.approx(0.0, abs=1e-9)
-    assert (relief.surfaces[0] == 1).all()
-    assert (relief.surfaces[1] == seen).all()
+    moved = np.stack([-10 * height_m, 0 * height_m])  # a row for every 0.1 m
+    relief = relief_of(moved, height_m, np.ones((20, 6), bool), ambiguity_m=1.0)
+    assert relief.height_m[5] == pytest.approx(0.0, abs=1e-9)
+    assert (relief.surfaces[5] == 1).all()
+    assert (relief.surfaces[12] == seen).all()
+
+
+def test_slopes_lie_where_the_curves_have_moved():
+    row = np.mgrid[:40, :30][0]
+    height_m = 0.02 * (row - 20)
+    moved = np.stack([10 * height_m, 0 * height_m + 2])
+    relief = relief_of(moved, height_m, np.ones(row.shape, bool), ambiguity_m=1.0)
+    # Row r lies on curve q with r = q + 0.2 (q - 20).
+    expected = 0.02 * ((row + 4) / 1.2 - 20)
+    assert relief.height_m[1:-1, 2:] == pytest.approx(expected[1:-1, 2:])
+    assert (relief.surfaces[1:-1, 2:-1] == 1).all()
+    assert (relief.surfaces[:, :2] == 0).all()
+
+
+def test_surfaces_at_the_same_ranges_are_counted():
+    """A wall brings its top to the rows before it, which the ground below shares with it."""
+    row = np.mgrid[:60, :4][0]
+    height_m = np.clip(0.1 * (row - 30), 0, 0.4)
+    reliable = np.ones(row.shape, bool)
+    relief = relief_of(np.stack([-30 * height_m, 0 * height_m]), height_m, reliable, 1.0)
+    assert (relief.surfaces[24:28] == 3).all()
+    assert relief.height_m[24:28].max() == pytest.approx(0.4)
+    assert (relief.surfaces[:18] == 1).all()
+    reliable[20:40] = False
+    hidden = relief_of(np.stack([-30 * height_m, 0 * height_m]), height_m, reliable, 1.0)
+    assert (hidden.surfaces[20:27] == 0).all()
 
 
 def test_unknown_pixels_take_the_nearest_value():

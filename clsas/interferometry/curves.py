@@ -1,0 +1,385 @@
+"""Curves of equal range, and the images of both banks along them.
+
+A scatterer keeps its range to the first bank and its position along the track while it rises along
+a curve: around a straight track, a circle. So the image of the first bank is the same at all
+heights along these curves. That of the second bank changes only because the range to its receivers
+does, and is its own image of a plane at another place: where the plane has the range of the point
+on the curve. One image of a plane per bank therefore shows both banks at any height.
+
+That holds for straight tracks. Deviations from one blur both images alike, the more, the farther a
+scatterer lies from the plane. They change neither coherence nor phase, but cost resolution along
+the track, by as much as `Curves.blur_m` states.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates, spline_filter1d
+
+from clsas.engine.data.fourier import phasors, turned
+from clsas.engine.data.grid import Grid, without_heights
+from clsas.interferometry.baseline import Baseline, Lattice, in_pixels
+from clsas.interferometry.coherence import Images
+from clsas.interferometry.pair import Pair
+
+_OVERSAMPLING = 2.0  # of the band across the track; cubic splines then err by -45 dB at its ends
+_LEVELS = 5  # heights of the lattice, which a polynomial connects
+_LEAST_POINTS, _MOST_POINTS = 9, 33  # of the lattice along either side
+_SPACING = 1 / 4  # of these points, in ranges
+_NEWTON = 6  # iterations; with 4, curves err by less than 1 µm
+_SEEN = 0.01  # least relative weight of a channel that counts for the band
+_SPACE = 3  # pixels beyond the outermost curve, for the taps of the interpolation
+_LEAST_SLOPE = 1e-3  # of a range, per metre; below the track it does not change
+_TURNS = 3  # iterations of the curve through a place of a relief
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Curves of equal range to the first bank, one through every pixel of a level plane.
+
+    Attributes
+    ----------
+    baseline : Baseline
+    grid : Grid
+        The level plane. Its rows run along the track. It extends beyond the places whose heights
+        are wanted, so that each of them lies on one of the curves at every height.
+    lattice : Lattice
+        At heights above the plane: by how many rows and columns a curve has moved, by how many rows
+        the image of the second bank is displaced, K (rad/m), and the blur (m), negative below.
+    """
+
+    baseline: Baseline
+    grid: Grid
+    lattice: Lattice
+
+    @classmethod
+    def over(
+        cls,
+        baseline: Baseline,
+        grid: Grid,
+        search_m: tuple[float, float],
+        steps_m: tuple[float, float],
+    ) -> Self:
+        """Return the curves that reach a plane or height map at the heights of a search.
+
+        Parameters
+        ----------
+        baseline : Baseline
+        grid : Grid
+        search_m : (lowest, highest)
+            Heights above the pixels of the grid.
+        steps_m : (across, along)
+            Distances of the curves across and along the track.
+        """
+        low_m, high_m = (float(each[2]) for each in grid.bounds_m)
+        z_m = np.linspace(low_m + search_m[0], high_m + search_m[1], _LEVELS)
+        level_m = float(np.clip((low_m + high_m) / 2, z_m[0], z_m[-1]))
+        places_m = without_heights(grid).spread(3)
+        places_m[:, 2] = level_m
+        middle_m = places_m.mean(axis=0)
+        along = (baseline.weights(middle_m[None]) @ baseline.along)[0] * [1, 1, 0]
+        along /= np.linalg.norm(along)
+        plane = Grid.oriented(
+            middle_m, steps_m[0] * np.cross([0, 0, 1], along), steps_m[1] * along, (2, 2),
+            georeference=grid.georeference,
+        )  # fmt: skip
+
+        # The rectangle in which curves through places of the grid pass the plane
+        rising = _traced(baseline, plane, places_m, z_m - level_m)[..., :2]
+        passed = in_pixels(plane, (places_m - middle_m)[:, :2])[:, None] - rising
+        first = np.floor(passed.min(axis=(0, 1))) - _SPACE
+        shape = np.ceil(passed.max(axis=(0, 1))).astype(int) + _SPACE + 1 - first.astype(int)
+        plane = replace(
+            plane,
+            origin_m=middle_m + first @ np.stack(plane.vectors_m[1:]),
+            shape=tuple(map(int, shape)),
+        )
+
+        antennas_m = baseline.a.phase_centres_m[baseline.channels]
+        away_m = np.linalg.norm(plane.spread(_LEAST_POINTS)[:, None] - antennas_m, axis=2)
+        counts = shape * steps_m / (_SPACING * float(away_m.min()))
+        rows, columns = (
+            np.unique(np.linspace(0, n - 1, min(n, int(count))).round())
+            for n, count in zip(shape, np.clip(counts, _LEAST_POINTS, _MOST_POINTS), strict=True)
+        )
+        points_m = plane.positions_m()[np.ix_(rows.astype(int), columns.astype(int))]
+        values = _traced(baseline, plane, points_m.reshape(-1, 3), z_m - level_m)
+        values = values.reshape(len(rows), len(columns), *values.shape[1:])
+        return cls(baseline, plane, Lattice(rows, columns, z_m - level_m, values))
+
+    @property
+    def sights(self) -> Lattice:
+        """K along the curves, on which scatterers do not move: the tangent is 0."""
+        return replace(self.lattice, values=self.lattice.values[..., 3:4] * [1, 0, 0])
+
+    @property
+    def level_m(self) -> float:
+        """The z of the plane."""
+        return float(self.grid.vectors_m[0][2])
+
+    def every(self, rows: int, columns: int) -> Self:
+        """Return some of the curves: those of every so many rows and columns."""
+        values = self.lattice.values / [rows, columns, rows, 1, 1]
+        lattice = Lattice(
+            self.lattice.rows / rows, self.lattice.columns / columns, self.lattice.offset_m, values
+        )
+        grid = self.grid.window(slice(None, None, rows), slice(None, None, columns))
+        return replace(self, grid=grid, lattice=lattice)
+
+    def _over_all(self, height_m: NDArray[np.float64] | float, some: slice) -> NDArray[np.float64]:
+        """Return some values of the lattice at heights of all curves, [values, rows, columns]."""
+        lattice = replace(self.lattice, values=self.lattice.values[..., some])
+        return lattice.over(*map(np.arange, self.grid.shape), height_m)
+
+    def moved(self, height_m: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Return by how many rows and columns the curves have moved, [2, rows, columns]."""
+        return self._over_all(height_m, slice(0, 2))
+
+    def displaced(self, height_m: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Return by how many rows the image of the second bank is displaced, [rows, columns]."""
+        return self._over_all(height_m, slice(2, 3))[0]
+
+    def rad_m(self, height_m: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Return K, rad/m, [rows, columns]."""
+        return self._over_all(height_m, slice(3, 4))[0]
+
+    def points_m(self, height_m: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Return the positions of all curves at heights above the plane, [rows, columns, 3]."""
+        _, row_step_m, column_step_m = self.grid.vectors_m
+        down, across = self.moved(height_m)
+        points_m = self.grid.positions_m()
+        points_m += down[..., None] * row_step_m + across[..., None] * column_step_m
+        points_m[..., 2] += height_m
+        return points_m
+
+    def start_m(self, start: Grid) -> NDArray[np.float64]:
+        """Return how high above the plane the curves pass through a plane or height map."""
+        origin_m, row_step_m, column_step_m = start.vectors_m
+        height_m = np.zeros(self.grid.shape)
+        for _ in range(_TURNS):
+            places_m = self.points_m(height_m)[..., :2] - origin_m[:2]
+            row, column = np.moveaxis(in_pixels(start, places_m), -1, 0)
+            height_m = origin_m[2] - self.level_m + row * row_step_m[2] + column * column_step_m[2]
+            if start.height_m is not None:
+                height_m += map_coordinates(start.height_m, [row, column], order=1, mode="nearest")
+        return height_m
+
+    def blur_m(self, height_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return by how much the track's deviations blur images of the plane, [rows, columns].
+
+        This is the rms shift along the track by which the images of single channels, each from a
+        direction of its own, differ at these heights.
+        """
+        return np.abs(self._over_all(height_m, slice(4, 5))[0])
+
+
+def spacing_m(baseline: Baseline, plane: Grid, relative_band: float) -> float:
+    """Return how close curves must be to sample images across the track, metres.
+
+    Images contain the band, as far as the range changes across the track, for channels in all
+    directions.
+    """
+    points_m = plane.spread(3)
+    weights = baseline.weights(points_m)
+    away_m = points_m[:, None] - baseline.a.phase_centres_m[baseline.channels]
+    along_m = np.einsum("pci,pi->pc", away_m, weights @ baseline.along)
+    level_m = np.linalg.norm(away_m[..., :2], axis=2)
+    steepness = np.sqrt(np.maximum(level_m**2 - along_m**2, 0)) / np.linalg.norm(away_m, axis=2)
+    seen = weights > _SEEN * weights.max(axis=1, keepdims=True)
+    steepest = np.where(seen, steepness, 0).max(axis=1)
+    span = steepest - np.where(seen, steepness, 1).min(axis=1)
+    cycles_per_m = abs(baseline.rad_per_m) / (2 * np.pi)
+    return 1 / (_OVERSAMPLING * cycles_per_m * float(np.max(relative_band * steepest + span)))
+
+
+def _traced(
+    baseline: Baseline, plane: Grid, points_m: NDArray[np.float64], heights_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the values of a lattice at points of a level plane, [points, heights, 5].
+
+    Ranges are means over the channels, weighted as the point of the plane sees them.
+    """
+    shape = len(points_m), len(heights_m)
+    channels = baseline.channels
+    first, second = (
+        (each.tx_m[channels], each.rx_m[channels]) for each in (baseline.a, baseline.b)
+    )
+    weights = np.repeat(baseline.weights(points_m), shape[1], axis=0)
+    along = weights @ baseline.along
+    level = along * [1, 1, 0] / np.linalg.norm(along[:, :2], axis=1, keepdims=True)
+    across = np.cross([0.0, 0.0, 1.0], level)
+    pitch = along[:, 2] / np.linalg.norm(along[:, :2], axis=1)
+    start_m, height_m = np.repeat(points_m, shape[1], axis=0), np.tile(heights_m, shape[0])
+    risen_m = height_m[:, None] * ([0.0, 0.0, 1.0] - pitch[:, None] * level)
+
+    of_start = _ranges_m(start_m, first)
+    moved_m = _slid_m(start_m + risen_m, across, first, weights, _mean(weights, of_start))
+    end_m = start_m + risen_m + moved_m[:, None] * across
+    range_m = _mean(weights, _ranges_m(end_m, second))
+    displaced_m = _slid_m(start_m, across, second, weights, range_m)
+    rad_m = -baseline.rad_per_m * np.gradient(range_m.reshape(shape), heights_m, axis=1)
+
+    # What a shift along the track changes from channel to channel is its part of their direction.
+    left_m = np.diff(_ranges_m(end_m, first) - of_start, axis=1)
+    centres_m = baseline.a.phase_centres_m[channels]
+    sight = np.einsum("nci,ni->nc", start_m[:, None] - centres_m, level)
+    turned = np.diff(sight / of_start, axis=1)
+    seen = weights[:, 1:]
+    blur_m = np.sqrt((seen * left_m**2).sum(axis=1) / (seen * turned**2).sum(axis=1))
+
+    pixels = [
+        in_pixels(plane, each[:, :2]) for each in (end_m - start_m, displaced_m[:, None] * across)
+    ]
+    return np.concatenate(
+        [
+            pixels[0], pixels[1][:, :1], rad_m.reshape(-1, 1),
+            (np.sign(height_m) * blur_m)[:, None],
+        ],
+        axis=1,
+    ).reshape(*shape, 5)  # fmt: skip
+
+
+Antennas = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def _ranges_m(points_m: NDArray[np.float64], antennas: Antennas) -> NDArray[np.float64]:
+    """Return the ranges of points from transmitters and receivers, [points, channels]."""
+    return sum(np.linalg.norm(points_m[:, None] - each_m, axis=2) for each_m in antennas) / 2
+
+
+def _mean(weights: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.einsum("nc,nc->n", weights, values)
+
+
+def _slid_m(
+    from_m: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    antennas: Antennas,
+    weights: NDArray[np.float64],
+    range_m: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return how far along a direction points have a mean range, metres, [points]."""
+    paths = []
+    for antenna_m in antennas:
+        away_m = from_m[:, None] - antenna_m
+        squared, along_m = (
+            np.einsum(sums, away_m, each)
+            for sums, each in (("nci,nci->nc", away_m), ("nci,ni->nc", direction))
+        )
+        paths.append((squared, along_m))
+    moved_m = np.zeros(len(from_m))
+    for _ in range(_NEWTON):
+        mean_m, slope = np.zeros((2, len(from_m)))
+        for squared, along_m in paths:
+            to_m = along_m + moved_m[:, None]
+            away_m = np.sqrt(squared + moved_m[:, None] * (along_m + to_m))
+            mean_m += _mean(weights, away_m) / 2
+            slope += _mean(weights, to_m / away_m) / 2
+        moved_m += (range_m - mean_m) / np.where(np.abs(slope) > _LEAST_SLOPE, slope, np.inf)
+    return moved_m
+
+
+@dataclass(frozen=True, eq=False)
+class CurveImages:
+    """Images of both banks along curves of equal range, which show them at any height.
+
+    Attributes
+    ----------
+    curves : Curves
+        The curves on which `at` returns images.
+    first : complex64 [rows, columns]
+        Image of the first bank on these, without the phase of the range.
+    second : complex64 [fine rows, columns]
+        Coefficients of a cubic spline across the track: image of the second bank on more curves,
+        without that phase.
+    every : int
+        Rows of `second` per row of `first`.
+    phase_rad : float64 [fine rows]
+        The phase that was taken out.
+    formed : float64 [rows, columns]
+        Rows by which the image of the second bank is displaced at the heights where it was formed.
+    """
+
+    curves: Curves
+    first: NDArray[np.complex64]
+    second: NDArray[np.complex64]
+    every: int
+    phase_rad: NDArray[np.float64]
+    formed: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls, pair: Pair, fine: Curves, every: int, height_m: NDArray[np.float64] | None = None
+    ) -> Self:
+        """Form the images.
+
+        Parameters
+        ----------
+        pair : Pair
+        fine : Curves
+            Curves as close as the band requires.
+        every : int
+            Rows of them per row of the images.
+        height_m : float64, broadcast to [fine rows, columns], optional
+            Heights above the plane at which to form them. By default they are formed on the plane.
+        """
+        plane = fine.grid
+        grid, formed = plane, np.zeros(plane.shape)
+        if height_m is not None:
+            grid = Grid.points(fine.points_m(height_m), georeference=plane.georeference)
+            formed = fine.displaced(height_m)
+        first, second = pair.images(grid)
+
+        # Without the phase of the range, images are smooth from row to row.
+        along_m = plane.vectors_m[2]
+        away_m = plane.positions_m()[:, 0] - fine.baseline.a.phase_centres_m.mean(axis=0)
+        range_m = np.linalg.norm(np.cross(away_m, along_m / np.linalg.norm(along_m)), axis=1)
+        phase_rad = fine.baseline.rad_per_m * range_m
+        smooth = second * turned(-phase_rad / (2 * np.pi))[:, None]
+        phase_rad += np.angle(np.vdot(smooth[:-1], smooth[1:])) * np.arange(len(phase_rad))
+        back = turned(-phase_rad / (2 * np.pi)).astype(np.complex64)[:, None]
+        return cls(
+            fine.every(every, 1),
+            (first * back)[::every],
+            spline_filter1d(second * back, axis=0, output=np.complex64),
+            every,
+            phase_rad,
+            formed[::every],
+        )
+
+    def few(self, step: int) -> Self:
+        """Return the images on every so many rows and columns."""
+        some = slice(None, None, step)
+        return replace(
+            self,
+            curves=self.curves.every(step, step),
+            first=self.first[some, some],
+            second=self.second[:, some],
+            every=self.every * step,
+            formed=self.formed[some, some],
+        )
+
+    def at(self, height_m: NDArray[np.float64] | float) -> Images:
+        """Return the images at heights above the plane, without a phase that both share."""
+        moved = self.every * self.curves.displaced(height_m) - self.formed
+        row = self.every * np.arange(len(self.first))[:, None]
+        rate, bend = (
+            each[row]
+            for each in (np.gradient(self.phase_rad), np.gradient(np.gradient(self.phase_rad)))
+        )
+        before = np.floor(row + moved).astype(np.intp)
+        t = (row + moved - before).astype(np.float32)
+        left, right = (1 - t) ** 3 / 6, t**3 / 6
+        middle = 2 / 3 - t**2 + t**3 / 2
+        found = np.zeros_like(self.first)
+        for tap, weight in zip(
+            range(-1, 3), (left, middle, 1 - left - middle - right, right), strict=True
+        ):
+            at = np.clip(before + tap, 0, len(self.second) - 1)
+            found += weight * np.take_along_axis(self.second, at, axis=0)
+        found *= phasors((moved * (rate + moved * bend / 2)).astype(np.float32))
+        return self.first, found
