@@ -25,7 +25,7 @@ from scipy.interpolate import RegularGridInterpolator, make_interp_spline
 
 from clsas.engine.data.beam import BeamWindow, track_directions
 from clsas.engine.data.geometry import unit_vectors
-from clsas.engine.data.grid import Grid, without_heights
+from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, some_channels, wavelength_m
 from clsas.measures.elevation import Sight, sight_along
 
@@ -70,15 +70,21 @@ class Baseline:
         return Sight(*(np.concatenate(each) for each in zip(*found, strict=True)))
 
     def _sight(self, points_m: NDArray[np.float64]) -> Sight:
-        weight = self.weights(points_m)
-        difference, mean = self._gradients(points_m, weight)
-        return sight_along(weight @ self.along, mean, difference, self.rad_per_m)
+        of_a, of_b = self.gradients(points_m)
+        return sight_along(self.weights(points_m) @ self.along, of_a, of_a - of_b, self.rad_per_m)
 
     def gradients(
         self, points_m: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the gradients of the difference and of the mean of the ranges, [points, 3]."""
-        return self._gradients(points_m, self.weights(points_m))
+        """Return the gradients of the ranges to both banks, float64 [points, 3] each."""
+        weight = self.weights(points_m)
+
+        def towards(antennas_m: NDArray[np.float64]) -> NDArray[np.float64]:
+            sight = unit_vectors(points_m[:, None] - antennas_m[self.channels])
+            return np.einsum("pc,pci->pi", weight, sight)
+
+        of_a, of_b = ((towards(lines.tx_m) + towards(lines.rx_m)) / 2 for lines in (self.a, self.b))
+        return of_a, of_b
 
     def rad_per_roll(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the phase of b per radian by which b is turned about a, rad, [points].
@@ -106,16 +112,6 @@ class Baseline:
         weight = self.beam.weights(sine, wavelength_m(self.a))
         total = weight.sum(axis=1, keepdims=True)
         return np.where(total > 0, weight, 1) / np.where(total > 0, total, weight.shape[1])
-
-    def _gradients(
-        self, points_m: NDArray[np.float64], weight: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        def towards(antennas_m: NDArray[np.float64]) -> NDArray[np.float64]:
-            sight = unit_vectors(points_m[:, None] - antennas_m[self.channels])
-            return np.einsum("pc,pci->pi", weight, sight)
-
-        of_a, of_b = ((towards(lines.tx_m) + towards(lines.rx_m)) / 2 for lines in (self.a, self.b))
-        return of_a - of_b, (of_a + of_b) / 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,36 +188,38 @@ def _splines(places: NDArray, known: NDArray[np.float64]) -> NDArray[np.float64]
     return np.asarray(spline(np.clip(places, known[0], known[-1])))
 
 
-def lattice_pixels(grid: Grid) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows and columns of a lattice over a grid."""
-    rows, columns = (
-        np.unique(np.linspace(0, n - 1, min(_LATTICE, n)).round().astype(int)) for n in grid.shape
-    )
-    return rows, columns
+def sight_lattice(
+    baseline: Baseline,
+    plane: Grid,
+    span_m: tuple[float, float],
+    counts: tuple[int, int, int] = (_LATTICE, _LATTICE, _LEVELS),
+) -> Lattice:
+    """Return how the banks see places above a plane.
 
+    The quantities are K (rad/m), the tangent, in rows and columns per metre of rise, and the phase
+    per radian of roll.
 
-def levels_m(grid: Grid) -> NDArray[np.float64]:
-    """Return a few heights above a grid's plane, from its lowest pixel to its highest one."""
-    if grid.height_m is None:
-        return np.zeros(1)
-    return np.unique(np.linspace(grid.height_m.min(), grid.height_m.max(), _LEVELS))
-
-
-def sight_lattice(baseline: Baseline, grid: Grid, search_m: tuple[float, float]) -> Lattice:
-    """Return K (rad/m) and the tangent, in rows and columns per metre of rise, above a plane.
-
-    They extend over the heights of `search_m` above all pixels of the grid.
+    Parameters
+    ----------
+    baseline : Baseline
+    plane : Grid
+    span_m : (lowest, highest)
+        Heights above the plane.
+    counts : (rows, columns, levels)
+        Points of the lattice along every axis.
     """
-    rows, columns = lattice_pixels(grid)
-    above_m = levels_m(grid)
-    offset_m = np.linspace(above_m[0] + search_m[0], above_m[-1] + search_m[1], _LEVELS)
-    grid = without_heights(grid)
-    points_m = grid.positions_m()[np.ix_(rows, columns)][..., None, :]
-    points_m = points_m + offset_m[:, None] * np.array([0.0, 0.0, 1.0])
-    sight = baseline.sight(points_m.reshape(-1, 3))
-    values = np.column_stack([sight.rad_m, in_pixels(grid, sight.tangent)])
-    shape = (len(rows), len(columns), len(offset_m), 3)
-    return Lattice(rows.astype(float), columns.astype(float), offset_m, values.reshape(shape))
+    rows, columns = (
+        np.unique(np.linspace(0, n - 1, min(count, n)).round())
+        for n, count in zip(plane.shape, counts, strict=False)
+    )
+    offset_m = np.linspace(*span_m, counts[2])
+    points_m = plane.positions_m()[np.ix_(rows.astype(int), columns.astype(int))][..., None, :]
+    points_m = (points_m + offset_m[:, None] * [0.0, 0.0, 1.0]).reshape(-1, 3)
+    sight, roll = baseline.sight(points_m), baseline.rad_per_roll(points_m)
+    values = np.column_stack([sight.rad_m, in_pixels(plane, sight.tangent), roll])
+    return Lattice(
+        rows, columns, offset_m, values.reshape(len(rows), len(columns), len(offset_m), 4)
+    )
 
 
 def in_pixels(grid: Grid, horizontal_m: NDArray[np.float64]) -> NDArray[np.float64]:

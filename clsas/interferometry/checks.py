@@ -259,9 +259,9 @@ def _check_decorrelation(
     the mean of the ranges. Only the part of the band that both banks share is coherent (Gatelli et
     al. 1994).
     """
-    difference, mean = baseline.gradients(points_m)
-    of_ground = np.linalg.norm(mean[:, :2], axis=1)
-    shift = np.median(np.linalg.norm(difference[:, :2], axis=1) / np.maximum(of_ground, 1e-9))
+    of_a, of_b = (each[:, :2] for each in baseline.gradients(points_m))
+    of_ground = np.linalg.norm(of_a + of_b, axis=1) / 2
+    shift = np.median(np.linalg.norm(of_a - of_b, axis=1) / np.maximum(of_ground, 1e-9))
     left = 1 - float(shift) / relative_band
     if left < least_coherence:
         apart_m = float(np.median(np.linalg.norm(_separation_m(baseline), axis=1)))

@@ -40,6 +40,7 @@ LEAST_LOOKS = 4.0
 # have one slope, because slopes change the spatial frequency of the speckle. Tiles of one window
 # measure the longest lags from one pair of pixels.
 _TILE = 2
+_MOST_TILES = 256  # spread over an image; they measure the looks to better than 1 %
 
 
 @dataclass(frozen=True)
@@ -168,10 +169,11 @@ def _correlated_area(
 
 
 def _tiles(image: NDArray, rows: int, columns: int) -> NDArray[np.complex64]:
-    """Return the whole tiles that fit into an image, [tiles, rows, columns]."""
+    """Return whole tiles that fit into an image, [tiles, rows, columns]."""
     down, across = image.shape[0] // rows, image.shape[1] // columns
     whole = image[: down * rows, : across * columns].reshape(down, rows, across, columns)
-    return whole.swapaxes(1, 2).reshape(-1, rows, columns)
+    some = np.unique(np.linspace(0, down * across - 1, min(down * across, _MOST_TILES)).round())
+    return whole.swapaxes(1, 2)[np.unravel_index(some.astype(int), (down, across))]
 
 
 def debiased(coherence: NDArray, looks: NDArray | float) -> NDArray[np.float64]:

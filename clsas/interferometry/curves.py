@@ -132,8 +132,9 @@ class Curves:
 
     def _over_all(self, height_m: NDArray[np.float64] | float, some: slice) -> NDArray[np.float64]:
         """Return some values of the lattice at heights of all curves, [values, rows, columns]."""
+        rows, columns = map(np.arange, self.grid.shape)
         lattice = replace(self.lattice, values=self.lattice.values[..., some])
-        return lattice.over(*map(np.arange, self.grid.shape), height_m)
+        return lattice.over(rows, columns, height_m)
 
     def moved(self, height_m: NDArray[np.float64] | float) -> NDArray[np.float64]:
         """Return by how many rows and columns the curves have moved, [2, rows, columns]."""

@@ -9,7 +9,7 @@ height at a place is therefore that found at the place plus t e, minus e.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -18,7 +18,7 @@ from scipy.ndimage import map_coordinates
 
 from clsas.engine.data.grid import Grid, without_heights
 from clsas.engine.signal.spectrum import middle_cycles_per_m
-from clsas.interferometry.baseline import Baseline, Lattice, in_pixels
+from clsas.interferometry.baseline import Baseline, Lattice, in_pixels, sight_lattice
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.result import Heights
@@ -30,7 +30,6 @@ _STEPS = 3  # to the middle of the curve; more change displacements of 2 m by le
 # 1 mrad where heights are displaced by one and a half heights of ambiguity.
 _SPACING = 1 / 50
 _MOST_POINTS = 65  # along each axis of the lattice, for the time that they take
-_POINTS_AT_ONCE = 64
 _ENDS = 33  # points along either side, among which the nearest and the farthest are found
 _MOST_CYCLES = 3.0  # heights of ambiguity by which heights may be displaced; arbitrary
 
@@ -91,7 +90,15 @@ class Displaced:
         level_m = plane.spread(_ENDS) + float(np.median(known_m)) * _UP
         antennas_m = straight.a.phase_centres_m[baseline.channels]
         range_m = np.linalg.norm(level_m[:, None] - antennas_m, axis=2).min(axis=1)
-        lattice = _lattice(baseline, plane, span_m, _SPACING * float(range_m.min()))
+        sides_m = [
+            n * float(np.linalg.norm(step))
+            for n, step in zip(plane.shape, plane.vectors_m[1:], strict=True)
+        ]
+        rows, columns, levels = (
+            min(math.ceil(side_m / (_SPACING * float(range_m.min()))) + 2, _MOST_POINTS)
+            for side_m in (*sides_m, span_m[1] - span_m[0])
+        )
+        lattice = sight_lattice(baseline, plane, span_m, (rows, columns, levels))
         rad_m, rolled = baseline.sight(level_m).rad_m, baseline.rad_per_roll(level_m)
         near, far = (
             Elevation(float(range_m[n]), float(rad_m[n]), float(rolled[n]))
@@ -159,34 +166,6 @@ def _smooth_m_per_rad(found: Heights, plane: Grid) -> NDArray[np.float64]:
     sums = window.sums(np.where(found.mask, found.m_per_rad, 0.0))
     valid = window.sums(found.mask.astype(np.float64))
     return np.divide(sums, valid, out=np.zeros_like(sums), where=valid > 0.5)
-
-
-def _lattice(
-    baseline: Baseline, plane: Grid, span_m: tuple[float, float], spacing_m: float
-) -> Lattice:
-    """Return K, the tangent in rows and columns, and the phase per radian of roll above a plane.
-
-    The curves are those on which the range of the first bank is constant, which has no errors.
-    """
-
-    def count(length_m: float) -> int:
-        return min(math.ceil(length_m / spacing_m) + 2, _MOST_POINTS)
-
-    rows, columns = (
-        np.unique(np.linspace(0, n - 1, count(n * float(np.linalg.norm(step_m)))).round())
-        for n, step_m in zip(plane.shape, plane.vectors_m[1:], strict=True)
-    )
-    offset_m = np.linspace(*span_m, count(span_m[1] - span_m[0]))
-    at = np.ix_(rows.astype(int), columns.astype(int))
-    raised_m = plane.positions_m()[at][..., None, :] + offset_m[:, None] * _UP
-    points_m = raised_m.reshape(-1, 3)
-    tangent = replace(baseline, b=baseline.a).sight(points_m).tangent
-    parts = np.array_split(points_m, len(points_m) // _POINTS_AT_ONCE + 1)
-    gradient = np.concatenate([baseline.gradients(some_m)[0] for some_m in parts])
-    rad_m = baseline.rad_per_m * np.einsum("pi,pi->p", gradient[:, :2], tangent)
-    rad_m += baseline.rad_per_m * gradient[:, 2]
-    values = np.column_stack([rad_m, in_pixels(plane, tangent), baseline.rad_per_roll(points_m)])
-    return Lattice(rows, columns, offset_m, values.reshape(*raised_m.shape[:-1], 4))
 
 
 class Elevation(NamedTuple):

@@ -276,21 +276,25 @@ def measured(
     report = progress or (lambda done, total: None)
     relief_m, known, doubts = _first_relief(task, offset_m, lambda done: report(done, total))
 
-    plane, formed, seconds = without_heights(grid), list[Image](), list[float]()
+    plane = without_heights(grid)
+    last: list[tuple[Image, Image, float]] = []
 
     def images_at(relief_m: NDArray[np.float64]) -> Images:
         on_relief, started = plane.with_height(relief_m), time.perf_counter()
-        formed[:] = [pair.image(bank, on_relief) for bank in (pair.a, pair.b)]
-        seconds[:] = [time.perf_counter() - started]
-        return formed[0].pixels, formed[1].pixels
+        first, second = (pair.image(bank, on_relief) for bank in (pair.a, pair.b))
+        last[:] = [(first, second, time.perf_counter() - started)]
+        return first.pixels, second.pixels
 
-    sights = sight_lattice(task.baseline, grid, request.search_m)
+    start_m = np.zeros(1) if grid.height_m is None else grid.height_m
+    span_m = start_m.min() + request.search_m[0], start_m.max() + request.search_m[1]
+    sights = sight_lattice(task.baseline, plane, span_m)
     view = View(plane, sights, task.window, task.looks, request.least_coherence, task.ambiguity_m)
     refined = refine(
         images_at, relief_m, known, view, lambda done: report(len(offset_m) + done, total)
     )
     report(total, total)
-    power = np.abs(formed[0].pixels.astype(np.complex128)) ** 2
+    first, second, seconds = last[0]
+    power = np.abs(first.pixels.astype(np.complex128)) ** 2
     response = point_response(task.straight, task.level)
     valid = refined.valid & ~from_elsewhere(power, response, task.window)
     hidden = in_shadow(plane, refined.offset_m, refined.sd_m, valid, sights, task.window)
@@ -301,9 +305,9 @@ def measured(
         valid & ~hidden,
         refined.looks,
         refined.m_per_rad,
-        formed[0],
+        first,
         task.window_m,
-        pair.certificate(*formed, *seconds),
+        pair.certificate(first, second, seconds),
     )
     return Measured(found, refined, sights, doubts)
 

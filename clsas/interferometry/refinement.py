@@ -201,7 +201,7 @@ def sensitivity(
     """
     _, row_step_m, column_step_m = view.grid.vectors_m
     rows, columns = map(np.arange, view.grid.shape)
-    rad_m, row_tangent, column_tangent = view.sights.over(rows, columns, offset_m)
+    rad_m, row_tangent, column_tangent = view.sights.over(rows, columns, offset_m)[:3]
     facing = 1 - (slope_m[0] + row_step_m[2]) * row_tangent
     facing -= (slope_m[1] + column_step_m[2]) * column_tangent
     return rad_m / np.maximum(facing, _LEAST_FORESHORTENING), facing

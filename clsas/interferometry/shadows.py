@@ -170,14 +170,14 @@ class ReliefPart:
             )
         )
         local = np.ix_(rows - self.corner[0], columns - self.corner[1])
-        tangent = self.sights.over(local[0].ravel(), local[1].ravel(), self.offset_m[local])[1:]
+        tangent = self.sights.over(local[0].ravel(), local[1].ravel(), self.offset_m[local])[1:3]
         # Most windows are not even hidden if their lowest pixel sees the highest roof around.
         of_rows, of_columns = (np.unique(each // self.every) for each in (rows, columns))
         first = np.ix_(
             of_rows * self.every - self.corner[0], of_columns * self.every - self.corner[1]
         )
         blocks = np.stack(np.meshgrid(of_rows, of_columns, indexing="ij")).reshape(2, -1)
-        of_blocks = self.sights.over(first[0].ravel(), first[1].ravel(), self.offset_m[first])[1:]
+        of_blocks = self.sights.over(first[0].ravel(), first[1].ravel(), self.offset_m[first])[1:3]
         may_be = self._below(
             coarse, blocks, self.lowest_m[first].ravel(), of_blocks.reshape(2, -1), self.every
         ).reshape(len(of_rows), len(of_columns))

@@ -16,6 +16,7 @@ from elsewhere. Heights are not valid where that is most of the power in the win
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -29,6 +30,7 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, antennas_of, wavelength_m
 from clsas.engine.data.pings import channels_per_ping
 from clsas.engine.data.system import element_pattern
+from clsas.engine.data.threads import cores
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.pair import Pair
@@ -66,9 +68,13 @@ def from_elsewhere(
         return np.zeros(power.shape, bool)
     beyond = response / own
     beyond[inside] = 0.0
-    from scipy.signal import fftconvolve  # slow to import
-
-    received = window.sums(fftconvolve(power, beyond, mode="same"))
+    size = [fft.next_fast_len(2 * n - 1, real=True) for n in power.shape]
+    spectra = (
+        fft.rfft2(each.astype(np.float32), size, workers=cores()) for each in (power, beyond)
+    )
+    everywhere = fft.irfft2(math.prod(spectra), size, workers=cores())
+    rows, columns = power.shape
+    received = window.sums(everywhere[row : row + rows, column : column + columns])
     found: NDArray[np.bool_] = received > _MOST_FROM_ELSEWHERE * window.sums(power)
     return found
 

@@ -51,7 +51,7 @@ def of_shadows(
     valid = ~np.isnan(offset_m)
     z_m = without_heights(grid).positions_m()[..., 2] + offset_m
     # Tangents are rounded to some digits of the largest one.
-    tangent = sights.values[..., 1:]
+    tangent = sights.values[..., 1:3]
     largest = float(np.abs(tangent).max(initial=0.0))
     decimals = _DIGITS - int(np.ceil(np.log10(largest))) if largest else 0
     return {

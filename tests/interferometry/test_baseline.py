@@ -26,12 +26,12 @@ def ranges_m(lines, points_m):
     return mean(points_m), (mean(points_m + step) - mean(points_m - step)) / 2e-4
 
 
-def raised(lines_a, lines_b, point_m, height_m):
-    """The place at a height with the mean range and the mean Doppler of a point."""
+def raised(lines, point_m, height_m):
+    """The place at a height with the range and the Doppler of a point."""
 
     def of(at_m):
-        a, b = (ranges_m(each, at_m[None]) for each in (lines_a, lines_b))
-        return np.array([(a[0] + b[0])[0], 10 * (a[1] + b[1])[0]]) / 2
+        range_m, slope = ranges_m(lines, at_m[None])
+        return np.array([range_m[0], 10 * slope[0]])
 
     wanted = of(point_m)
     xy = least_squares(
@@ -48,7 +48,7 @@ def baseline():
 def test_phase_changes_along_curves_of_equal_range(baseline):
     a, b = flat_banks()
     for point_m in np.array([[0.0, 32.0, 0.0], [0.7, 31.0, 0.5]]):
-        above_m = raised(a, b, point_m, point_m[2] + 0.05)
+        above_m = raised(a, point_m, point_m[2] + 0.05)
         sight = baseline.sight(point_m[None])
         assert (above_m - point_m)[:2] / 0.05 == pytest.approx(sight.tangent[0], abs=2e-3)
         apart_m = [ranges_m(a, each[None])[0] - ranges_m(b, each[None])[0] for each in
