@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
@@ -18,9 +19,8 @@ from clsas.engine.device.device import Device, open_device
 from clsas.engine.factorized.planner import TOLERANCE
 from clsas.engine.signal.spectrum import middle_cycles_per_m
 from clsas.interferometry.checks import HEIGHTS_TOLERANCE_DB, KNOWN_HEIGHT, check_pair
-from clsas.interferometry.comparisons import Comparison, at_pixels, at_points, in_overlap
-from clsas.interferometry.displaced import Displaced
-from clsas.interferometry.estimate import MOST_SD_RAD, Estimate, estimated
+from clsas.interferometry.comparisons import Comparison, Displaced, at_pixels, at_points, in_overlap
+from clsas.interferometry.error_fit import Equations, Fit, fitted
 from clsas.interferometry.misregistration import ConstantPhase, constant_phase
 from clsas.interferometry.pair import Pair
 from clsas.interferometry.pair_errors_result import UNKNOWNS, PairErrors
@@ -29,6 +29,11 @@ from clsas.interferometry.result import Heights
 _MRAD = 1e-3
 # Deviations by which heights may differ from expected ones without a warning; dunes reach 2.
 _MOST_MISFIT = 5.0
+# Largest standard deviation of an error that is observable, as a phase: a plain choice.
+_MOST_SD_RAD = 0.5
+# Deviation of an error relative to what it would be if the others were known. The errors of the
+# model, some milliradians that vary over the swath, grow by as much.
+_MOST_AMPLIFICATION = 30.0
 _UNLIKE = 5.0  # ratio of sensitivities that no slope of the seabed explains
 
 
@@ -200,7 +205,7 @@ def pair_errors(
     else:
         assert known_height_m is not None
         comparison = at_pixels(surfaces[0], known_height_m, known_sd_m)
-    estimate = estimated(comparison, names, used[0])
+    estimate = _estimated(comparison, names, used[0])
     constant = None
     if {"phase", "delay"} <= set(names) and 0 in estimate.columns:
         constant = _mean_phase(
@@ -270,6 +275,102 @@ def _check_belongs(surface: Displaced, name: str) -> None:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class _Estimate:
+    """A phase, a roll or both.
+
+    Attributes
+    ----------
+    columns : list of int
+        Which were estimated: 0 for the phase, 1 for the roll.
+    values, covariance : float64 [2], [2, 2]
+        Both errors, 0 where they were not estimated.
+    absorbed : float
+        Phase that an estimate of the phase alone would absorb per radian of roll.
+    fit : Fit
+    """
+
+    columns: list[int]
+    values: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    absorbed: float
+    fit: Fit
+
+
+def _estimated(comparison: Comparison, unknowns: tuple[str, ...], given: str) -> _Estimate:
+    """Return the errors of phase and roll; those that are not observable are left out."""
+    columns = list(dict.fromkeys(int(name == "roll") for name in unknowns))
+    while True:
+        fit = _fit(comparison, columns)
+        if fit is None:
+            raise _incomparable(comparison, given)
+        if _is_observable(fit.covariance, columns, comparison.roll_rad):
+            break
+        if len(columns) == 1:
+            raise _unobservable(fit, unknowns, columns[0], comparison)
+        columns = columns[:-1]
+    both = comparison.equations_at(_embedded(fit.values, columns))
+    phase, roll = (both.per_unknown_m[fit.used] / both.sd_m[fit.used, None]).T
+    absorbed = float(phase @ roll / (phase @ phase)) if 0 in columns else 0.0
+    spread = np.eye(2)[:, columns]
+    return _Estimate(
+        columns, spread @ fit.values, spread @ fit.covariance @ spread.T, absorbed, fit
+    )
+
+
+def _fit(comparison: Comparison, columns: list[int]) -> Fit | None:
+    def equations_at(values: NDArray[np.float64]) -> Equations:
+        full = comparison.equations_at(_embedded(values, columns))
+        return full._replace(per_unknown_m=full.per_unknown_m[:, columns])
+
+    return fitted(equations_at, len(columns), comparison.places)
+
+
+def _embedded(values: NDArray[np.float64], columns: list[int]) -> NDArray[np.float64]:
+    full = np.zeros(2)
+    full[columns] = values
+    return full
+
+
+def _is_observable(covariance: NDArray[np.float64], columns: list[int], roll_rad: float) -> bool:
+    """Return whether all estimates are accurate, and not because errors of several cancel."""
+    if not np.isfinite(covariance).all():
+        return False
+    scale = np.array([1.0, roll_rad])[columns]
+    sd_rad = scale * np.sqrt(np.diag(covariance))
+    amplification = np.sqrt(np.diag(covariance) * np.diag(np.linalg.inv(covariance)))
+    return bool((sd_rad <= _MOST_SD_RAD).all() and (amplification <= _MOST_AMPLIFICATION).all())
+
+
+def _incomparable(comparison: Comparison, given: str) -> ArgumentError:
+    equations = comparison.equations_at(np.zeros(2))
+    some = equations.usable
+    if not some.any():
+        allowed = "share places with the valid heights"
+        return ArgumentError(given, allowed, hint=f"no valid height lies at {comparison.what}")
+    typical_m = float(np.median(np.abs(equations.residual_m[some])))
+    return ArgumentError(
+        given,
+        "lie close enough to the heights for errors of the pair to explain the difference",
+        f"{typical_m:.3g} m",
+        "or give more places, since the estimate from these does not settle",
+    )
+
+
+def _unobservable(
+    fit: Fit, unknowns: tuple[str, ...], column: int, comparison: Comparison
+) -> ArgumentError:
+    name = next(each for each in unknowns if (each == "roll") == bool(column))
+    sd_rad = float(np.sqrt(fit.covariance[0, 0])) * (comparison.roll_rad if column else 1.0)
+    return ArgumentError(
+        "unknowns",
+        "be observable from these heights, with a standard deviation up to "
+        f"{_MOST_SD_RAD:g} rad of phase",
+        f"{name} with {sd_rad:.2g} rad",
+        "more places or a smaller `known_sd_m` show it, or two tracks at different ranges",
+    )
+
+
 def _mean_phase(each: list[ConstantPhase]) -> ConstantPhase:
     """Return the mean of phases, weighted by their deviations."""
     weight = np.array([1 / max(one.sd_rad, 1e-9) ** 2 for one in each])
@@ -285,7 +386,7 @@ def _middle_hz(lines: RangeLines) -> float:
 
 
 def _errors(
-    estimate: Estimate,
+    estimate: _Estimate,
     unknowns: tuple[str, ...],
     constant: ConstantPhase | None,
     middle_hz: float,
@@ -295,7 +396,7 @@ def _errors(
     held = {"roll"} & set(unknowns) if 1 not in estimate.columns else set()
     if 0 not in estimate.columns:
         held |= {"phase", "delay"} & set(unknowns)
-    elif constant is not None and constant.sd_rad > MOST_SD_RAD:
+    elif constant is not None and constant.sd_rad > _MOST_SD_RAD:
         # Heights that are off by more than half a cycle followed a delay.
         shifted = abs(estimate.values[0]) > math.pi
         held.add(
