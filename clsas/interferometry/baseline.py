@@ -27,9 +27,11 @@ from clsas.engine.data.beam import BeamWindow, track_directions
 from clsas.engine.data.geometry import unit_vectors
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import RangeLines, some_channels, wavelength_m
+from clsas.engine.data.threads import in_threads
 from clsas.measures.elevation import Sight, sight_along
 
 _POINTS_AT_ONCE = 64
+_ROWS_AT_ONCE = 64  # of interpolated quantities, which then fit into caches
 _LATTICE = 9  # points along either side of a grid; 5 and 17 change heights by at most 1 mm
 _LEVELS = 5  # heights of a lattice; 3 and 9 give the same heights
 
@@ -168,16 +170,27 @@ class Lattice:
         rows, columns : array [n], [m]
         offset_m : float64, broadcast to [n, m]
         """
-        of_rows, of_columns = _splines(rows, self.rows), _splines(columns, self.columns).T
         middle_m = (self.offset_m[0] + self.offset_m[-1]) / 2
         half_m = max(float(np.ptp(self.offset_m)) / 2, 1e-9)
         height = np.clip((offset_m - middle_m) / half_m, -1, 1)
         powers = np.linalg.inv(np.vander((self.offset_m - middle_m) / half_m))
-        found = np.zeros((self.values.shape[-1], len(rows), len(columns)))
-        for each in np.tensordot(powers, self.values.transpose(2, 3, 0, 1), 1):
-            found *= height
-            found += of_rows @ each @ of_columns
-        return found
+        if height.ndim == 0:  # one polynomial for all
+            powers, height = np.vander(height[None], len(powers)) @ powers, np.zeros((1, 1))
+        terms = np.tensordot(powers, self.values.transpose(2, 3, 0, 1), 1)
+        terms = terms @ _splines(columns, self.columns).T
+        of_rows = _splines(rows, self.rows)
+        height = np.broadcast_to(height, (len(rows), len(columns)))
+
+        def strip(first: int) -> NDArray[np.float64]:
+            some = slice(first, first + _ROWS_AT_ONCE)
+            found = of_rows[some] @ terms[0]
+            for term in terms[1:]:
+                found *= height[some]
+                found += of_rows[some] @ term
+            return found
+
+        strips = in_threads(strip, range(0, len(rows), _ROWS_AT_ONCE))
+        return np.concatenate(list(strips), axis=1)
 
 
 def _splines(places: NDArray, known: NDArray[np.float64]) -> NDArray[np.float64]:

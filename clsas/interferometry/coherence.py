@@ -79,8 +79,16 @@ class Window:
 
         Pixels beyond the edges count as zero.
         """
-        down = uniform_filter1d(values, self.rows, axis=-2, mode="constant")
-        return uniform_filter1d(down, self.columns, axis=-1, mode="constant") * self.pixels
+        half, rows = self.rows // 2, values.shape[-2]
+        down = np.empty(values.shape, np.result_type(values, np.float64))
+        total = values[..., :half, :].sum(axis=-2, dtype=down.dtype)
+        for row in range(rows):
+            if row + half < rows:
+                total += values[..., row + half, :]
+            if row > half:
+                total -= values[..., row - half - 1, :]
+            down[..., row, :] = total
+        return uniform_filter1d(down, self.columns, axis=-1, mode="constant") * self.columns
 
     def any_of(self, values: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return whether any value in the window around every pixel is true."""
@@ -88,7 +96,11 @@ class Window:
 
     def fullness(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
         """Return the share of the window around every pixel that lies within an image."""
-        return self.sums(np.ones(shape)) / self.pixels
+        down, across = (
+            np.convolve(np.ones(n), np.full(side, 1 / side))[side // 2 :][:n]
+            for n, side in zip(shape, self.sides, strict=True)
+        )
+        return np.outer(down, across)
 
 
 class Moments(NamedTuple):

@@ -105,8 +105,8 @@ class Refined:
     ----------
     offset_m, sd_m, coherence, looks, m_per_rad : float64
     valid : bool
-    relief_m : float64
-        The heights, and the nearest ones where they are not known.
+    usable : bool
+        Pixels whose heights make up the relief of another pass.
     correction : float
         Rms of the last correction, in standard deviations.
     """
@@ -117,13 +117,18 @@ class Refined:
     looks: NDArray[np.float64]
     m_per_rad: NDArray[np.float64]
     valid: NDArray[np.bool_]
-    relief_m: NDArray[np.float64]
+    usable: NDArray[np.bool_]
     correction: float
 
     @property
     def converged(self) -> bool:
         """True if the last correction is well below the deviation."""
         return self.correction <= _CONVERGED
+
+    @property
+    def relief_m(self) -> NDArray[np.float64]:
+        """The heights, or the nearest usable ones."""
+        return filled(self.offset_m, self.usable)
 
 
 def refine(
@@ -149,8 +154,7 @@ def refine(
     """
     window, shape = view.window, relief_m.shape
     # A slope that faces the sonar is imaged with more pixels per independent sample.
-    level_m = np.full(shape, float(relief_m.mean()))
-    _, level = sensitivity(view, level_m, np.zeros((2, *shape)))
+    _, level = sensitivity(view, float(relief_m.mean()), np.zeros((2, 1, 1)))
     level_growth = edge_growth(window, shape)
     looks_on_plane = view.looks * window.fullness(shape) / level
     first_m, slope_m = relief_m, np.array(np.gradient(relief_m))
@@ -175,28 +179,28 @@ def refine(
         correction = DEVIATION_PER_MEDIAN * median
         settled = valid & (change < _UNSETTLED)
         whole_sd_m = np.hypot(sd_m, displacement_m(planes.bend_m, sd_m, settled, window))
-        relief_m = filled(planes.height_m, usable)
-        slope_m = np.stack([planes.row_slope_m, planes.column_slope_m])
         found = Refined(
-            planes.height_m, whole_sd_m, coherence, seen, -1 / rad_m, settled, relief_m, correction
+            planes.height_m, whole_sd_m, coherence, seen, -1 / rad_m, settled, usable, correction
         )
         progress(done)
         if found.converged:
             break
+        relief_m = found.relief_m
+        slope_m = np.stack([planes.row_slope_m, planes.column_slope_m])
     return found
 
 
 def sensitivity(
-    view: View, offset_m: NDArray[np.float64], slope_m: NDArray[np.float64]
+    view: View, offset_m: NDArray[np.float64] | float, slope_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the change of phase per metre of height error, rad/m, and the foreshortening.
 
     Parameters
     ----------
     view : View
-    offset_m : float64 [rows, columns]
+    offset_m : float64, broadcast to [rows, columns]
         Heights above its plane.
-    slope_m : float64 [2, rows, columns]
+    slope_m : float64, broadcast to [2, rows, columns]
         Their slopes, metres per row and per column.
     """
     _, row_step_m, column_step_m = view.grid.vectors_m
