@@ -104,9 +104,9 @@ def heights(
         Side of the windows in which the coherence is estimated, metres. It is the resolution of the
         heights. By default windows contain about 50 independent samples.
     tolerance_db : float
-        Largest relative rms error of the images on the relief, dB, as for `factorize`. The error
-        of those of the last pass is measured if they take 0.1 s or more; a warning appears if it
-        exceeds the tolerance. Images of the sweep may have an error of -30 dB.
+        Largest relative rms error of the images, dB, as for `factorize`. The error of the last
+        ones on the relief is measured if they take 0.1 s or more; a warning appears if it exceeds
+        the tolerance.
     least_coherence : float
         Smallest coherence of a valid height, 0.1 to 0.99.
     beam : BeamWindow, optional
@@ -156,12 +156,13 @@ def heights(
     on which range and position along the track are constant, per metre of rise, and m is the slope
     of the seabed. The height of ambiguity, 2 pi/K, changes the phase by a cycle.
 
-    The sweep images both banks at six heights per cycle, along those curves, on some of the pixels.
-    At the height of the scatterers the phase is zero, and the magnitude of the coherence is
-    largest. Large windows decide between cycles, small ones determine the height. Both banks are
-    then imaged on the relief that was found. In every window a plane is fitted to the height plus
-    what the remaining phase adds to it, until corrections are below 0.3 deviations. The
-    reported deviation is ::
+    Along those curves, an image of the first bank is the same at all heights, and one of the second
+    bank is that of a plane, displaced by the change of its range. The sweep therefore compares both
+    images of one plane, at six heights per cycle. At the height of the scatterers the phase is
+    zero, and the magnitude of the coherence is largest. Large windows decide between cycles, small
+    ones determine the height. In every window a plane is then fitted to the height plus what the
+    remaining phase adds to it. At last both banks are imaged on the relief that was found, and the
+    fit is repeated until corrections are below the deviation. The reported deviation is ::
 
         sd = sqrt((1 - m.t)^2 / K^2 (1 - g^2) / (2 L g^2) + d^2)
 
@@ -188,8 +189,10 @@ def heights(
     far side is 25 dB darker than the seabed beside it, they were 2.9 times the deviation with equal
     weights for all directions, and 0.9 times with a Hann window of 14 degrees.
 
-    The track may sway, but must be close to straight over the channels that see a pixel, since a
-    scatterer above an imaged surface appears in one place only then.
+    The track may sway, but must be close to straight over the channels that see a pixel. Deviations
+    blur what lies above or below an imaged surface along the track. If the blur at the heights that
+    the sweep finds exceeds half a window, both banks are imaged on that relief before planes are
+    fitted.
 
     References
     ----------
