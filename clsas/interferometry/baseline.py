@@ -3,8 +3,8 @@
 A scatterer above an imaged surface appears where its range to the first bank and its position along
 the track are the same. Around a straight track, these points form a circle; t is its tangent,
 scaled to a rise of 1 m. Along that curve an image shows the same speckle at every height. D is the
-gradient of the difference of the two banks' ranges. If a scatterer lies e higher along the curve than the pixel
-that shows it, the phase in that pixel is
+gradient of the difference of the two banks' ranges. If a scatterer lies e higher along the curve
+than the pixel that shows it, the phase in that pixel is
 
     arg(a b*) = -K e,   K = 2 k D.t.
 

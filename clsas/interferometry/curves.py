@@ -333,7 +333,7 @@ class CurveImages:
         if height_m is not None:
             grid = Grid.points(fine.points_m(height_m), georeference=plane.georeference)
             formed = fine.displaced(height_m)
-        first, second = pair.images(grid)
+        first, second = pair.images(grid).pixels
 
         # Without the phase of the range, images are smooth from row to row.
         along_m = plane.vectors_m[2]

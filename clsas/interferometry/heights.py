@@ -10,7 +10,6 @@ banks are then imaged on the relief, and corrections end when they are below the
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple, Self
@@ -23,9 +22,9 @@ from clsas.engine.data import validate
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid, without_heights
-from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at
 from clsas.engine.device.device import Device, open_device
+from clsas.engine.factorized.plan import Plan
 from clsas.engine.factorized.planner import TOLERANCE
 from clsas.engine.promise import report
 from clsas.engine.signal.spectrum import measure_spectrum
@@ -44,7 +43,7 @@ from clsas.interferometry.checks import (
 )
 from clsas.interferometry.coherence import Images, Window, effective_looks, noise_coherence
 from clsas.interferometry.curves import CurveImages, Curves, spacing_m
-from clsas.interferometry.pair import Pair
+from clsas.interferometry.pair import Pair, PairImages
 from clsas.interferometry.refinement import PASSES, Refined, View, filled, refine
 from clsas.interferometry.result import Heights
 from clsas.interferometry.shadows import in_shadow
@@ -280,13 +279,11 @@ def measured(
     relief_m, known, doubts = _first_relief(task, offset_m, lambda done: report(done, total))
 
     plane = without_heights(grid)
-    last: list[tuple[Image, Image, float]] = []
+    last: list[PairImages] = []
 
     def images_at(relief_m: NDArray[np.float64]) -> Images:
-        on_relief, started = plane.with_height(relief_m), time.perf_counter()
-        first, second = (pair.image(bank, on_relief) for bank in (pair.a, pair.b))
-        last[:] = [(first, second, time.perf_counter() - started)]
-        return first.pixels, second.pixels
+        last[:] = [pair.images(plane.with_height(relief_m))]
+        return last[0].pixels
 
     start_m = np.zeros(1) if grid.height_m is None else grid.height_m
     span_m = start_m.min() + request.search_m[0], start_m.max() + request.search_m[1]
@@ -296,9 +293,9 @@ def measured(
         images_at, relief_m, known, view, lambda done: report(len(offset_m) + done, total)
     )
     report(total, total)
-    first, second, seconds = last[0]
-    power = np.abs(first.pixels.astype(np.complex128)) ** 2
-    response = point_response(task.straight, task.level)
+    image = last[0].first
+    power = image.pixels.real.astype(np.float64) ** 2 + image.pixels.imag.astype(np.float64) ** 2
+    response = point_response(task.straight, task.level, task.plan)
     valid = refined.valid & ~from_elsewhere(power, response, task.window)
     hidden = in_shadow(plane, refined.offset_m, refined.sd_m, valid, sights, task.window)
     found = Heights(
@@ -308,9 +305,9 @@ def measured(
         valid & ~hidden,
         refined.looks,
         refined.m_per_rad,
-        first,
+        image,
         task.window_m,
-        pair.certificate(first, second, seconds),
+        pair.certificate(last[0]),
     )
     return Measured(found, refined, sights, doubts)
 
@@ -348,6 +345,8 @@ class Task:
         Height of ambiguity.
     level : Grid
         The plane of the grid, raised by its mean height.
+    plan : Plan or None
+        Plan of the images of both banks there.
     window_m : float
     window : Window
     looks : float
@@ -361,6 +360,7 @@ class Task:
     relative_band: float
     ambiguity_m: float
     level: Grid
+    plan: Plan | None
     window_m: float
     window: Window
     looks: float
@@ -379,13 +379,13 @@ class Task:
         mean_m = 0.0 if grid.height_m is None else float(grid.height_m.mean())
         level = replace(without_heights(grid), origin_m=grid.vectors_m[0] + [0.0, 0.0, mean_m])
         images = straight.images(level)
-        window_m = request.window_m or _default_window_m(images, grid)
+        window_m = request.window_m or _default_window_m(images.pixels, grid)
         window = Window.of(grid, window_m)
-        looks = effective_looks(images, window)
+        looks = effective_looks(images.pixels, window)
         check_looks(window_m, looks)
         return cls(
-            straight, grid, request, baseline, relative_band, ambiguity_m, level, window_m, window,
-            looks,
+            straight, grid, request, baseline, relative_band, ambiguity_m, level, images.plan,
+            window_m, window, looks,
         )  # fmt: skip
 
     def large_window(self, looks: float, window: Window) -> Window:

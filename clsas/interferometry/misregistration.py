@@ -38,7 +38,7 @@ def constant_phase(pair: Pair, found: Heights) -> ConstantPhase:
     grid = found.image.grid
     sums, cycles_per_m = [], []
     for a, b in zip(sub_bands(pair.a, 2), sub_bands(pair.b, 2), strict=True):
-        first, second = replace(pair, a=a, b=b).images(grid)
+        first, second = replace(pair, a=a, b=b).images(grid).pixels
         sums.append(_tile_sums(first, second, found))
         cycles_per_m.append(_mean_cycles_per_m(a))
     low, high = sums

@@ -2,20 +2,47 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.certificate import Certificate
+from clsas.engine.data.digests import lines_digest
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.device.device import Device
+from clsas.engine.factorized.plan import Plan
 from clsas.engine.imaging import Imager
 from clsas.engine.promise import is_wanted, measured_if_possible
 from clsas.engine.water.refraction import homogeneous
 from clsas.interferometry.coherence import Images
+
+
+class PairImages(NamedTuple):
+    """Images of both banks on one grid.
+
+    Attributes
+    ----------
+    first, second : Image
+    plan : Plan or None
+        How they were formed; None if they are exact.
+    seconds : float
+        Time that they took.
+    """
+
+    first: Image
+    second: Image
+    plan: Plan | None
+    seconds: float
+
+    @property
+    def pixels(self) -> Images:
+        """The pixels of both."""
+        return self.first.pixels, self.second.pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,29 +65,41 @@ class Pair:
     beam: BeamWindow | None
     device: Device
 
-    def images(self, grid: Grid) -> Images:
-        """Return the pixels of both banks' images."""
-        return self.image(self.a, grid).pixels, self.image(self.b, grid).pixels
+    def images(self, grid: Grid) -> PairImages:
+        """Return the images of both banks, formed by one plan."""
+        started = time.perf_counter()
+        imager = self._imager(self.a, grid, None)
+        first = imager(self.a, certificate=False)
+        second = self.image(self.b, grid, imager.plan)
+        return PairImages(first, second, imager.plan, time.perf_counter() - started)
 
-    def image(self, lines: RangeLines, grid: Grid) -> Image:
-        """Return the image of one of the banks."""
-        imager = Imager(
+    def image(self, lines: RangeLines, grid: Grid, plan: Plan | None) -> Image:
+        """Return an image of lines whose antennas are close to those that a plan was made for."""
+        return self._imager(lines, grid, plan)(lines, certificate=False)
+
+    def _imager(self, lines: RangeLines, grid: Grid, plan: Plan | None) -> Imager:
+        if plan is not None:
+            # Errors, time and memory of lines so similar do not differ by more than the margins.
+            alike = replace(plan, lines_digest=lines_digest(lines))
+            return Imager(lines, grid, alike, device=self.device)
+        return Imager(
             lines, grid, tolerance_db=self.tolerance_db, accuracy_db=self.accuracy_db,
             beam=self.beam, device=self.device,
         )  # fmt: skip
-        return imager(lines, certificate=False)
 
-    def certificate(self, a: Image, b: Image, seconds: float) -> Certificate | None:
+    def certificate(self, images: PairImages) -> Certificate | None:
         """Return the measured error of that bank's image which errs more.
 
         It is None if both took less time than images that are certified, or if that of a bank
         cannot be measured.
         """
-        if not is_wanted(None, seconds):
+        if not is_wanted(None, images.seconds):
             return None
         found = []
-        for image, lines in ((a, self.a), (b, self.b)):
-            each = measured_if_possible(image, lines, self.device, seconds / 2, self.tolerance_db)
+        for image, lines in ((images.first, self.a), (images.second, self.b)):
+            each = measured_if_possible(
+                image, lines, self.device, images.seconds / 2, self.tolerance_db
+            )
             if each is None:
                 return None
             found.append(each)

@@ -31,6 +31,7 @@ from clsas.engine.data.lines import RangeLines, antennas_of, wavelength_m
 from clsas.engine.data.pings import channels_per_ping
 from clsas.engine.data.system import element_pattern
 from clsas.engine.data.threads import cores
+from clsas.engine.factorized.plan import Plan
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.pair import Pair
@@ -85,7 +86,7 @@ def middle(shape: tuple[int, ...]) -> tuple[int, int]:
     return (rows - 1) // 2, (columns - 1) // 2
 
 
-def point_response(pair: Pair, grid: Grid) -> NDArray[np.float64]:
+def point_response(pair: Pair, grid: Grid, plan: Plan | None) -> NDArray[np.float64]:
     """Return the power of the first bank's image of a point in the middle of a grid.
 
     Parameters
@@ -93,11 +94,13 @@ def point_response(pair: Pair, grid: Grid) -> NDArray[np.float64]:
     pair : Pair
     grid : Grid
         A plane.
+    plan : Plan or None
+        Plan of the image of the first bank on it.
     """
     point_m = grid.positions_m()[middle(grid.shape)]
     lines, beam = pair.a, pair.beam
     along = track_directions(lines) if beam is None else beam.directions(lines)
-    pixels = pair.image(lines_of_point(lines, point_m, along), grid).pixels
+    pixels = pair.image(lines_of_point(lines, point_m, along), grid, plan).pixels
     return pixels.real.astype(np.float64) ** 2 + pixels.imag.astype(np.float64) ** 2
 
 
