@@ -131,6 +131,11 @@ class Lattice:
     offset_m: NDArray[np.float64]
     values: NDArray[np.float64]
 
+    def every(self, rows: int, columns: int, units: list[int]) -> Self:
+        """Return the lattice of every so many rows and columns, with quantities in other units."""
+        places = self.rows / rows, self.columns / columns
+        return type(self)(*places, self.offset_m, self.values / np.array(units))
+
     def at(
         self,
         rows: NDArray[np.float64],

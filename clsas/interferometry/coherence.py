@@ -104,35 +104,55 @@ class Window:
 
 
 class Moments(NamedTuple):
-    """Sums over windows of the products of two images, [rows, columns] each.
+    """Sums of the products of two images, [rows, columns] each.
 
     Attributes
     ----------
-    cross : complex128
+    cross : complex
         Sum of a b*.
-    power_a, power_b : float64
+    power_a, power_b : float
         Sums of |a|^2 and |b|^2.
     """
 
-    cross: NDArray[np.complex128]
-    power_a: NDArray[np.float64]
-    power_b: NDArray[np.float64]
+    cross: NDArray[np.complexfloating]
+    power_a: NDArray[np.floating]
+    power_b: NDArray[np.floating]
 
     @classmethod
-    def of(cls, a: NDArray[np.complex64], b: NDArray[np.complex64], window: Window) -> Moments:
+    def multilooked(cls, a: NDArray, b: NDArray, side: int) -> Self:
+        """Return the sums over blocks of `side` x `side` pixels; the last ones may be smaller."""
+        products = a * b.conj(), a.real**2 + a.imag**2, b.real**2 + b.imag**2
+        return cls(*(block_sums(each, side) for each in products))
+
+    @classmethod
+    def of(cls, a: NDArray[np.complex64], b: NDArray[np.complex64], window: Window) -> Self:
         """Return the sums over the window around every pixel."""
-        a, b = a.astype(np.complex128), b.astype(np.complex128)
-        powers = (window.sums(each.real**2 + each.imag**2) for each in (a, b))
-        return cls(window.sums(a * b.conj()), *powers)
+        return cls.multilooked(a, b, 1).within(window)
+
+    def within(self, window: Window) -> Self:
+        """Return the sums over the window around every one of these."""
+        real, imaginary, *powers = window.sums(
+            np.stack([self.cross.real, self.cross.imag, self.power_a, self.power_b])
+        )
+        return type(self)(real + 1j * imaginary, *powers)
 
     @property
-    def coherence(self) -> NDArray[np.complex128]:
-        """Complex coherence of the samples in each window, 0 where an image is 0."""
+    def coherence(self) -> NDArray[np.complexfloating]:
+        """Complex coherence of the samples, 0 where an image is 0."""
         # Running sums leave rounding errors where a window contains only zeros.
         power = np.sqrt(np.maximum(self.power_a, 0)) * np.sqrt(np.maximum(self.power_b, 0))
         found = np.zeros_like(self.cross)
         np.divide(self.cross, power, out=found, where=power > 1e-12 * power.max(initial=0.0))
-        return found / np.maximum(np.abs(found), 1)
+        found /= np.maximum(np.abs(found), 1)
+        return found
+
+
+def block_sums(values: NDArray, side: int) -> NDArray:
+    """Return the sums over blocks of `side` x `side` pixels; the last ones may be smaller."""
+    if side == 1:
+        return values
+    rows, columns = (np.arange(0, n, side) for n in values.shape)
+    return np.asarray(np.add.reduceat(np.add.reduceat(values, rows), columns, axis=1))
 
 
 def effective_looks(images: tuple[NDArray, ...], window: Window) -> float:

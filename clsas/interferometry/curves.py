@@ -23,7 +23,7 @@ from scipy.ndimage import map_coordinates, spline_filter1d
 from clsas.engine.data.fourier import phasors, turned
 from clsas.engine.data.grid import Grid, without_heights
 from clsas.interferometry.baseline import Baseline, Lattice, in_pixels
-from clsas.interferometry.coherence import Images
+from clsas.interferometry.coherence import Images, Moments
 from clsas.interferometry.pair import Pair
 
 _OVERSAMPLING = 2.0  # of the band across the track; cubic splines then err by -45 dB at its ends
@@ -123,10 +123,7 @@ class Curves:
 
     def every(self, rows: int, columns: int) -> Self:
         """Return some of the curves: those of every so many rows and columns."""
-        values = self.lattice.values / [rows, columns, rows, 1, 1]
-        lattice = Lattice(
-            self.lattice.rows / rows, self.lattice.columns / columns, self.lattice.offset_m, values
-        )
+        lattice = self.lattice.every(rows, columns, [rows, columns, rows, 1, 1])
         grid = self.grid.window(slice(None, None, rows), slice(None, None, columns))
         return replace(self, grid=grid, lattice=lattice)
 
@@ -384,3 +381,7 @@ class CurveImages:
             found += weight * np.take_along_axis(self.second, at, axis=0)
         found *= phasors((moved * (rate + moved * bend / 2)).astype(np.float32))
         return self.first, found
+
+    def products(self, height_m: NDArray[np.float64] | float) -> Moments:
+        """Return the products of the images at heights above the plane."""
+        return Moments.multilooked(*self.at(height_m), 1)

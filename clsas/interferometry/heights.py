@@ -41,10 +41,16 @@ from clsas.interferometry.checks import (
     check_looks,
     check_pair,
 )
-from clsas.interferometry.coherence import Images, Window, effective_looks, noise_coherence
+from clsas.interferometry.coherence import (
+    Moments,
+    Window,
+    block_sums,
+    effective_looks,
+    noise_coherence,
+)
 from clsas.interferometry.curves import CurveImages, Curves, spacing_m
 from clsas.interferometry.pair import Pair, PairImages
-from clsas.interferometry.refinement import PASSES, Refined, View, filled, refine
+from clsas.interferometry.refinement import PASSES, Refined, View, enlarged, filled, refine
 from clsas.interferometry.result import Heights
 from clsas.interferometry.shadows import in_shadow
 from clsas.interferometry.side_lobes import from_elsewhere, point_response
@@ -278,36 +284,45 @@ def measured(
     report = progress or (lambda done, total: None)
     relief_m, known, doubts = _first_relief(task, offset_m, lambda done: report(done, total))
 
-    plane = without_heights(grid)
-    last: list[PairImages] = []
+    plane, side = without_heights(grid), task.side
+    shape = grid.shape[0], grid.shape[1]
+    last: list[tuple[PairImages, Moments]] = []
 
-    def images_at(relief_m: NDArray[np.float64]) -> Images:
-        last[:] = [pair.images(plane.with_height(relief_m))]
-        return last[0].pixels
+    def products_at(relief_m: NDArray[np.float64]) -> Moments:
+        middle = (1 - side) / (2 * side)  # of the first pixel, from that of the first block
+        finer_m = _enlarged(relief_m, (side, side), shape, middle)
+        images = pair.images(plane.with_height(finer_m))
+        last[:] = [(images, Moments.multilooked(*images.pixels, side))]
+        return last[0][1]
 
     start_m = np.zeros(1) if grid.height_m is None else grid.height_m
     span_m = start_m.min() + request.search_m[0], start_m.max() + request.search_m[1]
     sights = sight_lattice(task.baseline, plane, span_m)
-    view = View(plane, sights, task.window, task.looks, request.least_coherence, task.ambiguity_m)
+    window = Window.of(task.blocks, task.window_m)
+    view = View(
+        task.blocks, sights.every(side, side, [1, side, side, 1]), window,
+        task.looks * window.pixels * side**2 / task.window.pixels, request.least_coherence,
+        task.ambiguity_m,
+    )  # fmt: skip
     refined = refine(
-        images_at, relief_m, known, view, lambda done: report(len(offset_m) + done, total)
+        products_at, relief_m, known, view, lambda done: report(len(offset_m) + done, total)
     )
     report(total, total)
-    image = last[0].first
-    power = image.pixels.real.astype(np.float64) ** 2 + image.pixels.imag.astype(np.float64) ** 2
-    response = point_response(task.straight, task.level, task.plan)
-    valid = refined.valid & ~from_elsewhere(power, response, task.window)
-    hidden = in_shadow(plane, refined.offset_m, refined.sd_m, valid, sights, task.window)
+    images, products = last[0]
+    response = block_sums(point_response(task.straight, task.level, task.plan), side)
+    valid = refined.valid & ~from_elsewhere(products.power_a, response, window)
+    valid &= ~in_shadow(task.blocks, refined.offset_m, refined.sd_m, valid, view.sights, window)
+    refined = refined.in_pixels(side, shape)
     found = Heights(
         refined.offset_m,
         refined.sd_m,
         refined.coherence,
-        valid & ~hidden,
+        enlarged(valid, side, shape),
         refined.looks,
         refined.m_per_rad,
-        image,
+        images.first,
         task.window_m,
-        pair.certificate(last[0]),
+        pair.certificate(images),
     )
     return Measured(found, refined, sights, doubts)
 
@@ -351,6 +366,8 @@ class Task:
     window : Window
     looks : float
         Effective number of looks of a window.
+    side : int
+        Pixels along the side of the blocks over which products of images are summed at once.
     """
 
     straight: Pair
@@ -364,6 +381,7 @@ class Task:
     window_m: float
     window: Window
     looks: float
+    side: int
 
     @classmethod
     def of(cls, pair: Pair, grid: Grid, request: Request) -> Self:
@@ -385,8 +403,20 @@ class Task:
         check_looks(window_m, looks)
         return cls(
             straight, grid, request, baseline, relative_band, ambiguity_m, level, images.plan,
-            window_m, window, looks,
+            window_m, window, looks, max(min(window.sides) // _CURVES, 1),
         )  # fmt: skip
+
+    @property
+    def blocks(self) -> Grid:
+        """The plane of the grid, with a place for every block."""
+        origin_m, row_step_m, column_step_m = self.grid.vectors_m
+        return replace(
+            without_heights(self.grid),
+            origin_m=origin_m + (self.side - 1) / 2 * (row_step_m + column_step_m),
+            row_step_m=self.side * row_step_m,
+            column_step_m=self.side * column_step_m,
+            shape=tuple(math.ceil(n / self.side) for n in self.grid.shape),
+        )
 
     def large_window(self, looks: float, window: Window) -> Window:
         """Return the window that decides between cycles of the phase.
@@ -426,26 +456,28 @@ def _first_relief(
         large_m = side_m
     doubts = Doubts(end, large_m, task.ambiguity_m)
 
-    height_m = _closer(filled(swept.height_m, reliable), (_SWEPT, _SWEPT), curves.grid.shape)
-    reliable = _closer(reliable.astype(np.float32), (_SWEPT, _SWEPT), curves.grid.shape) > 0.5
+    height_m = _enlarged(filled(swept.height_m, reliable), (_SWEPT, _SWEPT), curves.grid.shape)
+    reliable = _enlarged(reliable.astype(np.float32), (_SWEPT, _SWEPT), curves.grid.shape) > 0.5
     blur_m = curves.blur_m(height_m)[reliable]
     if blur_m.size and np.median(blur_m) > _MOST_BLUR * window_m:
-        formed_m = _closer(height_m, (every, 1), fine.grid.shape)
+        formed_m = _enlarged(height_m, (every, 1), fine.grid.shape)
         images = CurveImages.of(task.straight, fine, every, formed_m)
     window = Window.of(curves.grid, window_m)
     view = View(
         curves.grid, curves.sights, window, effective_looks(images.at(0.0), window),
         request.least_coherence, task.ambiguity_m,
     )  # fmt: skip
-    found_m = refine(images.at, height_m, window.any_of(reliable), view).relief_m
+    found_m = refine(images.products, height_m, window.any_of(reliable), view).relief_m
     relief = relief_of(curves.moved(found_m), found_m, reliable, task.ambiguity_m)
-    return *_at_pixels(relief, curves, window, grid), doubts
+    return *_at_pixels(relief, curves, window, task.blocks), doubts
 
 
-def _closer(values: NDArray, factors: tuple[int, int], shape: tuple[int, ...]) -> NDArray:
+def _enlarged(
+    values: NDArray, factors: tuple[int, int], shape: tuple[int, ...], offset: float = 0.0
+) -> NDArray:
     """Return values on rows and columns that are closer by factors, interpolated linearly."""
     scale = 1 / np.array(factors)
-    return np.asarray(affine_transform(values, scale, output_shape=shape, order=1, mode="nearest"))
+    return np.asarray(affine_transform(values, scale, offset, shape, order=1, mode="nearest"))
 
 
 def _at_pixels(

@@ -18,9 +18,9 @@ Passes over new images of the corrected relief end when corrections are below th
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,6 @@ from clsas.engine.data.grid import Grid
 from clsas.engine.data.threads import in_threads
 from clsas.interferometry.baseline import Lattice
 from clsas.interferometry.coherence import (
-    Images,
     Moments,
     Window,
     debiased,
@@ -107,6 +106,8 @@ class Refined:
     valid : bool
     usable : bool
         Pixels whose heights make up the relief of another pass.
+    slope_m : float64 [2, rows, columns]
+        Slopes of the heights, metres per row and per column.
     correction : float
         Rms of the last correction, in standard deviations.
     """
@@ -118,6 +119,7 @@ class Refined:
     m_per_rad: NDArray[np.float64]
     valid: NDArray[np.bool_]
     usable: NDArray[np.bool_]
+    slope_m: NDArray[np.float64]
     correction: float
 
     @property
@@ -130,9 +132,28 @@ class Refined:
         """The heights, or the nearest usable ones."""
         return filled(self.offset_m, self.usable)
 
+    def in_pixels(self, side: int, shape: tuple[int, int]) -> Self:
+        """Return the heights of pixels, from those of blocks of `side` x `side` pixels."""
+        if side == 1:
+            return self
+        row, column = ((np.arange(n) % side - (side - 1) / 2) / side for n in shape)
+        found: dict[str, Any] = {
+            name: enlarged(value, side, shape)
+            for name, value in vars(self).items()
+            if np.ndim(value)
+        }
+        found["offset_m"] += found["slope_m"][0] * row[:, None] + found["slope_m"][1] * column
+        return replace(self, **found)
+
+
+def enlarged(values: NDArray, side: int, shape: tuple[int, int]) -> NDArray:
+    """Return the values of pixels, which are those of their blocks of `side` x `side` pixels."""
+    down = np.repeat(values, side, axis=-2)[..., : shape[0], :]
+    return np.repeat(down, side, axis=-1)[..., : shape[1]]
+
 
 def refine(
-    images_at: Callable[[NDArray[np.float64]], Images],
+    products_at: Callable[[NDArray[np.float64]], Moments],
     relief_m: NDArray[np.float64],
     known: NDArray[np.bool_],
     view: View,
@@ -142,8 +163,8 @@ def refine(
 
     Parameters
     ----------
-    images_at : callable
-        Returns both images on a relief.
+    products_at : callable
+        Returns the products of both images on a relief, in every pixel or block of pixels.
     relief_m : float64 [rows, columns]
         Heights above the plane.
     known : bool [rows, columns]
@@ -160,7 +181,7 @@ def refine(
     first_m, slope_m = relief_m, np.array(np.gradient(relief_m))
     for done in range(1, PASSES + 1):
         rad_m, facing = sensitivity(view, relief_m, slope_m)
-        planes = fit_planes(images_at(relief_m), relief_m, -1 / rad_m, window)
+        planes = fit_planes(products_at(relief_m), relief_m, -1 / rad_m, window)
         seen = looks_on_plane * np.maximum(facing, _LEAST_FORESHORTENING)
         coherence = debiased(planes.coherence, seen)
         sd_m = phase_sd_rad(coherence, seen / planes.growth) / np.abs(rad_m)
@@ -179,14 +200,15 @@ def refine(
         correction = DEVIATION_PER_MEDIAN * median
         settled = valid & (change < _UNSETTLED)
         whole_sd_m = np.hypot(sd_m, displacement_m(planes.bend_m, sd_m, settled, window))
+        slope_m = np.stack([planes.row_slope_m, planes.column_slope_m])
         found = Refined(
-            planes.height_m, whole_sd_m, coherence, seen, -1 / rad_m, settled, usable, correction
-        )
+            planes.height_m, whole_sd_m, coherence, seen, -1 / rad_m, settled, usable, slope_m,
+            correction,
+        )  # fmt: skip
         progress(done)
         if found.converged:
             break
         relief_m = found.relief_m
-        slope_m = np.stack([planes.row_slope_m, planes.column_slope_m])
     return found
 
 
@@ -278,39 +300,40 @@ class Planes(NamedTuple):
 
 
 def fit_planes(
-    images: Images,
+    products: Moments,
     height_m: NDArray[np.float64],
     m_per_rad: NDArray[np.float64],
     window: Window,
 ) -> Planes:
-    """Return the planes that two images on a relief show.
+    """Return the planes that the products of two images on a relief show.
 
     Parameters
     ----------
-    images : two complex64 [rows, columns]
+    products : Moments
     height_m : float64 [rows, columns]
         The relief.
     m_per_rad : float64 [rows, columns]
         Change M of the height per radian of phase.
     window : Window
     """
-    return _in_strips(partial(_fit, window=window), (*images, height_m, m_per_rad), window)
+    return _in_strips(partial(_fit, window=window), (*products, height_m, m_per_rad), window)
 
 
 def _fit(
-    a: NDArray[np.complex64],
-    b: NDArray[np.complex64],
+    cross: NDArray[np.complexfloating],
+    power_a: NDArray[np.floating],
+    power_b: NDArray[np.floating],
     height_m: NDArray[np.float64],
     m_per_rad: NDArray[np.float64],
     *,
     window: Window,
 ) -> Planes:
     """Return the planes of some rows."""
-    moments = Moments.of(a, b, window)
+    moments = Moments(cross, power_a, power_b).within(window)
     magnitude = np.abs(moments.cross)
     lit = magnitude > 1e-12 * magnitude.max(initial=0.0)
     mean = np.where(lit, moments.cross, 1) / np.where(lit, magnitude, 1)
-    product = a.astype(np.complex128) * b.conj()
+    product = cross.astype(np.complex128)
     # Multiplied by this phase, sums have weights as real parts, and weights times phases relative
     # to the mean as imaginary parts. Division by the sum of weights makes them means.
     scale = mean.conj() / np.where(lit, magnitude, 1)

@@ -45,13 +45,13 @@ _LEAST_ACROSS = 1e-3  # avoids a division by zero if elements look along the tra
 
 
 def from_elsewhere(
-    power: NDArray[np.float64], response: NDArray[np.float64], window: Window
+    power: NDArray[np.floating], response: NDArray[np.float64], window: Window
 ) -> NDArray[np.bool_]:
     """Return which pixels receive most of their power from beyond their own window.
 
     Parameters
     ----------
-    power : float64 [rows, columns]
+    power : float [rows, columns]
         Power of an image.
     response : float64 [rows, columns]
         Response to a point in the middle; see `point_response`.

@@ -26,7 +26,7 @@ from scipy.ndimage import maximum_filter1d
 
 from clsas.engine.data import validate
 from clsas.engine.data.threads import in_threads
-from clsas.interferometry.coherence import Moments, Window
+from clsas.interferometry.coherence import Window
 from clsas.interferometry.curves import CurveImages
 
 STEPS_PER_CYCLE = 6
@@ -84,8 +84,8 @@ def sweep(
     """
     coherence = np.empty((len(offset_m), *images.first.shape), np.complex64)
 
-    def seen(height_m: float) -> NDArray[np.complex128]:
-        return Moments.of(*images.at(start_m + height_m), window).coherence
+    def seen(height_m: float) -> NDArray[np.complexfloating]:
+        return images.products(start_m + height_m).within(window).coherence
 
     for number, found in enumerate(in_threads(seen, offset_m)):
         coherence[number] = found
