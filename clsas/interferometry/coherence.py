@@ -40,7 +40,7 @@ LEAST_LOOKS = 4.0
 # have one slope, because slopes change the spatial frequency of the speckle. Tiles of one window
 # measure the longest lags from one pair of pixels.
 _TILE = 2
-_MOST_TILES = 256  # spread over an image; they measure the looks to better than 1 %
+_MOST_PIXELS = 1 << 17  # in tiles spread over an image, which measure looks to about 1 %
 
 
 @dataclass(frozen=True)
@@ -149,10 +149,14 @@ class Moments(NamedTuple):
 
 def block_sums(values: NDArray, side: int) -> NDArray:
     """Return the sums over blocks of `side` x `side` pixels; the last ones may be smaller."""
-    if side == 1:
-        return values
-    rows, columns = (np.arange(0, n, side) for n in values.shape)
-    return np.asarray(np.add.reduceat(np.add.reduceat(values, rows), columns, axis=1))
+    for axis in (0, 1) if side > 1 else ():
+        values = np.moveaxis(values, axis, 0)
+        sums = values[::side].copy()
+        for first in range(1, side):
+            part = values[first::side]
+            sums[: len(part)] += part
+        values = np.moveaxis(sums, 0, axis)
+    return values
 
 
 def effective_looks(images: tuple[NDArray, ...], window: Window) -> float:
@@ -204,7 +208,8 @@ def _tiles(image: NDArray, rows: int, columns: int) -> NDArray[np.complex64]:
     """Return whole tiles that fit into an image, [tiles, rows, columns]."""
     down, across = image.shape[0] // rows, image.shape[1] // columns
     whole = image[: down * rows, : across * columns].reshape(down, rows, across, columns)
-    some = np.unique(np.linspace(0, down * across - 1, min(down * across, _MOST_TILES)).round())
+    count = min(max(_MOST_PIXELS // (rows * columns), 1), down * across)
+    some = np.unique(np.linspace(0, down * across - 1, count).round())
     return whole.swapaxes(1, 2)[np.unravel_index(some.astype(int), (down, across))]
 
 

@@ -365,20 +365,17 @@ class CurveImages:
         """Return the images at heights above the plane, without a phase that both share."""
         moved = self.every * self.curves.displaced(height_m) - self.formed
         row = self.every * np.arange(len(self.first))[:, None]
-        rate, bend = (
-            each[row]
-            for each in (np.gradient(self.phase_rad), np.gradient(np.gradient(self.phase_rad)))
-        )
-        before = np.floor(row + moved).astype(np.intp)
+        slope = np.gradient(self.phase_rad)
+        rate, bend = slope[row], np.gradient(slope)[row]
+        before = np.clip(np.floor(row + moved), 1, len(self.second) - 3)
         t = (row + moved - before).astype(np.float32)
         left, right = (1 - t) ** 3 / 6, t**3 / 6
-        middle = 2 / 3 - t**2 + t**3 / 2
-        found = np.zeros_like(self.first)
-        for tap, weight in zip(
-            range(-1, 3), (left, middle, 1 - left - middle - right, right), strict=True
-        ):
-            at = np.clip(before + tap, 0, len(self.second) - 1)
-            found += weight * np.take_along_axis(self.second, at, axis=0)
+        middle = 2 / 3 - t**2 * (1 - t / 2)
+        at, columns = before.astype(np.intp), np.arange(t.shape[1])
+        found = left * self.second[at - 1, columns]
+        found += middle * self.second[at, columns]
+        found += (1 - left - middle - right) * self.second[at + 1, columns]
+        found += right * self.second[at + 2, columns]
         found *= phasors((moved * (rate + moved * bend / 2)).astype(np.float32))
         return self.first, found
 

@@ -442,34 +442,38 @@ def _first_relief(
     fine = Curves.over(task.baseline, grid, request.search_m, (across_m, step_m))
     validate.memory("grid and search_m", 8 * len(offset_m) * fine.grid.size // every)
     images = CurveImages.of(task.straight, fine, every)
-    curves = images.curves
-
     few = images.few(_SWEPT)
-    small = Window.of(few.curves.grid, window_m)
-    looks = effective_looks(few.at(0.0), small)
-    large = task.large_window(looks, small)
-    swept = sweep(few, few.curves.start_m(grid), offset_m, small, large, progress)
-    reliable = swept.coherence >= noise_coherence(looks, _FALSE_ALARM / len(offset_m))
+
+    def view_of(some: CurveImages) -> View:
+        plane, window = some.curves.grid, Window.of(some.curves.grid, window_m)
+        looks = effective_looks(some.at(0.0), window)
+        least = request.least_coherence, task.ambiguity_m
+        return View(plane, some.curves.sights, window, looks, *least)
+
+    view, closer = view_of(few), view_of(images)
+    large = task.large_window(view.looks, view.window)
+    start_m = few.curves.start_m(grid)
+    swept = sweep(few, start_m, offset_m, view.window, large, progress)
+    reliable = swept.coherence >= noise_coherence(view.looks, _FALSE_ALARM / len(offset_m))
     end = end_of(swept) if reliable.mean() > 2 * _FALSE_ALARM else None
-    side_m, large_m = large.rows * float(np.linalg.norm(few.curves.grid.vectors_m[1])), None
+    side_m, large_m = large.rows * float(np.linalg.norm(view.grid.vectors_m[1])), None
     if np.ptp(request.search_m) > task.ambiguity_m and side_m > min(_sides_m(grid)):
         large_m = side_m
     doubts = Doubts(end, large_m, task.ambiguity_m)
 
-    height_m = _enlarged(filled(swept.height_m, reliable), (_SWEPT, _SWEPT), curves.grid.shape)
-    reliable = _enlarged(reliable.astype(np.float32), (_SWEPT, _SWEPT), curves.grid.shape) > 0.5
-    blur_m = curves.blur_m(height_m)[reliable]
+    height_m = filled(swept.height_m, reliable)
+    blur_m = few.curves.blur_m(height_m)[reliable]
     if blur_m.size and np.median(blur_m) > _MOST_BLUR * window_m:
-        formed_m = _enlarged(height_m, (every, 1), fine.grid.shape)
+        formed_m = _enlarged(height_m, (_SWEPT * every, _SWEPT), fine.grid.shape)
         images = CurveImages.of(task.straight, fine, every, formed_m)
-    window = Window.of(curves.grid, window_m)
-    view = View(
-        curves.grid, curves.sights, window, effective_looks(images.at(0.0), window),
-        request.least_coherence, task.ambiguity_m,
-    )  # fmt: skip
-    found_m = refine(images.products, height_m, window.any_of(reliable), view).relief_m
-    relief = relief_of(curves.moved(found_m), found_m, reliable, task.ambiguity_m)
-    return *_at_pixels(relief, curves, window, task.blocks), doubts
+        few = images.few(_SWEPT)
+    found = refine(few.products, height_m, view.window.any_of(reliable), view)
+    height_m = _enlarged(found.relief_m, (_SWEPT, _SWEPT), closer.grid.shape)
+    reliable = _enlarged(reliable.astype(np.float32), (_SWEPT, _SWEPT), closer.grid.shape) > 0.5
+    found = refine(images.products, height_m, closer.window.any_of(reliable), closer)
+    height_m = found.relief_m
+    relief = relief_of(images.curves.moved(height_m), height_m, reliable, task.ambiguity_m)
+    return *_at_pixels(relief, images.curves, closer.window, task.blocks), doubts
 
 
 def _enlarged(
