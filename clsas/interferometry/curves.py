@@ -71,7 +71,7 @@ class Curves:
         baseline : Baseline
         grid : Grid
         search_m : (lowest, highest)
-            Heights above the pixels of the grid.
+            Heights above the pixels of the grid. Beyond them, curves do not move.
         steps_m : (across, along)
             Distances of the curves across and along the track.
         """
@@ -291,7 +291,7 @@ class CurveImages:
         The curves on which `at` returns images.
     first : complex64 [rows, columns]
         Image of the first bank on these, without the phase of the range.
-    second : complex64 [fine rows, columns]
+    second : complex64 [1 + fine rows + 2, columns]
         Coefficients of a cubic spline across the track: image of the second bank on more curves,
         without that phase.
     every : int
@@ -343,7 +343,11 @@ class CurveImages:
         return cls(
             fine.every(every, 1),
             (first * back)[::every],
-            spline_filter1d(second * back, axis=0, output=np.complex64),
+            np.pad(
+                spline_filter1d(second * back, axis=0, output=np.complex64),
+                ((1, 2), (0, 0)),
+                "edge",
+            ),
             every,
             phase_rad,
             formed[::every],
@@ -367,15 +371,15 @@ class CurveImages:
         row = self.every * np.arange(len(self.first))[:, None]
         slope = np.gradient(self.phase_rad)
         rate, bend = slope[row], np.gradient(slope)[row]
-        before = np.clip(np.floor(row + moved), 1, len(self.second) - 3)
+        before = np.floor(row + moved)
         t = (row + moved - before).astype(np.float32)
         left, right = (1 - t) ** 3 / 6, t**3 / 6
         middle = 2 / 3 - t**2 * (1 - t / 2)
-        at, columns = before.astype(np.intp), np.arange(t.shape[1])
-        found = left * self.second[at - 1, columns]
-        found += middle * self.second[at, columns]
-        found += (1 - left - middle - right) * self.second[at + 1, columns]
-        found += right * self.second[at + 2, columns]
+        at = np.clip(before, 0, len(self.second) - 4).astype(np.intp), np.arange(t.shape[1])
+        found = left * self.second[at]
+        found += middle * self.second[1:][at]
+        found += (1 - left - middle - right) * self.second[2:][at]
+        found += right * self.second[3:][at]
         found *= phasors((moved * (rate + moved * bend / 2)).astype(np.float32))
         return self.first, found
 

@@ -439,7 +439,8 @@ def _first_relief(
     step_m = window_m / _CURVES
     across_m = spacing_m(task.baseline, task.level, task.relative_band)
     every = max(round(step_m / across_m), 1)
-    fine = Curves.over(task.baseline, grid, request.search_m, (across_m, step_m))
+    ends_m = float(offset_m[0]), float(offset_m[-1])
+    fine = Curves.over(task.baseline, grid, ends_m, (across_m, step_m))
     validate.memory("grid and search_m", 8 * len(offset_m) * fine.grid.size // every)
     images = CurveImages.of(task.straight, fine, every)
     few = images.few(_SWEPT)
