@@ -346,7 +346,7 @@ class CurveImages:
             np.pad(
                 spline_filter1d(second * back, axis=0, output=np.complex64),
                 ((1, 2), (0, 0)),
-                "edge",
+                "reflect",
             ),
             every,
             phase_rad,

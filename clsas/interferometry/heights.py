@@ -305,7 +305,11 @@ def measured(
         task.ambiguity_m,
     )  # fmt: skip
     refined = refine(
-        products_at, relief_m, known, view, lambda done: report(len(offset_m) + done, total)
+        products_at,
+        relief_m,
+        known,
+        view,
+        progress=lambda done: report(len(offset_m) + done, total),
     )
     report(total, total)
     images, products = last[0]
@@ -471,7 +475,7 @@ def _first_relief(
     found = refine(few.products, height_m, view.window.any_of(reliable), view)
     height_m = _enlarged(found.relief_m, (_SWEPT, _SWEPT), closer.grid.shape)
     reliable = _enlarged(reliable.astype(np.float32), (_SWEPT, _SWEPT), closer.grid.shape) > 0.5
-    found = refine(images.products, height_m, closer.window.any_of(reliable), closer)
+    found = refine(images.products, height_m, closer.window.any_of(reliable), closer, passes=1)
     height_m = found.relief_m
     relief = relief_of(images.curves.moved(height_m), height_m, reliable, task.ambiguity_m)
     return *_at_pixels(relief, images.curves, closer.window, task.blocks), doubts

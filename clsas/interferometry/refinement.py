@@ -41,7 +41,8 @@ from clsas.interferometry.coherence import (
 PASSES = 6
 """Most passes. Two or three are usual."""
 
-# Rms correction of the last pass, in standard deviations. The next one corrects a tenth of that.
+# Rms correction of the last pass, in standard deviations. Another one would correct a hundredth of
+# that.
 _CONVERGED = 1.0
 # Last correction of a pixel, in deviations, from which on it is not valid: its window reaches to
 # where the relief is unknown, and contains echoes of another height.
@@ -157,6 +158,7 @@ def refine(
     relief_m: NDArray[np.float64],
     known: NDArray[np.bool_],
     view: View,
+    passes: int = PASSES,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Refined:
     """Return heights, starting from those of a sweep.
@@ -170,6 +172,8 @@ def refine(
     known : bool [rows, columns]
         Where they are known, or decided by the windows themselves.
     view : View
+    passes : int
+        Most passes.
     progress : callable
         Called with the number of passes done.
     """
@@ -179,7 +183,7 @@ def refine(
     level_growth = edge_growth(window, shape)
     looks_on_plane = view.looks * window.fullness(shape) / level
     first_m, slope_m = relief_m, np.array(np.gradient(relief_m))
-    for done in range(1, PASSES + 1):
+    for done in range(1, passes + 1):
         rad_m, facing = sensitivity(view, relief_m, slope_m)
         planes = fit_planes(products_at(relief_m), relief_m, -1 / rad_m, window)
         seen = looks_on_plane * np.maximum(facing, _LEAST_FORESHORTENING)
