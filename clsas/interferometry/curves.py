@@ -353,18 +353,6 @@ class CurveImages:
             formed[::every],
         )
 
-    def few(self, step: int) -> Self:
-        """Return the images on every so many rows and columns."""
-        some = slice(None, None, step)
-        return replace(
-            self,
-            curves=self.curves.every(step, step),
-            first=self.first[some, some],
-            second=self.second[:, some],
-            every=self.every * step,
-            formed=self.formed[some, some],
-        )
-
     def at(self, height_m: NDArray[np.float64] | float) -> Images:
         """Return the images at heights above the plane, without a phase that both share."""
         moved = self.every * self.curves.displaced(height_m) - self.formed

@@ -61,11 +61,10 @@ LEAST_COHERENCE = 0.5
 
 _LOOKS = 50.0  # in the default window: a deviation of 0.1 rad at a coherence of 0.7
 _TRIAL_PIXELS = 9  # side of the window that measures the density of samples; arbitrary
-# Curves along the side of a window, about twice as many as independent samples. With half as many,
-# heights found on the relief differ from those on the curves by half a deviation, and another pass
-# is needed. The sweep takes every other curve; all of them would make 0.6 % more of simulated dunes
-# valid and take four times as long.
-_CURVES, _SWEPT = 10, 2
+# Curves along the side of a window. With 5, heights of the relief differ from those of the curves by
+# a deviation, and 1 % of simulated dunes is lost; with 10, the sweep takes twice as long.
+_CURVES = 7
+_BLOCKS = 10  # along the side of a window
 # Half a cycle, in deviations of the height that the magnitude of the coherence shows: 0.1 % of the
 # cycles are wrong at the least coherence. Half the value loses a tenth of simulated dunes, twice
 # the value gives the same heights.
@@ -407,7 +406,7 @@ class Task:
         check_looks(window_m, looks)
         return cls(
             straight, grid, request, baseline, relative_band, ambiguity_m, level, images.plan,
-            window_m, window, looks, max(min(window.sides) // _CURVES, 1),
+            window_m, window, looks, max(min(window.sides) // _BLOCKS, 1),
         )  # fmt: skip
 
     @property
@@ -447,38 +446,31 @@ def _first_relief(
     fine = Curves.over(task.baseline, grid, ends_m, (across_m, step_m))
     validate.memory("grid and search_m", 8 * len(offset_m) * fine.grid.size // every)
     images = CurveImages.of(task.straight, fine, every)
-    few = images.few(_SWEPT)
-
-    def view_of(some: CurveImages) -> View:
-        plane, window = some.curves.grid, Window.of(some.curves.grid, window_m)
-        looks = effective_looks(some.at(0.0), window)
-        least = request.least_coherence, task.ambiguity_m
-        return View(plane, some.curves.sights, window, looks, *least)
-
-    view, closer = view_of(few), view_of(images)
-    large = task.large_window(view.looks, view.window)
-    start_m = few.curves.start_m(grid)
-    swept = sweep(few, start_m, offset_m, view.window, large, progress)
-    reliable = swept.coherence >= noise_coherence(view.looks, _FALSE_ALARM / len(offset_m))
+    curves = images.curves
+    window = Window.of(curves.grid, window_m)
+    looks = effective_looks(images.at(0.0), window)
+    large = task.large_window(looks, window)
+    swept = sweep(images, curves.start_m(grid), offset_m, window, large, progress)
+    reliable = swept.coherence >= noise_coherence(looks, _FALSE_ALARM / len(offset_m))
     end = end_of(swept) if reliable.mean() > 2 * _FALSE_ALARM else None
-    side_m, large_m = large.rows * float(np.linalg.norm(view.grid.vectors_m[1])), None
+    side_m, large_m = large.rows * float(np.linalg.norm(curves.grid.vectors_m[1])), None
     if np.ptp(request.search_m) > task.ambiguity_m and side_m > min(_sides_m(grid)):
         large_m = side_m
     doubts = Doubts(end, large_m, task.ambiguity_m)
 
     height_m = filled(swept.height_m, reliable)
-    blur_m = few.curves.blur_m(height_m)[reliable]
+    blur_m = curves.blur_m(height_m)[reliable]
     if blur_m.size and np.median(blur_m) > _MOST_BLUR * window_m:
-        formed_m = _enlarged(height_m, (_SWEPT * every, _SWEPT), fine.grid.shape)
+        formed_m = _enlarged(height_m, (every, 1), fine.grid.shape)
         images = CurveImages.of(task.straight, fine, every, formed_m)
-        few = images.few(_SWEPT)
-    found = refine(few.products, height_m, view.window.any_of(reliable), view)
-    height_m = _enlarged(found.relief_m, (_SWEPT, _SWEPT), closer.grid.shape)
-    reliable = _enlarged(reliable.astype(np.float32), (_SWEPT, _SWEPT), closer.grid.shape) > 0.5
-    found = refine(images.products, height_m, closer.window.any_of(reliable), closer, passes=1)
+    view = View(
+        curves.grid, curves.sights, window, looks, request.least_coherence, task.ambiguity_m
+    )
+    found = refine(images.products, height_m, window.any_of(reliable), view)
     height_m = found.relief_m
-    relief = relief_of(images.curves.moved(height_m), height_m, reliable, task.ambiguity_m)
-    return *_at_pixels(relief, images.curves, closer.window, task.blocks), doubts
+    seen = reliable & found.usable  # other heights jump, which looks like layover
+    relief = relief_of(curves.moved(height_m), height_m, seen, task.ambiguity_m)
+    return *_at_pixels(relief, curves, window, task.blocks), doubts
 
 
 def _enlarged(

@@ -46,7 +46,7 @@ PASSES = 6
 _CONVERGED = 1.0
 # Last correction of a pixel, in deviations, from which on it is not valid: its window reaches to
 # where the relief is unknown, and contains echoes of another height.
-_UNSETTLED = 2.0
+_UNSETTLED = 3.0
 _CREDIBLE = 0.25  # largest credible correction of the sweep, in heights of ambiguity; arbitrary
 _FALSE_ALARM = 1e-3  # share of incoherent windows that exceed the threshold of coherence
 # Rms distance of the relief from the plane of a window, in deviations. Noise of the heights makes
@@ -158,7 +158,6 @@ def refine(
     relief_m: NDArray[np.float64],
     known: NDArray[np.bool_],
     view: View,
-    passes: int = PASSES,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Refined:
     """Return heights, starting from those of a sweep.
@@ -172,8 +171,6 @@ def refine(
     known : bool [rows, columns]
         Where they are known, or decided by the windows themselves.
     view : View
-    passes : int
-        Most passes.
     progress : callable
         Called with the number of passes done.
     """
@@ -183,7 +180,7 @@ def refine(
     level_growth = edge_growth(window, shape)
     looks_on_plane = view.looks * window.fullness(shape) / level
     first_m, slope_m = relief_m, np.array(np.gradient(relief_m))
-    for done in range(1, passes + 1):
+    for done in range(1, PASSES + 1):
         rad_m, facing = sensitivity(view, relief_m, slope_m)
         planes = fit_planes(products_at(relief_m), relief_m, -1 / rad_m, window)
         seen = looks_on_plane * np.maximum(facing, _LEAST_FORESHORTENING)
