@@ -226,18 +226,25 @@ def sight_lattice(
     counts : (rows, columns, levels)
         Points of the lattice along every axis.
     """
-    rows, columns = (
-        np.unique(np.linspace(0, n - 1, min(count, n)).round())
-        for n, count in zip(plane.shape, counts, strict=False)
-    )
+    rows, columns = lattice_places(plane, counts[:2])
     offset_m = np.linspace(*span_m, counts[2])
-    points_m = plane.positions_m()[np.ix_(rows.astype(int), columns.astype(int))][..., None, :]
+    points_m = plane.positions_m()[np.ix_(rows, columns)][..., None, :]
     points_m = (points_m + offset_m[:, None] * [0.0, 0.0, 1.0]).reshape(-1, 3)
     sight, roll = baseline.sight(points_m), baseline.rad_per_roll(points_m)
     values = np.column_stack([sight.rad_m, in_pixels(plane, sight.tangent), roll])
-    return Lattice(
-        rows, columns, offset_m, values.reshape(len(rows), len(columns), len(offset_m), 4)
+    values = values.reshape(len(rows), len(columns), len(offset_m), 4)
+    return Lattice(rows.astype(float), columns.astype(float), offset_m, values)
+
+
+def lattice_places(
+    plane: Grid, counts: tuple[int, int] = (_LATTICE, _LATTICE)
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return rows and columns spread over a plane."""
+    rows, columns = (
+        np.unique(np.linspace(0, n - 1, min(count, n)).round().astype(int))
+        for n, count in zip(plane.shape, counts, strict=True)
     )
+    return rows, columns
 
 
 def in_pixels(grid: Grid, horizontal_m: NDArray[np.float64]) -> NDArray[np.float64]:

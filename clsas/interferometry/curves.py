@@ -22,18 +22,15 @@ from scipy.ndimage import map_coordinates, spline_filter1d
 
 from clsas.engine.data.fourier import phasors, turned
 from clsas.engine.data.grid import Grid, without_heights
-from clsas.interferometry.baseline import Baseline, Lattice, in_pixels
+from clsas.engine.data.lines import RangeLines
+from clsas.interferometry.baseline import Baseline, Lattice, in_pixels, lattice_places
 from clsas.interferometry.coherence import Images, Moments
 from clsas.interferometry.pair import Pair
 
 _OVERSAMPLING = 2.0  # of the band across the track; cubic splines then err by -45 dB at its ends
 _LEVELS = 5  # heights of the lattice, which a polynomial connects
-_LEAST_POINTS, _MOST_POINTS = 9, 33  # of the lattice along either side
-_SPACING = 1 / 4  # of these points, in ranges
-_NEWTON = 6  # iterations; with 4, curves err by less than 1 µm
 _SEEN = 0.01  # least relative weight of a channel that counts for the band
 _SPACE = 3  # pixels beyond the outermost curve, for the taps of the interpolation
-_LEAST_SLOPE = 1e-3  # of a range, per metre; below the track it does not change
 _TURNS = 3  # iterations of the curve through a place of a relief
 
 
@@ -99,17 +96,12 @@ class Curves:
             shape=tuple(map(int, shape)),
         )
 
-        antennas_m = baseline.a.phase_centres_m[baseline.channels]
-        away_m = np.linalg.norm(plane.spread(_LEAST_POINTS)[:, None] - antennas_m, axis=2)
-        counts = shape * steps_m / (_SPACING * float(away_m.min()))
-        rows, columns = (
-            np.unique(np.linspace(0, n - 1, min(n, int(count))).round())
-            for n, count in zip(shape, np.clip(counts, _LEAST_POINTS, _MOST_POINTS), strict=True)
-        )
-        points_m = plane.positions_m()[np.ix_(rows.astype(int), columns.astype(int))]
-        values = _traced(baseline, plane, points_m.reshape(-1, 3), z_m - level_m)
+        rows, columns = lattice_places(plane)
+        points_m = plane.positions_m()[np.ix_(rows, columns)].reshape(-1, 3)
+        values = _traced(baseline, plane, points_m, z_m - level_m)
         values = values.reshape(len(rows), len(columns), *values.shape[1:])
-        return cls(baseline, plane, Lattice(rows, columns, z_m - level_m, values))
+        places = rows.astype(float), columns.astype(float)
+        return cls(baseline, plane, Lattice(*places, z_m - level_m, values))
 
     @property
     def sights(self) -> Lattice:
@@ -197,88 +189,51 @@ def spacing_m(baseline: Baseline, plane: Grid, relative_band: float) -> float:
 def _traced(
     baseline: Baseline, plane: Grid, points_m: NDArray[np.float64], heights_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the values of a lattice at points of a level plane, [points, heights, 5].
+    """Return the values of a lattice at points of a level plane, [points, heights, 5]."""
+    weights, (_, of_b) = baseline.weights(points_m), baseline.gradients(points_m)
+    step_m = plane.vectors_m[1]
+    sight_m = points_m[:, None] - baseline.a.phase_centres_m[baseline.channels]
+    aspect = np.einsum("nci,ni->nc", sight_m, weights @ baseline.along)
+    aspect /= np.linalg.norm(sight_m, axis=2)
+    at_start_m = [_ranges_m(baseline, lines, points_m) for lines in (baseline.a, baseline.b)]
 
-    Ranges are means over the channels, weighted as the point of the plane sees them.
-    """
-    shape = len(points_m), len(heights_m)
-    channels = baseline.channels
-    first, second = (
-        (each.tx_m[channels], each.rx_m[channels]) for each in (baseline.a, baseline.b)
-    )
-    weights = np.repeat(baseline.weights(points_m), shape[1], axis=0)
-    along = weights @ baseline.along
-    level = along * [1, 1, 0] / np.linalg.norm(along[:, :2], axis=1, keepdims=True)
-    across = np.cross([0.0, 0.0, 1.0], level)
-    pitch = along[:, 2] / np.linalg.norm(along[:, :2], axis=1)
-    start_m, height_m = np.repeat(points_m, shape[1], axis=0), np.tile(heights_m, shape[0])
-    risen_m = height_m[:, None] * ([0.0, 0.0, 1.0] - pitch[:, None] * level)
+    def rising(at_m: NDArray[np.float64], rise_m: float) -> NDArray[np.float64]:
+        tangent = baseline.sight(at_m).tangent
+        return rise_m * np.column_stack([tangent, np.ones(len(tangent))])
 
-    of_start = _ranges_m(start_m, first)
-    moved_m = _slid_m(start_m + risen_m, across, first, weights, _mean(weights, of_start))
-    end_m = start_m + risen_m + moved_m[:, None] * across
-    range_m = _mean(weights, _ranges_m(end_m, second))
-    displaced_m = _slid_m(start_m, across, second, weights, range_m)
-    rad_m = -baseline.rad_per_m * np.gradient(range_m.reshape(shape), heights_m, axis=1)
-
-    # What a shift along the track changes from channel to channel is its part of their direction.
-    left_m = np.diff(_ranges_m(end_m, first) - of_start, axis=1)
-    centres_m = baseline.a.phase_centres_m[channels]
-    sight = np.einsum("nci,ni->nc", start_m[:, None] - centres_m, level)
-    turned = np.diff(sight / of_start, axis=1)
-    seen = weights[:, 1:]
-    blur_m = np.sqrt((seen * left_m**2).sum(axis=1) / (seen * turned**2).sum(axis=1))
-
-    pixels = [
-        in_pixels(plane, each[:, :2]) for each in (end_m - start_m, displaced_m[:, None] * across)
-    ]
-    return np.concatenate(
-        [
-            pixels[0], pixels[1][:, :1], rad_m.reshape(-1, 1),
-            (np.sign(height_m) * blur_m)[:, None],
-        ],
-        axis=1,
-    ).reshape(*shape, 5)  # fmt: skip
+    values = np.empty((len(points_m), len(heights_m), 5))
+    upwards = [n for n, height_m in enumerate(heights_m) if height_m >= 0]
+    downwards = [n for n, height_m in enumerate(heights_m) if height_m < 0][::-1]
+    for numbers in (upwards, downwards):
+        at_m, height_m = points_m, 0.0
+        for number in numbers:  # by the midpoint rule
+            rise_m = float(heights_m[number]) - height_m
+            at_m = at_m + rising(at_m + rising(at_m, rise_m / 2), rise_m)
+            height_m = float(heights_m[number])
+            change_m = [
+                _ranges_m(baseline, lines, at_m) - start_m
+                for lines, start_m in zip((baseline.a, baseline.b), at_start_m, strict=True)
+            ]
+            nearer_m = np.einsum("nc,nc->n", weights, change_m[1] - change_m[0])
+            # A shift along the track changes ranges by its part in the direction of each channel.
+            change, turn = np.diff(change_m[0], axis=1), np.diff(aspect, axis=1)
+            blur_m = np.sqrt(
+                (weights[:, 1:] * change**2).sum(axis=1) / (weights[:, 1:] * turn**2).sum(axis=1)
+            )
+            values[:, number, :2] = in_pixels(plane, (at_m - points_m)[:, :2])
+            values[:, number, 2] = nearer_m / (of_b @ step_m)
+            values[:, number, 3] = baseline.sight(at_m).rad_m
+            values[:, number, 4] = np.sign(height_m) * blur_m
+    return values
 
 
-Antennas = tuple[NDArray[np.float64], NDArray[np.float64]]
-
-
-def _ranges_m(points_m: NDArray[np.float64], antennas: Antennas) -> NDArray[np.float64]:
-    """Return the ranges of points from transmitters and receivers, [points, channels]."""
-    return sum(np.linalg.norm(points_m[:, None] - each_m, axis=2) for each_m in antennas) / 2
-
-
-def _mean(weights: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.einsum("nc,nc->n", weights, values)
-
-
-def _slid_m(
-    from_m: NDArray[np.float64],
-    direction: NDArray[np.float64],
-    antennas: Antennas,
-    weights: NDArray[np.float64],
-    range_m: NDArray[np.float64],
+def _ranges_m(
+    baseline: Baseline, lines: RangeLines, points_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return how far along a direction points have a mean range, metres, [points]."""
-    paths = []
-    for antenna_m in antennas:
-        away_m = from_m[:, None] - antenna_m
-        squared, along_m = (
-            np.einsum(sums, away_m, each)
-            for sums, each in (("nci,nci->nc", away_m), ("nci,ni->nc", direction))
-        )
-        paths.append((squared, along_m))
-    moved_m = np.zeros(len(from_m))
-    for _ in range(_NEWTON):
-        mean_m, slope = np.zeros((2, len(from_m)))
-        for squared, along_m in paths:
-            to_m = along_m + moved_m[:, None]
-            away_m = np.sqrt(squared + moved_m[:, None] * (along_m + to_m))
-            mean_m += _mean(weights, away_m) / 2
-            slope += _mean(weights, to_m / away_m) / 2
-        moved_m += (range_m - mean_m) / np.where(np.abs(slope) > _LEAST_SLOPE, slope, np.inf)
-    return moved_m
+    """Return the ranges of points from the channels of a bank, [points, channels]."""
+    antennas_m = lines.tx_m[baseline.channels], lines.rx_m[baseline.channels]
+    one, other = (np.linalg.norm(points_m[:, None] - each_m, axis=2) for each_m in antennas_m)
+    return np.asarray((one + other) / 2)
 
 
 @dataclass(frozen=True, eq=False)

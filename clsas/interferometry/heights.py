@@ -61,8 +61,8 @@ LEAST_COHERENCE = 0.5
 
 _LOOKS = 50.0  # in the default window: a deviation of 0.1 rad at a coherence of 0.7
 _TRIAL_PIXELS = 9  # side of the window that measures the density of samples; arbitrary
-# Curves along the side of a window. With 5, heights of the relief differ from those of the curves by
-# a deviation, and 1 % of simulated dunes is lost; with 10, the sweep takes twice as long.
+# Curves along the side of a window. With 5, heights on the relief differ from those on the curves
+# by a deviation, and 1 % of simulated dunes is lost; with 10, the sweep takes twice as long.
 _CURVES = 7
 _BLOCKS = 10  # along the side of a window
 # Half a cycle, in deviations of the height that the magnitude of the coherence shows: 0.1 % of the
