@@ -167,13 +167,8 @@ class Lattice:
     ) -> NDArray[np.float64]:
         """Return the quantities at all crossings of rows and columns, [quantities, n, m].
 
-        Between the points of the lattice they are cubic splines along rows and columns, and a
-        polynomial along heights.
-
-        Parameters
-        ----------
-        rows, columns : array [n], [m]
-        offset_m : float64, broadcast to [n, m]
+        Heights broadcast to [n, m]. Between the points of the lattice, quantities are cubic splines
+        along rows and columns, and a polynomial along heights.
         """
         middle_m = (self.offset_m[0] + self.offset_m[-1]) / 2
         half_m = max(float(np.ptp(self.offset_m)) / 2, 1e-9)
@@ -212,19 +207,10 @@ def sight_lattice(
     span_m: tuple[float, float],
     counts: tuple[int, int, int] = (_LATTICE, _LATTICE, _LEVELS),
 ) -> Lattice:
-    """Return how the banks see places above a plane.
+    """Return how the banks see places between two heights above a plane.
 
     The quantities are K (rad/m), the tangent, in rows and columns per metre of rise, and the phase
     per radian of roll.
-
-    Parameters
-    ----------
-    baseline : Baseline
-    plane : Grid
-    span_m : (lowest, highest)
-        Heights above the plane.
-    counts : (rows, columns, levels)
-        Points of the lattice along every axis.
     """
     rows, columns = lattice_places(plane, counts[:2])
     offset_m = np.linspace(*span_m, counts[2])

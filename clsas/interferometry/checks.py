@@ -162,17 +162,7 @@ def check_geometry(
     relative_band: float,
     least_coherence: float,
 ) -> float:
-    """Return the height of ambiguity, metres; raise UnmeasurableError if there are no heights.
-
-    Parameters
-    ----------
-    baseline : Baseline
-    grid : Grid
-    search_m : (low, high)
-    relative_band : float
-        Bandwidth over the frequency in its middle.
-    least_coherence : float
-    """
+    """Return the height of ambiguity, metres; raise UnmeasurableError if there are no heights."""
     points_m = grid.spread(_POINTS)
     low_m, high_m = search_m
     # These come first: far from the sonar the phase hardly changes, so a search that reaches too

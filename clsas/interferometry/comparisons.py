@@ -47,15 +47,8 @@ _MOST_CYCLES = 3.0  # heights of ambiguity by which heights may be displaced; ar
 class Comparison:
     """Heights that errors of the pair explain.
 
-    Attributes
-    ----------
-    equations_at : callable
-        Returns the equations at a phase and a roll, float64 [2].
-    places : Places
-    what : str
-        Where heights are compared, for messages.
-    roll_rad : float
-        Largest phase per radian of roll.
+    The equations are those at a phase and a roll, float64 [2]. For messages, `what` says where
+    heights are compared, and `roll_rad` is the largest phase per radian of roll.
     """
 
     equations_at: Callable[[NDArray[np.float64]], Equations]
@@ -171,14 +164,8 @@ def _most_roll_rad(surface: Displaced) -> float:
 class MovedBack(NamedTuple):
     """Heights at some places, without the displacement that errors of the pair cause.
 
-    NaN where none was found.
-
-    Attributes
-    ----------
-    z_m, sd_m : float64 [n]
-        z of the seabed, and its deviation.
-    per_error_m : float64 [n, 2]
-        Change of z per radian of phase and per radian of roll.
+    The last ones are the changes of z per radian of phase and per radian of roll, [n, 2]. NaN where
+    none was found.
     """
 
     z_m: NDArray[np.float64]
@@ -246,16 +233,9 @@ class Displaced:
         rough_z_m: NDArray[np.float64],
         errors_rad: NDArray[np.float64],
     ) -> MovedBack:
-        """Return the heights at places if the pair has certain errors.
+        """Return the heights at places, x and y [n, 2], if the pair has a certain phase and roll.
 
-        Parameters
-        ----------
-        places_m : float64 [n, 2]
-            x and y.
-        rough_z_m : float64 [n]
-            z near those places, where K and the tangent are evaluated.
-        errors_rad : float64 [2]
-            Phase and roll.
+        K and the tangent are evaluated at the rough z, [n].
         """
         row, column = self.pixels_of(places_m).T
         offset_m = rough_z_m - self.plane_z_m(row, column)
@@ -303,16 +283,7 @@ def _smooth_m_per_rad(found: Heights, plane: Grid) -> NDArray[np.float64]:
 
 
 class Elevation(NamedTuple):
-    """How a pair sees one place.
-
-    Attributes
-    ----------
-    range_m : float
-    rad_m : float
-        Change K of the phase per metre of height along the curve of constant range.
-    rad_per_roll : float
-        Phase per radian of roll.
-    """
+    """How a pair sees one place: range, K along the curve of constant range, and rad per roll."""
 
     range_m: float
     rad_m: float

@@ -61,16 +61,9 @@ class Curves:
         search_m: tuple[float, float],
         steps_m: tuple[float, float],
     ) -> Self:
-        """Return the curves that reach a plane or height map at the heights of a search.
+        """Return the curves that reach a grid at the heights of a search above its pixels.
 
-        Parameters
-        ----------
-        baseline : Baseline
-        grid : Grid
-        search_m : (lowest, highest)
-            Heights above the pixels of the grid. Beyond them, curves do not move.
-        steps_m : (across, along)
-            Distances of the curves across and along the track.
+        Steps are their distances across and along the track. Beyond the search, curves do not move.
         """
         low_m, high_m = (float(each[2]) for each in grid.bounds_m)
         z_m = np.linspace(low_m + search_m[0], high_m + search_m[1], _LEVELS)
@@ -240,21 +233,10 @@ def _ranges_m(
 class CurveImages:
     """Images of both banks along curves of equal range, which show them at any height.
 
-    Attributes
-    ----------
-    curves : Curves
-        The curves on which `at` returns images.
-    first : complex64 [rows, columns]
-        Image of the first bank on these, without the phase of the range.
-    second : complex64 [1 + fine rows + 2, columns]
-        Coefficients of a cubic spline across the track: image of the second bank on more curves,
-        without that phase.
-    every : int
-        Rows of `second` per row of `first`.
-    phase_rad : float64 [fine rows]
-        The phase that was taken out.
-    formed : float64 [rows, columns]
-        Rows by which the image of the second bank is displaced at the heights where it was formed.
+    Those of the second bank are on every row of the curves, as coefficients of a cubic spline with
+    one row before and two behind. Those of the first are on every so many rows, as are `curves`,
+    and the rows by which the second's image is displaced at the heights where it was formed.
+    `phase_rad`, that of the range to every row, was taken out of both.
     """
 
     curves: Curves
@@ -268,17 +250,9 @@ class CurveImages:
     def of(
         cls, pair: Pair, fine: Curves, every: int, height_m: NDArray[np.float64] | None = None
     ) -> Self:
-        """Form the images.
+        """Form images on curves as close as the band requires, on their plane or above it.
 
-        Parameters
-        ----------
-        pair : Pair
-        fine : Curves
-            Curves as close as the band requires.
-        every : int
-            Rows of them per row of the images.
-        height_m : float64, broadcast to [fine rows, columns], optional
-            Heights above the plane at which to form them. By default they are formed on the plane.
+        Every so many rows of the first are kept.
         """
         plane = fine.grid
         grid, formed = plane, np.zeros(plane.shape)

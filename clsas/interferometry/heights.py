@@ -249,17 +249,7 @@ def measure(
 
 
 class Measured(NamedTuple):
-    """Heights, and how they were found.
-
-    Attributes
-    ----------
-    heights : Heights
-    refined : Refined
-        Includes pixels in shadow.
-    sights : Lattice
-        How the banks see the grid.
-    doubts : Doubts
-    """
+    """Heights, those with pixels in shadow, how the banks see the grid, and doubts."""
 
     heights: Heights
     refined: Refined
@@ -289,7 +279,7 @@ def measured(
 
     def products_at(relief_m: NDArray[np.float64]) -> Moments:
         middle = (1 - side) / (2 * side)  # of the first pixel, from that of the first block
-        finer_m = _enlarged(relief_m, (side, side), shape, middle)
+        finer_m = _interpolated(relief_m, (side, side), shape, middle)
         images = pair.images(plane.with_height(finer_m))
         last[:] = [(images, Moments.multilooked(*images.pixels, side))]
         return last[0][1]
@@ -333,12 +323,8 @@ def measured(
 def windows(pair: Pair, grid: Grid, request: Request) -> tuple[float, Window, Window]:
     """Return the windows with which heights of a grid, or of one like it, are measured.
 
-    Returns
-    -------
-    window_m : float
-        The requested one, or the default.
-    window, large : Window
-        Windows of the heights, and those that decide between cycles of the phase.
+    They are the side of the windows, metres, these windows, and those that decide between cycles
+    of the phase.
     """
     task = Task.of(pair, grid, request)
     return task.window_m, task.window, task.large_window(task.looks, task.window)
@@ -348,29 +334,10 @@ def windows(pair: Pair, grid: Grid, request: Request) -> tuple[float, Window, Wi
 class Task:
     """Two banks, the grid whose heights they measure, and what follows from both.
 
-    Attributes
-    ----------
-    straight : Pair
-        The banks in homogeneous water. Rays are exact only in the last images.
-    grid : Grid
-        A plane, or a height map from which the search starts.
-    request : Request
-    baseline : Baseline
-        How the banks see the grid.
-    relative_band : float
-        Bandwidth over the frequency in its middle.
-    ambiguity_m : float
-        Height of ambiguity.
-    level : Grid
-        The plane of the grid, raised by its mean height.
-    plan : Plan or None
-        Plan of the images of both banks there.
-    window_m : float
-    window : Window
-    looks : float
-        Effective number of looks of a window.
-    side : int
-        Pixels along the side of the blocks over which products of images are summed at once.
+    The banks are those in homogeneous water: rays are exact only in the last images. `level` is the
+    plane of the grid, raised by its mean height, and `plan` that of the images there. `looks` is
+    the effective number of looks of a window. `side` is that of the blocks of pixels over which
+    products of images are summed at once.
     """
 
     straight: Pair
@@ -461,7 +428,7 @@ def _first_relief(
     height_m = filled(swept.height_m, reliable)
     blur_m = curves.blur_m(height_m)[reliable]
     if blur_m.size and np.median(blur_m) > _MOST_BLUR * window_m:
-        formed_m = _enlarged(height_m, (every, 1), fine.grid.shape)
+        formed_m = _interpolated(height_m, (every, 1), fine.grid.shape)
         images = CurveImages.of(task.straight, fine, every, formed_m)
     view = View(
         curves.grid, curves.sights, window, looks, request.least_coherence, task.ambiguity_m
@@ -473,7 +440,7 @@ def _first_relief(
     return *_at_pixels(relief, curves, window, task.blocks), doubts
 
 
-def _enlarged(
+def _interpolated(
     values: NDArray, factors: tuple[int, int], shape: tuple[int, ...], offset: float = 0.0
 ) -> NDArray:
     """Return values on rows and columns that are closer by factors, interpolated linearly."""

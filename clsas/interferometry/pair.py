@@ -23,16 +23,7 @@ from clsas.interferometry.coherence import Images
 
 
 class PairImages(NamedTuple):
-    """Images of both banks on one grid.
-
-    Attributes
-    ----------
-    first, second : Image
-    plan : Plan or None
-        How they were formed; None if they are exact.
-    seconds : float
-        Time that they took.
-    """
+    """Images of both banks on one grid, their plan unless they are exact, and their time."""
 
     first: Image
     second: Image

@@ -277,17 +277,10 @@ def _check_belongs(surface: Displaced, name: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Estimate:
-    """A phase, a roll or both.
+    """A phase, a roll or both: which (columns 0 and 1), their values and covariance, [2, 2].
 
-    Attributes
-    ----------
-    columns : list of int
-        Which were estimated: 0 for the phase, 1 for the roll.
-    values, covariance : float64 [2], [2, 2]
-        Both errors, 0 where they were not estimated.
-    absorbed : float
-        Phase that an estimate of the phase alone would absorb per radian of roll.
-    fit : Fit
+    These are 0 where they were not estimated. An estimate of the phase alone would absorb `absorbed`
+    of it per radian of roll.
     """
 
     columns: list[int]

@@ -73,20 +73,10 @@ _ROWS, _WINDOWS = 64, 4
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """How two banks see a surface, and which heights on it are valid.
+    """How two banks see places above a plane, and which heights are valid.
 
-    Attributes
-    ----------
-    grid : Grid
-        The plane above which heights are measured.
-    sights : Lattice
-        K and the tangent of the curves of equal range; see `sight_lattice`.
-    window : Window
-    looks : float
-        Effective number of looks of a window on a level surface. They must not be measured on a
-        relief: its small errors shift the phase of neighbouring pixels, which then seem
-        uncorrelated.
-    least_coherence, ambiguity_m : float
+    Looks are those of a window on a level surface. They must not be measured on a relief: its small
+    errors shift the phase of neighbouring pixels, which then seem uncorrelated.
     """
 
     grid: Grid
@@ -160,19 +150,10 @@ def refine(
     view: View,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Refined:
-    """Return heights, starting from those of a sweep.
+    """Return heights, starting from those of a relief above the plane of a view.
 
-    Parameters
-    ----------
-    products_at : callable
-        Returns the products of both images on a relief, in every pixel or block of pixels.
-    relief_m : float64 [rows, columns]
-        Heights above the plane.
-    known : bool [rows, columns]
-        Where they are known, or decided by the windows themselves.
-    view : View
-    progress : callable
-        Called with the number of passes done.
+    Products of both images on a relief, pixel by pixel or block by block, come from a function. A
+    pixel is known if the relief shows its height, or windows decide by themselves.
     """
     window, shape = view.window, relief_m.shape
     # A slope that faces the sonar is imaged with more pixels per independent sample.
@@ -218,13 +199,7 @@ def sensitivity(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the change of phase per metre of height error, rad/m, and the foreshortening.
 
-    Parameters
-    ----------
-    view : View
-    offset_m : float64, broadcast to [rows, columns]
-        Heights above its plane.
-    slope_m : float64, broadcast to [2, rows, columns]
-        Their slopes, metres per row and per column.
+    Heights above the plane, and their slopes per row and column, broadcast to [rows, columns].
     """
     _, row_step_m, column_step_m = view.grid.vectors_m
     rows, columns = map(np.arange, view.grid.shape)
@@ -243,18 +218,9 @@ def displacement_m(
     """Return the rms displacement of heights by the curvature of the seabed within windows, metres.
 
     A plane displaces the middle of a curved window, and does so again if it is fitted to the
-    heights that were found. That second displacement estimates the first one (Tukey 1977). Its mean
-    square around every pixel, less that of noise, is the square of the result.
-
-    Parameters
-    ----------
-    bend_m : float64 [rows, columns]
-        Displacement of the relief by planes, `Planes.bend_m`.
-    noise_m : float64 [rows, columns]
-        Deviation of the heights by noise.
-    valid : bool [rows, columns]
-        Pixels that count.
-    window : Window
+    heights that were found. That second displacement, `Planes.bend_m`, estimates the first one
+    (Tukey 1977). Its mean square around every valid pixel, less that of noise, is the square of the
+    result.
     """
     excess = np.where(valid, bend_m**2 - _BEND_NOISE * noise_m**2, 0.0)
     around = window.scaled(_BENDING)
@@ -308,14 +274,7 @@ def fit_planes(
 ) -> Planes:
     """Return the planes that the products of two images on a relief show.
 
-    Parameters
-    ----------
-    products : Moments
-    height_m : float64 [rows, columns]
-        The relief.
-    m_per_rad : float64 [rows, columns]
-        Change M of the height per radian of phase.
-    window : Window
+    A radian of phase changes the height by `m_per_rad`, [rows, columns].
     """
     return _in_strips(partial(_fit, window=window), (*products, height_m, m_per_rad), window)
 
@@ -392,16 +351,7 @@ def edge_growth(window: Window, shape: tuple[int, ...]) -> NDArray[np.float64]:
 def _in_strips(
     function: Callable[..., Planes], arrays: tuple[NDArray, ...], window: Window
 ) -> Planes:
-    """Return the results of a function of windows around every pixel.
-
-    Parameters
-    ----------
-    function : callable
-        Takes the arrays, some rows of them, and returns a named tuple of arrays of the same shape.
-        A result depends on the pixels within half a window.
-    arrays : arrays [rows, columns]
-    window : Window
-    """
+    """Return what a function of windows around every pixel returns, strip by strip in threads."""
     rows, margin = len(arrays[0]), window.rows // 2
     height = max(_ROWS, _WINDOWS * window.rows)
 

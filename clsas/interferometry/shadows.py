@@ -155,13 +155,9 @@ class ReliefPart:
     ) -> NDArray[np.bool_]:
         """Return which valid pixels are hidden, bool [rows, columns].
 
-        Parameters
-        ----------
-        fine, coarse : Skyline
-            `roof_m` of the whole relief, and `highest_m` at the first pixel of every block.
-        inside : (rows, columns)
-            Pixels of this part that matter, by default all. A window and a block before them must
-            belong to the part too, unless the relief begins there.
+        The skylines are those of `roof_m` of the whole relief, and of `highest_m` at the first
+        pixel of every block. Around the pixels that matter, by default all, a window and a block
+        before them must belong to this part too, unless the relief begins there.
         """
         rows, columns = (
             np.arange(first, first + count)[part]
@@ -202,16 +198,8 @@ class ReliefPart:
     ) -> NDArray[np.bool_]:
         """Return which lines of sight pass below a skyline.
 
-        Parameters
-        ----------
-        skyline : Skyline
-        place : int64 [2, n]
-            Where the lines begin, counted in blocks of `every` x `every` pixels of the relief.
-        line_m : float64 [n]
-            Their heights there.
-        tangent : float64 [2, n]
-            Rows and columns per metre of rise, away from the sonar.
-        every : int
+        Lines begin at places, counted in blocks of `every` x `every` pixels, and heights, and move
+        away from the sonar by a tangent, rows and columns per metre of rise.
         """
         _, *steps_m = self.grid.vectors_m
         horizontal_m = np.array(steps_m)[:, :2].T

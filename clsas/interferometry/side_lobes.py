@@ -50,15 +50,7 @@ def from_elsewhere(
 ) -> NDArray[np.bool_]:
     """Return which pixels receive most of their power from beyond their own window.
 
-    Parameters
-    ----------
-    power : float [rows, columns]
-        Power of an image.
-    response : float64 [rows, columns]
-        Response to a point in the middle; see `point_response`.
-    window : Window
-        Windows in which powers are averaged. Responses within their extent count as the pixel's
-        own.
+    Responses to a point in the middle, within the extent of a window, count as the pixel's own.
     """
     row, column = middle(power.shape)
     inside = (
@@ -88,15 +80,9 @@ def middle(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 def point_response(pair: Pair, grid: Grid, plan: Plan | None) -> NDArray[np.float64]:
-    """Return the power of the first bank's image of a point in the middle of a grid.
+    """Return the power of the first bank's image of a point in the middle of a plane.
 
-    Parameters
-    ----------
-    pair : Pair
-    grid : Grid
-        A plane.
-    plan : Plan or None
-        Plan of the image of the first bank on it.
+    The plan is that of an image of the bank there, or None.
     """
     point_m = grid.positions_m()[middle(grid.shape)]
     lines, beam = pair.a, pair.beam
@@ -111,14 +97,8 @@ def lines_of_point(
     """Return the lines that a point would cause, with the band of the lines.
 
     Lines do not contain the length of the elements. It is taken to be twice the usual spacing of
-    the phase centres, the spacing up to which elements of that length are sampled.
-
-    Parameters
-    ----------
-    lines : RangeLines
-    point_m : float64 [3]
-    along : float64 [channels, 3]
-        Unit vectors along the track.
+    the phase centres, the spacing up to which elements of that length are sampled. They lie along
+    the track, unit vectors [channels, 3].
     """
     range_m = bistatic_range_m(point_m, *antennas_of(lines, np.arange(lines.channels)))
     spectrum = measure_spectrum(lines)

@@ -66,21 +66,9 @@ def sweep(
     coarse: Window,
     progress: Callable[[int], None],
 ) -> Sweep:
-    """Return the most likely height on every curve.
+    """Return the most likely height on every curve, from heights relative to those where it starts.
 
-    Parameters
-    ----------
-    images : CurveImages
-    start_m : float64, broadcast to [rows, columns]
-        Heights above the plane of the curves around which to search.
-    offset_m : float64 [heights]
-        Heights to search, relative to those.
-    window : Window
-        Window of the heights.
-    coarse : Window
-        Window that decides between cycles of the phase.
-    progress : callable
-        Called with the number of heights done.
+    Large windows decide between cycles of the phase.
     """
     coherence = np.empty((len(offset_m), *images.first.shape), np.complex64)
 
@@ -102,12 +90,8 @@ def sweep(
 def likeliest(coherence: NDArray[np.complex64], coarse: Window) -> NDArray[np.intp]:
     """Return the index of the most likely height for every pixel, [rows, columns].
 
-    Parameters
-    ----------
-    coherence : complex64 [heights, rows, columns]
-        Coherence in small windows, at `STEPS_PER_CYCLE` heights per cycle of the phase.
-    coarse : Window
-        Window that decides between cycles.
+    The coherence in small windows is given at `STEPS_PER_CYCLE` heights per cycle of the phase.
+    Large windows decide between cycles.
     """
     magnitude = np.abs(coherence)
     candidate = np.abs(np.angle(coherence)) <= _CANDIDATE_RAD
@@ -193,19 +177,9 @@ def relief_of(
 ) -> Relief:
     """Return the heights of places, from those of the scatterers on curves.
 
-    Neighbouring curves across the track form a surface between them. A place lies on none in
-    shadow, and on several in layover.
-
-    Parameters
-    ----------
-    moved : float64 [2, rows, columns]
-        Rows and columns by which the curves have moved at their heights.
-    height_m : float64 [rows, columns]
-    reliable : bool [rows, columns]
-        Curves whose height counts.
-    ambiguity_m : float
-        Height of ambiguity. Heights that differ by more than half of it are not neighbours on one
-        surface.
+    Neighbouring reliable curves across the track form a surface between the places to which they
+    have moved, unless their heights differ by more than half a height of ambiguity. A place lies on
+    none in shadow, and on several in layover.
     """
     rows, columns = height_m.shape
     place = np.arange(rows)[:, None] + moved[0]
