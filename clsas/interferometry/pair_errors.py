@@ -279,8 +279,8 @@ def _check_belongs(surface: Displaced, name: str) -> None:
 class _Estimate:
     """A phase, a roll or both: which (columns 0 and 1), their values and covariance, [2, 2].
 
-    These are 0 where they were not estimated. An estimate of the phase alone would absorb `absorbed`
-    of it per radian of roll.
+    These are 0 where not estimated. An estimate of the phase alone would absorb `absorbed` of it
+    per radian of roll.
     """
 
     columns: list[int]
