@@ -189,6 +189,17 @@ def test_no_cycle_is_wrong(measured, snr_db):
 
 
 @pytest.mark.exhaustive
+def test_a_swaying_track_does_not_blur_a_step():
+    """Images of the plane are blurred at its top, by less than those of the relief correct."""
+    lines = banks(step, snr_db=17, sway_m=0.14)
+    result = heights(*lines, GRID, search_m=(-1.0, 4.0), window_m=WINDOW_M)
+    assert result.mask.mean() > 0.7
+    error_m = (result.height_m - truth(step))[result.mask]
+    assert np.mean(np.abs(error_m) > AMBIGUITY_M / 2) < 0.005
+    assert np.sqrt(np.mean(error_m**2)) < 1.3 * np.sqrt(np.mean(result.sd_m[result.mask] ** 2))
+
+
+@pytest.mark.exhaustive
 def test_relief_of_several_heights_of_ambiguity():
     def tall(x, y):
         return 1.0 * np.sin(2 * np.pi * (y - 32) / 12) + 0.1 * np.sin(np.pi * x)
