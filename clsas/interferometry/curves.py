@@ -292,11 +292,13 @@ class CurveImages:
         t = (row + moved - before).astype(np.float32)
         left, right = (1 - t) ** 3 / 6, t**3 / 6
         middle = 2 / 3 - t**2 * (1 - t / 2)
-        at = np.clip(before, 0, len(self.second) - 4).astype(np.intp), np.arange(t.shape[1])
-        found = left * self.second[at]
-        found += middle * self.second[1:][at]
-        found += (1 - left - middle - right) * self.second[2:][at]
-        found += right * self.second[3:][at]
+        flat, columns = self.second.ravel(), t.shape[1]
+        at = np.clip(before, 0, len(self.second) - 4).astype(np.intp) * columns
+        at += np.arange(columns)
+        found = left * flat[at]
+        for weight in (middle, 1 - left - middle - right, right):
+            at += columns
+            found += weight * flat[at]
         found *= phasors((moved * (rate + moved * bend / 2)).astype(np.float32))
         return self.first, found
 

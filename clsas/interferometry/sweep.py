@@ -71,9 +71,10 @@ def sweep(
     Large windows decide between cycles of the phase.
     """
     coherence = np.empty((len(offset_m), *images.first.shape), np.complex64)
+    start = start_m if np.ptp(start_m) > 0 else float(start_m[0, 0])  # a number is faster
 
     def seen(height_m: float) -> NDArray[np.complexfloating]:
-        return images.products(start_m + height_m).within(window).coherence
+        return images.products(start + height_m).within(window).coherence
 
     for number, found in enumerate(in_threads(seen, offset_m)):
         coherence[number] = found

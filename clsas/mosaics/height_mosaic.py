@@ -152,8 +152,8 @@ def mosaic_heights(
     -----
     Every patch is measured with a margin of two windows and half a large one, which decides between
     the cycles of the phase, and with all that lies at the same ranges within the search. So heights
-    hardly depend on the division into patches: at most as much as they still change in the last
-    pass, about 0.3 standard deviations. The number of independent samples is measured in every
+    hardly depend on the division into patches: they change by about 0.2 standard deviations. The
+    number of independent samples is measured in every
     patch, and with it the standard deviation and the threshold of the coherence. Shadows may be
     longer than patches: once all are finished, they are found from the relief of all of them.
 
