@@ -8,7 +8,7 @@ on the curve. One image of a plane per bank therefore shows both banks at any he
 
 That holds for straight tracks. Deviations from one blur both images alike, the more, the farther a
 scatterer lies from the plane. They change neither coherence nor phase, but cost resolution along
-the track, by as much as `Curves.blur_m` states.
+the track, until both banks are imaged on the relief.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Curves:
         are wanted, so that each of them lies on one of the curves at every height.
     lattice : Lattice
         At heights above the plane: by how many rows and columns a curve has moved, by how many rows
-        the image of the second bank is displaced, K (rad/m), and the blur (m), negative below.
+        the image of the second bank is displaced, and K (rad/m).
     """
 
     baseline: Baseline
@@ -108,7 +108,7 @@ class Curves:
 
     def every(self, rows: int, columns: int) -> Self:
         """Return some of the curves: those of every so many rows and columns."""
-        lattice = self.lattice.every(rows, columns, [rows, columns, rows, 1, 1])
+        lattice = self.lattice.every(rows, columns, [rows, columns, rows, 1])
         grid = self.grid.window(slice(None, None, rows), slice(None, None, columns))
         return replace(self, grid=grid, lattice=lattice)
 
@@ -151,14 +151,6 @@ class Curves:
                 height_m += map_coordinates(start.height_m, [row, column], order=1, mode="nearest")
         return height_m
 
-    def blur_m(self, height_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how much the track's deviations blur images of the plane, [rows, columns].
-
-        This is the rms shift along the track by which the images of single channels, each from a
-        direction of its own, differ at these heights.
-        """
-        return np.abs(self._over_all(height_m, slice(4, 5))[0])
-
 
 def spacing_m(baseline: Baseline, plane: Grid, relative_band: float) -> float:
     """Return how close curves must be to sample images across the track, metres.
@@ -182,19 +174,16 @@ def spacing_m(baseline: Baseline, plane: Grid, relative_band: float) -> float:
 def _traced(
     baseline: Baseline, plane: Grid, points_m: NDArray[np.float64], heights_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the values of a lattice at points of a level plane, [points, heights, 5]."""
+    """Return the values of a lattice at points of a level plane, [points, heights, 4]."""
     weights, (_, of_b) = baseline.weights(points_m), baseline.gradients(points_m)
     step_m = plane.vectors_m[1]
-    sight_m = points_m[:, None] - baseline.a.phase_centres_m[baseline.channels]
-    aspect = np.einsum("nci,ni->nc", sight_m, weights @ baseline.along)
-    aspect /= np.linalg.norm(sight_m, axis=2)
     at_start_m = [_ranges_m(baseline, lines, points_m) for lines in (baseline.a, baseline.b)]
 
     def rising(at_m: NDArray[np.float64], rise_m: float) -> NDArray[np.float64]:
         tangent = baseline.sight(at_m).tangent
         return rise_m * np.column_stack([tangent, np.ones(len(tangent))])
 
-    values = np.empty((len(points_m), len(heights_m), 5))
+    values = np.empty((len(points_m), len(heights_m), 4))
     upwards = [n for n, height_m in enumerate(heights_m) if height_m >= 0]
     downwards = [n for n, height_m in enumerate(heights_m) if height_m < 0][::-1]
     for numbers in (upwards, downwards):
@@ -208,15 +197,9 @@ def _traced(
                 for lines, start_m in zip((baseline.a, baseline.b), at_start_m, strict=True)
             ]
             nearer_m = np.einsum("nc,nc->n", weights, change_m[1] - change_m[0])
-            # A shift along the track changes ranges by its part in the direction of each channel.
-            change, turn = np.diff(change_m[0], axis=1), np.diff(aspect, axis=1)
-            blur_m = np.sqrt(
-                (weights[:, 1:] * change**2).sum(axis=1) / (weights[:, 1:] * turn**2).sum(axis=1)
-            )
             values[:, number, :2] = in_pixels(plane, (at_m - points_m)[:, :2])
             values[:, number, 2] = nearer_m / (of_b @ step_m)
             values[:, number, 3] = baseline.sight(at_m).rad_m
-            values[:, number, 4] = np.sign(height_m) * blur_m
     return values
 
 
@@ -234,8 +217,7 @@ class CurveImages:
     """Images of both banks along curves of equal range, which show them at any height.
 
     Those of the second bank are on every row of the curves, as coefficients of a cubic spline with
-    one row before and two behind. Those of the first are on every so many rows, as are `curves`,
-    and the rows by which the second's image is displaced at the heights where it was formed.
+    one row before and two behind; those of the first, and `curves`, on every so many rows.
     `phase_rad`, that of the range to every row, was taken out of both.
     """
 
@@ -244,22 +226,12 @@ class CurveImages:
     second: NDArray[np.complex64]
     every: int
     phase_rad: NDArray[np.float64]
-    formed: NDArray[np.float64]
 
     @classmethod
-    def of(
-        cls, pair: Pair, fine: Curves, every: int, height_m: NDArray[np.float64] | None = None
-    ) -> Self:
-        """Form images on curves as close as the band requires, on their plane or above it.
-
-        Every so many rows of the first are kept.
-        """
+    def of(cls, pair: Pair, fine: Curves, every: int) -> Self:
+        """Form images on curves as close as the band requires; keep every so many of the first."""
         plane = fine.grid
-        grid, formed = plane, np.zeros(plane.shape)
-        if height_m is not None:
-            grid = Grid.points(fine.points_m(height_m), georeference=plane.georeference)
-            formed = fine.displaced(height_m)
-        first, second = pair.images(grid).pixels
+        first, second = pair.images(plane).pixels
 
         # Without the phase of the range, images are smooth from row to row.
         along_m = plane.vectors_m[2]
@@ -279,12 +251,11 @@ class CurveImages:
             ),
             every,
             phase_rad,
-            formed[::every],
         )
 
     def at(self, height_m: NDArray[np.float64] | float) -> Images:
         """Return the images at heights above the plane, without a phase that both share."""
-        moved = self.every * self.curves.displaced(height_m) - self.formed
+        moved = self.every * self.curves.displaced(height_m)
         row = self.every * np.arange(len(self.first))[:, None]
         slope = np.gradient(self.phase_rad)
         rate, bend = slope[row], np.gradient(slope)[row]

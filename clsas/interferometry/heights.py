@@ -72,9 +72,6 @@ _CYCLE_SD = 3.3
 # Share of the incoherent curves that the sweep takes for coherent. Each adds a surface at a random
 # height, which looks like layover. Passes on the relief use the threshold of the coherence itself.
 _FALSE_ALARM = 0.05
-# Blur of the images of the plane, in windows, from which on others are formed on the relief that
-# the sweep found.
-_MOST_BLUR = 0.5
 
 
 def heights(
@@ -194,9 +191,7 @@ def heights(
     weights for all directions, and 0.9 times with a Hann window of 14 degrees.
 
     The track may sway, but must be close to straight over the channels that see a pixel. Deviations
-    blur what lies above or below an imaged surface along the track. If the blur at the heights that
-    the sweep finds exceeds half a window, both banks are imaged on that relief before planes are
-    fitted.
+    blur what lies above or below an imaged plane along the track, in both images alike.
 
     References
     ----------
@@ -278,8 +273,8 @@ def measured(
     last: list[tuple[PairImages, Moments]] = []
 
     def products_at(relief_m: NDArray[np.float64]) -> Moments:
-        middle = (1 - side) / (2 * side)  # of the first pixel, from that of the first block
-        finer_m = _interpolated(relief_m, (side, side), shape, middle)
+        first = (1 - side) / (2 * side)  # pixel, counted from the first block
+        finer_m = affine_transform(relief_m, 2 * [1 / side], first, shape, order=1, mode="nearest")
         images = pair.images(plane.with_height(finer_m))
         last[:] = [(images, Moments.multilooked(*images.pixels, side))]
         return last[0][1]
@@ -426,10 +421,6 @@ def _first_relief(
     doubts = Doubts(end, large_m, task.ambiguity_m)
 
     height_m = filled(swept.height_m, reliable)
-    blur_m = curves.blur_m(height_m)[reliable]
-    if blur_m.size and np.median(blur_m) > _MOST_BLUR * window_m:
-        formed_m = _interpolated(height_m, (every, 1), fine.grid.shape)
-        images = CurveImages.of(task.straight, fine, every, formed_m)
     view = View(
         curves.grid, curves.sights, window, looks, request.least_coherence, task.ambiguity_m
     )
@@ -438,14 +429,6 @@ def _first_relief(
     seen = reliable & found.usable  # other heights jump, which looks like layover
     relief = relief_of(curves.moved(height_m), height_m, seen, task.ambiguity_m)
     return *_at_pixels(relief, curves, window, task.blocks), doubts
-
-
-def _interpolated(
-    values: NDArray, factors: tuple[int, int], shape: tuple[int, ...], offset: float = 0.0
-) -> NDArray:
-    """Return values on rows and columns that are closer by factors, interpolated linearly."""
-    scale = 1 / np.array(factors)
-    return np.asarray(affine_transform(values, scale, offset, shape, order=1, mode="nearest"))
 
 
 def _at_pixels(

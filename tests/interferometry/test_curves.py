@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from reliefs import ALTITUDE_M, GRID, banks, flat_banks, track
+from reliefs import GRID, banks, flat_banks
 
 import clsas
 from clsas.engine.device.device import open_device
@@ -74,23 +74,6 @@ def test_curves_begin_on_the_surface_where_the_search_starts():
     assert z == pytest.approx(0.3 + dunes(x, y), abs=2e-3)
 
 
-def test_deviations_of_the_track_blur_images_away_from_the_plane():
-    straight = curves_of(flat_banks())
-    assert straight.blur_m(1.0).max() < 1e-3
-    curves = curves_of(banks(dunes, snr_db=None, sway_m=0.1))
-    row = curves.grid.shape[0] // 2
-    y_m = curves.grid.positions_m()[row, 0, 1]
-    range_m = np.hypot(y_m, ALTITUDE_M)
-    # The cosine of the depression changes along the curve, and with it the range of a sway.
-    change = np.sqrt(range_m**2 - (ALTITUDE_M - 1) ** 2) / range_m - y_m / range_m
-    along_m = track()[0][:, 0]
-    slope = 0.1 * 2 * np.pi / 6 * np.cos(2 * np.pi * along_m / 6)
-    expected_m = range_m * change * np.sqrt(np.mean(slope**2))
-    found_m = np.median(curves.blur_m(1.0)[row])
-    assert found_m == pytest.approx(expected_m, rel=0.15)
-    assert np.median(curves.blur_m(0.5)[row]) == pytest.approx(found_m / 2, rel=0.05)
-
-
 AHEAD_M = ((0.5, 0.1, 0.0), (0.55, 0.05, 0.25))
 TRACKS = {
     "straight": {},
@@ -125,18 +108,3 @@ def test_images_of_a_plane_are_those_at_other_heights(name, grid):
             product, expected = (a * b.conj() for a, b in (shown, formed))
             error = np.linalg.norm((product - expected)[inside])
             assert error < 0.02 * np.linalg.norm(expected[inside])
-
-
-def test_images_may_be_formed_on_a_relief():
-    """They show the same as those of the plane, without blur: here, exactly what is formed."""
-    lines = banks(dunes, snr_db=None, sway_m=0.1)
-    pair = Pair(*lines, -50.0, None, None, open_device())
-    fine = curves_of(lines)
-    height_m = (
-        0.5 + 0.1 * np.sin(np.arange(fine.grid.shape[0]) / 9)[:, None] + 0 * fine.displaced(0)
-    )
-    images = CurveImages.of(pair, fine, 1, height_m)
-    points = clsas.Grid.points(fine.points_m(height_m))
-    expected = [clsas.backproject(each, points, accuracy_db=-50).pixels for each in lines]
-    product, formed = (a * b.conj() for a, b in (images.at(height_m), expected))
-    assert np.linalg.norm(product - formed) < 0.01 * np.linalg.norm(formed)
