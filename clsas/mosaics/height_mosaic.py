@@ -69,7 +69,7 @@ from clsas.mosaics.survey import PatchSource, Survey, SurveyVisibility, largest_
 _TRIAL = 512  # largest side of the part of the grid that decides on the windows; arbitrary
 _NAMED = 4  # patches that a warning names; the others are only counted
 _MARGIN_WINDOWS = 2.0  # beside half a large one: for as many passes, of half a window each
-_PLACES = 5  # along either side of a patch, for which curves are found; arbitrary
+_PLACES = 30  # along the diagonal of a patch, for which curves are found; arbitrary
 
 
 def mosaic_heights(
@@ -487,13 +487,7 @@ def _swept(
     if visible.any():
         some = [bank.geometry.select(visible) for bank in banks]
         baseline = Baseline.of(some[0], some[1], _beam_of(first, request.beam, visible), 1.0)
-        step_m = (
-            min(
-                n * float(np.linalg.norm(step))
-                for n, step in zip(grid.shape, grid.vectors_m[1:], strict=True)
-            )
-            / _PLACES
-        )
+        step_m = float(np.linalg.norm(np.ptp(grid.spread(2)[:, :2], axis=0))) / _PLACES
         curves = Curves.over(baseline, grid, request.search_m, (step_m, step_m))
         low_m, *_, high_m = curves.lattice.offset_m
         volume = _box(curves.grid, (low_m, high_m))
