@@ -30,6 +30,7 @@ from clsas.interferometry.pair import Pair
 _OVERSAMPLING = 2.0  # of the band across the track; cubic splines then err by -45 dB at its ends
 _LEVELS = 5  # heights of the lattice, which a polynomial connects
 _SEEN = 0.01  # least relative weight of a channel that counts for the band
+_LEAST_SLOPE = 1e-3  # of ranges, relative; below the track, nothing is displaced
 _SPACE = 3  # pixels beyond the outermost curve, for the taps of the interpolation
 _TURNS = 3  # iterations of the curve through a place of a relief
 
@@ -176,7 +177,8 @@ def _traced(
 ) -> NDArray[np.float64]:
     """Return the values of a lattice at points of a level plane, [points, heights, 4]."""
     weights, (_, of_b) = baseline.weights(points_m), baseline.gradients(points_m)
-    step_m = plane.vectors_m[1]
+    per_row = of_b @ plane.vectors_m[1]
+    per_row[np.abs(per_row) < _LEAST_SLOPE * np.abs(per_row).max()] = np.inf
     at_start_m = [_ranges_m(baseline, lines, points_m) for lines in (baseline.a, baseline.b)]
 
     def rising(at_m: NDArray[np.float64], rise_m: float) -> NDArray[np.float64]:
@@ -198,7 +200,7 @@ def _traced(
             ]
             nearer_m = np.einsum("nc,nc->n", weights, change_m[1] - change_m[0])
             values[:, number, :2] = in_pixels(plane, (at_m - points_m)[:, :2])
-            values[:, number, 2] = nearer_m / (of_b @ step_m)
+            values[:, number, 2] = nearer_m / per_row
             values[:, number, 3] = baseline.sight(at_m).rad_m
     return values
 
