@@ -240,16 +240,31 @@ def measure(
     _warn(found.refined)
     if (certificate := found.heights.certificate) is not None:
         report(certificate, request.tolerance_db, "warn")
+    elif found.unmeasured:
+        validate.warn(f"the error of the images is not known: {found.unmeasured}")
     return found.heights
 
 
 class Measured(NamedTuple):
-    """Heights, those with pixels in shadow, how the banks see the grid, and doubts."""
+    """Heights, and how they were found.
+
+    Attributes
+    ----------
+    heights : Heights
+    refined : Refined
+        The same with pixels in shadow.
+    sights : Lattice
+        How the banks see the grid.
+    doubts : Doubts
+    unmeasured : str
+        Why the error of the images could not be measured; "" if it was, or was not to be.
+    """
 
     heights: Heights
     refined: Refined
     sights: Lattice
     doubts: Doubts
+    unmeasured: str
 
 
 def measured(
@@ -301,6 +316,7 @@ def measured(
     valid = refined.valid & ~from_elsewhere(products.power_a, response, window)
     valid &= ~in_shadow(task.blocks, refined.offset_m, refined.sd_m, valid, view.sights, window)
     refined = refined.in_pixels(side, shape)
+    certificate, unmeasured = pair.certificate(images)
     found = Heights(
         refined.offset_m,
         refined.sd_m,
@@ -310,9 +326,9 @@ def measured(
         refined.m_per_rad,
         images.first,
         task.window_m,
-        pair.certificate(images),
+        certificate,
     )
-    return Measured(found, refined, sights, doubts)
+    return Measured(found, refined, sights, doubts, unmeasured)
 
 
 def windows(pair: Pair, grid: Grid, request: Request) -> tuple[float, Window, Window]:

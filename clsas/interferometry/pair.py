@@ -17,7 +17,7 @@ from clsas.engine.data.lines import RangeLines
 from clsas.engine.device.device import Device
 from clsas.engine.factorized.plan import Plan
 from clsas.engine.imaging import Imager
-from clsas.engine.promise import is_wanted, measured_if_possible
+from clsas.engine.promise import is_wanted, measured_or_reason
 from clsas.engine.water.refraction import homogeneous
 from clsas.interferometry.coherence import Images
 
@@ -78,23 +78,22 @@ class Pair:
             beam=self.beam, device=self.device,
         )  # fmt: skip
 
-    def certificate(self, images: PairImages) -> Certificate | None:
-        """Return the measured error of that bank's image which errs more.
+    def certificate(self, images: PairImages) -> tuple[Certificate | None, str]:
+        """Return the larger measured error of both images, or None and why it is not known.
 
-        It is None if both took less time than images that are certified, or if that of a bank
-        cannot be measured.
+        The reason is "" if both took less time than images that are certified.
         """
         if not is_wanted(None, images.seconds):
-            return None
+            return None, ""
         found = []
         for image, lines in ((images.first, self.a), (images.second, self.b)):
-            each = measured_if_possible(
+            each, reason = measured_or_reason(
                 image, lines, self.device, images.seconds / 2, self.tolerance_db
             )
             if each is None:
-                return None
+                return None, reason
             found.append(each)
-        return max(found, key=lambda each: each.error)
+        return max(found, key=lambda each: each.error), ""
 
     def straightened(self, grid: Grid) -> Pair:
         """Return the pair in homogeneous water, unchanged without a profile of the sound speed.

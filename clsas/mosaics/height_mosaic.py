@@ -403,6 +403,7 @@ def measure_patch(
                 pixels = scale * measured.heights.image.pixels[inside]
                 layers, known["heights"] = _results(measured, window.grid, inside)
                 known["certificate"] = scaled(measured.heights.certificate, float(scale))
+                known["unmeasured"] = measured.unmeasured
             known["has_pixels"] = holds_any(pixels)
         record = Record(**known, seconds=time.perf_counter() - start)
     except ValueError as error:

@@ -556,13 +556,23 @@ def test_only_the_last_images_are_certified(monkeypatch):
 
     def keep(*arguments, **options):
         found.append(promise.measured(*arguments, **options))
-        return found[-1]
+        return found[-1], ""
 
     monkeypatch.setattr(promise, "LEAST_SECONDS", 0.0)
-    monkeypatch.setattr("clsas.interferometry.pair.measured_if_possible", keep)
+    monkeypatch.setattr("clsas.interferometry.pair.measured_or_reason", keep)
     part = GRID.window(slice(40, 80), slice(20, 60))
     result = heights(*flat_banks(), part, search_m=(-0.2, 0.2), window_m=WINDOW_M)
     assert len(found) == 2
     assert result.certificate is max(found, key=lambda each: each.error)
     assert result.certificate.error_db < -40
     assert result.certificate.describe() in repr(result)
+
+
+def test_images_whose_error_cannot_be_measured_are_told(monkeypatch):
+    monkeypatch.setattr(promise, "LEAST_SECONDS", 0.0)
+    monkeypatch.setattr(
+        "clsas.interferometry.pair.measured_or_reason", lambda *_: (None, "no guard band")
+    )
+    part = GRID.window(slice(40, 80), slice(20, 60))
+    with pytest.warns(clsas.ClsasWarning, match="images is not known: no guard band"):
+        heights(*flat_banks(), part, search_m=(-0.2, 0.2), window_m=WINDOW_M)
