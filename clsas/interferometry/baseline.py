@@ -115,6 +115,11 @@ class Baseline:
         total = weight.sum(axis=1, keepdims=True)
         return np.where(total > 0, weight, 1) / np.where(total > 0, total, weight.shape[1])
 
+    def course(self, point_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the mean direction of the track as a point sees it, [3]; short if it turns."""
+        course: NDArray[np.float64] = (self.weights(point_m[None]) @ self.along)[0]
+        return course
+
 
 @dataclass(frozen=True, eq=False)
 class Lattice:

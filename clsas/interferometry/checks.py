@@ -22,6 +22,7 @@ from clsas.interferometry.coherence import LEAST_LOOKS, Window
 
 _APART = 0.1  # relative change of the distance between banks that waves of the track may cause
 _MOST_CYCLES = 1e3  # of phase within the search; more need more planes than anyone has time for
+_LEAST_STRAIGHT = 0.7  # length of the mean direction of the track: 0.64 for a semicircle
 _POINTS = 5  # along either side of a grid, whose geometry is checked; arbitrary
 _LEAST_PHASE_RAD = 0.1  # over the whole search; less is not above the noise of usual coherences
 
@@ -165,6 +166,13 @@ def check_geometry(
     """Return the height of ambiguity, metres; raise UnmeasurableError if there are no heights."""
     points_m = grid.spread(_POINTS)
     low_m, high_m = search_m
+    straightness = float(np.linalg.norm(baseline.course(points_m.mean(axis=0))))
+    if straightness < _LEAST_STRAIGHT:
+        raise UnmeasurableError(
+            "a and b",
+            "see the grid from a track that turns by less than 170 degrees",
+            hint="banks on a circle see no curves of equal range: divide the channels into arcs",
+        )
     # These come first: far from the sonar the phase hardly changes, so a search that reaches too
     # far would be reported as a missing baseline.
     _check_below(baseline, points_m, search_m)

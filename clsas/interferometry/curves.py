@@ -32,7 +32,7 @@ _LEVELS = 5  # heights of the lattice, which a polynomial connects
 _SEEN = 0.01  # least relative weight of a channel that counts for the band
 _LEAST_SLOPE = 1e-3  # of ranges, relative; below the track, nothing is displaced
 _SPACE = 3  # pixels beyond the outermost curve, for the taps of the interpolation
-_TURNS = 3  # iterations of the curve through a place of a relief
+_TURNS = 10  # iterations of the curve through a place of a relief
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class Curves:
         places_m = without_heights(grid).spread(3)
         places_m[:, 2] = level_m
         middle_m = places_m.mean(axis=0)
-        along = (baseline.weights(middle_m[None]) @ baseline.along)[0] * [1, 1, 0]
+        along = baseline.course(middle_m) * [1, 1, 0]
         along /= np.linalg.norm(along)
         plane = Grid.oriented(
             middle_m, steps_m[0] * np.cross([0, 0, 1], along), steps_m[1] * along, (2, 2),

@@ -61,8 +61,11 @@ class Pair:
         started = time.perf_counter()
         imager = self._imager(self.a, grid, None)
         first = imager(self.a, certificate=False)
-        second = self.image(self.b, grid, imager.plan)
-        return PairImages(first, second, imager.plan, time.perf_counter() - started)
+        # What is left out of one bank's image, such as the distance of its receivers, may matter in
+        # that of the other.
+        plan = None if imager.plan is None or imager.plan.left_out else imager.plan
+        second = self.image(self.b, grid, plan)
+        return PairImages(first, second, plan, time.perf_counter() - started)
 
     def image(self, lines: RangeLines, grid: Grid, plan: Plan | None) -> Image:
         """Return an image of lines whose antennas are close to those that a plan was made for."""

@@ -38,7 +38,7 @@ from clsas.engine.data.digests import digest, grid_digest
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Formed, Image, holds_any
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.lines import RangeLines, some_channels
 from clsas.engine.data.simplify import shift_error
 from clsas.engine.data.threads import uninterrupted, wait
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
@@ -107,6 +107,7 @@ MEMORY_BYTES = 1 << 30
 
 _MOST_PIXELS = 4096**2  # of a block; such a block takes seconds, and larger ones gain nothing
 _SMALLEST_SIDE = 128  # pixels; reading and planning smaller patches takes longer than imaging
+_BLOCKS_PER_WORKER = 4  # at least, where several share the work: a plain choice
 _SAMPLED = 32  # patches or blocks whose memory is predicted, evenly spread; a plain choice
 _MOST_ON_CLUSTER = 1000  # blocks submitted at once: enough for any cluster, few to wait for
 
@@ -157,8 +158,8 @@ def mosaic(
         folder contains no file named `end`, `track_pings` is 101 by default.
     patches : (rows, columns), optional
         Number of patches along both axes; the last ones may be smaller. By default patches are as
-        large as memory allows, up to 16.8 million pixels. Smaller patches hardly take longer,
-        because neighbours are formed together.
+        large as memory allows, up to 16.8 million pixels. Smaller patches hardly take longer
+        without a store, because neighbours are formed together, except with `stages` or `follow_s`.
     memory_bytes : int, optional
         Memory of patches that are formed together, on host and device; 1 GiB by default. Exact
         backprojection needs the device's buffers in addition, of up to 1024 upsampled lines.
@@ -290,7 +291,9 @@ def mosaic(
         patch_shape = _choose_patch_shape(visibility, grid, memory_bytes)
     block_shape = patch_shape
     if growth is None and "stages" not in request:
-        workers = len(devices) if client is None else sum(client.nthreads().values())
+        workers = len(devices) if client is None else max(sum(client.nthreads().values()), 1)
+        if workers > 1 or client is not None:  # they differ in speed, and more may join
+            workers *= _BLOCKS_PER_WORKER
         block_shape = _choose_block_shape(visibility, grid, patch_shape, memory_bytes, workers)
     finished: dict[PatchIndex, Record] = {}
     if stored is not None:
@@ -487,8 +490,8 @@ def _divisions(shape: tuple[int, ...]) -> Iterator[tuple[int, int]]:
 def _needed_bytes(visibility: SurveyVisibility, layout: Layout) -> int:
     """Return the memory that patches or blocks are predicted to need, from some of them."""
     most, indices = 0, list(layout.indices())
-    for index in indices[:: math.ceil(len(indices) / _SAMPLED)]:
-        window = layout.window(index).grid
+    for number in some_channels(len(indices), _SAMPLED):
+        window = layout.window(indices[number]).grid
         visible = visibility.channels(window)
         if visible.any():
             count, length = visibility.survey.extent(visible, *visibility.ranges_m(window))
@@ -700,7 +703,7 @@ class Mosaic:
     def _in_blocks(
         self, indices: Iterable[PatchIndex]
     ) -> deque[tuple[PatchIndex, list[PatchIndex]]]:
-        """Return patches by the block that contains them."""
+        """Return patches by the block that contains them, row by row."""
         return deque(self._layout.grouped(indices, self._block_shape).items())
 
     def _worst(
@@ -818,11 +821,7 @@ class Mosaic:
             version=__version__,
             lines_digest=digest(sorted({each.lines_digest for each in known})),
             certificate=None if certificate is None else certificate.of_all,
-            misses=tuple(
-                f"patch {row},{column}: {miss}"
-                for (row, column), record in records.items()
-                for miss in record.misses
-            ),
+            misses=_misses(records),
         )
         return Image(pixels, self.grid, how)
 
@@ -849,6 +848,12 @@ def _is_outdated(
     return before < visibility.survey.channels and visibility.differs_since(
         before, record.channels, layout.window(index).grid
     )
+
+
+def _misses(records: dict[PatchIndex, Record]) -> tuple[str, ...]:
+    """Return what former images missed their tolerance by, once for all patches of a block."""
+    first = {miss: index for index, record in reversed(records.items()) for miss in record.misses}
+    return tuple(f"patch {row},{column}: {miss}" for miss, (row, column) in first.items())
 
 
 @dataclass(frozen=True, eq=False)
@@ -948,7 +953,7 @@ def form_block(
     for window, pixels, visible, counted in patches:
         if (window.row, window.column) not in block.wanted:
             continue
-        own = _record_of_patch(record, counted / size, visibility, visible, missing)
+        own = _record_of_patch(record, counted / max(size, 1), visibility, visible, missing)
         if store is not None:
             store.write(*window[1:], pixels, own)
         formed = image.formed if own.has_pixels else None

@@ -68,7 +68,7 @@ class Layout:
     def grouped(
         self, indices: Iterable[PatchIndex], block_shape: tuple[int, int]
     ) -> dict[PatchIndex, list[PatchIndex]]:
-        """Return patches by the index of the block that contains them."""
+        """Return patches, row by row, by the index of the block that contains them."""
         found: dict[PatchIndex, list[PatchIndex]] = {}
         for index in indices:
             row, column = (
@@ -76,7 +76,7 @@ class Layout:
                 for number, side, of_block in zip(index, self.patch_shape, block_shape, strict=True)
             )
             found.setdefault((row, column), []).append(index)
-        return found
+        return {block: sorted(patches) for block, patches in found.items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -440,6 +440,18 @@ class TestBadInput:
         with pytest.raises(error, match=match):
             heights(first if a is None else a, second if b is None else b, grid, **given)
 
+    def test_a_track_around_the_grid(self):
+        angle = 2 * np.pi * np.arange(flat_banks()[0].channels) / flat_banks()[0].channels
+        ring_m = [0, 31.8] + 29 * np.column_stack([np.cos(angle), np.sin(angle)])
+
+        def around(lines):
+            tx_m, rx_m = (
+                np.column_stack([ring_m, each[:, 2]]) for each in (lines.tx_m, lines.rx_m)
+            )
+            return replace(lines, tx_m=tx_m, rx_m=rx_m)
+
+        self.refused("turns by less than 170 degrees", *map(around, flat_banks()))
+
     def test_different_pings(self):
         _, second = flat_banks()
         self.refused("same pings.*120 pings.*119 pings", b=second.select(slice(1, None)))

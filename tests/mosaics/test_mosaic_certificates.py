@@ -1,6 +1,7 @@
 """Mosaics say how wrong they are, and their worst patches are formed again if the whole misses."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -93,6 +94,19 @@ def test_only_the_worst_patch_is_formed_again_if_that_suffices(known, lie, tmp_p
     assert image.formed.misses == (f"patch 0,1: {miss}",)
     assert not records[BRIGHT].misses
     assert records[BRIGHT].certificate.verdict(-40) == "missed"
+
+
+def test_patches_of_a_block_stay_in_place_when_it_is_formed_again(known, lie, tmp_path):
+    """Also those that an earlier run left in the store, which is resumed here."""
+    path, wish = tmp_path / "a.zarr", {key: REQUEST[key] for key in ("tolerance_db", "patches")}
+    lie(dict.fromkeys([(0, 0), (0, 1), (1, 0), (1, 1)], -15))
+    wish |= {"certificate": True}
+    with pytest.warns(clsas.ClsasWarning, match="misses its tolerance"):
+        list(clsas.mosaic(known.lines, known.grid, path, **wish, on_miss="warn"))
+    shutil.rmtree(path / "patches" / "0.0")
+    with pytest.warns(clsas.ClsasWarning, match="meets it"):
+        image = clsas.mosaic(known.lines, known.grid, path, **wish).image()
+    assert known.error_db(image.pixels) < -40
 
 
 def test_a_patch_that_misses_twice_is_formed_exactly(known, lie):
