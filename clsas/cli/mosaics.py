@@ -70,7 +70,7 @@ def _cluster(
             yield client
         except KilledWorker as error:
             raise click.ClickException(
-                f"workers ended unexpectedly several times on one patch: {error}"
+                f"workers ended unexpectedly several times on one block of patches: {error}"
             ) from None
 
 
@@ -223,7 +223,7 @@ def _check_paths(output: Path, picture: Path | None, lines_path: Path | None, fo
 
 
 def _read_request(described: SceneFile, given: dict[str, Any], exact: bool) -> dict[str, Any]:
-    """Return the request for every patch, which is one of `PLAN_KEYS` or an accuracy."""
+    """Return the request for every block, which is one of `PLAN_KEYS` or an accuracy."""
     request = read_request(described, given, exact)
     if ignored := set(request) - {*PLAN_KEYS, "accuracy_db"}:
         allowed = "be left out for a mosaic, in which it has no effect"

@@ -103,7 +103,7 @@ REQUESTS = ("tolerance_db", "tolerance_wavelengths", "stages", "accuracy_db")
 """Requests for accuracy or a method, of which a mosaic takes at most one."""
 
 MEMORY_BYTES = 1 << 30
-"""Default memory of one patch: a plain choice, which suits laptops and small GPUs."""
+"""Default memory of one block: a plain choice, which suits laptops and small GPUs."""
 
 _MOST_PIXELS = 4096**2  # of a block; such a block takes seconds, and larger ones gain nothing
 _SMALLEST_SIDE = 128  # pixels; reading and planning smaller patches takes longer than imaging
@@ -771,7 +771,7 @@ class Mosaic:
         -------
         Image
             Image on all of `grid`. It takes 8 bytes of memory per pixel, in addition to the memory
-            of the patches that are being formed. `Image.formed` is None if patches were read from
+            of the blocks that are being formed. `Image.formed` is None if patches were read from
             the store, whose `Record` says how each was formed.
 
         Raises

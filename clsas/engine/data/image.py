@@ -31,7 +31,7 @@ class Formed:
     Parameters
     ----------
     method : {"exact", "factorized", "wavenumber", "mosaic"}
-        Method; "mosaic" for several patches, each of which was formed by a plan of its own.
+        Method; "mosaic" for several blocks of patches, each formed by a plan of its own.
     tolerance_db : float or None
         Requested relative rms error, dB; None if none was requested.
     plan : str
