@@ -291,10 +291,10 @@ def mosaic(
         patch_shape = _choose_patch_shape(visibility, grid, memory_bytes)
     block_shape = patch_shape
     if growth is None and "stages" not in request:
-        workers = len(devices) if client is None else max(sum(client.nthreads().values()), 1)
-        if workers > 1 or client is not None:  # they differ in speed, and more may join
-            workers *= _BLOCKS_PER_WORKER
-        block_shape = _choose_block_shape(visibility, grid, patch_shape, memory_bytes, workers)
+        least = len(devices) if client is None else max(sum(client.nthreads().values()), 1)
+        if least > 1 or client is not None:  # they differ in speed, and more may join
+            least *= _BLOCKS_PER_WORKER
+        block_shape = _choose_block_shape(visibility, grid, patch_shape, memory_bytes, least)
     finished: dict[PatchIndex, Record] = {}
     if stored is not None:
         stored.begin(inputs, grid, patch_shape)
@@ -452,11 +452,11 @@ def _choose_block_shape(
     grid: Grid,
     patch_shape: tuple[int, int],
     memory_bytes: int,
-    workers: int,
+    least: int,
 ) -> tuple[int, int]:
     """Return the number of pixels of the largest blocks of patches that fit into memory.
 
-    There are at least as many as there are workers, unless there are fewer patches.
+    There are at least `least` of them, unless there are fewer patches.
     """
     patches = Layout(grid, patch_shape).shape
     for parts in _divisions(grid.shape):
@@ -469,7 +469,7 @@ def _choose_block_shape(
         layout = Layout(grid, (rows, columns))
         if (
             rows * columns <= _MOST_PIXELS
-            and len(layout) >= workers
+            and len(layout) >= least
             and _needed_bytes(visibility, layout) <= memory_bytes
         ):
             break
