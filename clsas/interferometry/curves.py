@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter1d
 
 from clsas.engine.data.fourier import phasors, turned
+from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid, without_heights
-from clsas.engine.data.lines import RangeLines
+from clsas.engine.data.lines import antennas_of
 from clsas.interferometry.baseline import Baseline, Lattice, in_pixels, lattice_places
 from clsas.interferometry.coherence import Images, Moments
 from clsas.interferometry.pair import Pair
@@ -179,7 +180,8 @@ def _traced(
     weights, (_, of_b) = baseline.weights(points_m), baseline.gradients(points_m)
     per_row = of_b @ plane.vectors_m[1]
     per_row[np.abs(per_row) < _LEAST_SLOPE * np.abs(per_row).max()] = np.inf
-    at_start_m = [_ranges_m(baseline, lines, points_m) for lines in (baseline.a, baseline.b)]
+    banks = [antennas_of(lines, baseline.channels)[:2] for lines in (baseline.a, baseline.b)]
+    at_start_m = [pairwise_range_m(points_m, *antennas_m) for antennas_m in banks]
 
     def rising(at_m: NDArray[np.float64], rise_m: float) -> NDArray[np.float64]:
         tangent = baseline.sight(at_m).tangent
@@ -195,23 +197,14 @@ def _traced(
             at_m = at_m + rising(at_m + rising(at_m, rise_m / 2), rise_m)
             height_m = float(heights_m[number])
             change_m = [
-                _ranges_m(baseline, lines, at_m) - start_m
-                for lines, start_m in zip((baseline.a, baseline.b), at_start_m, strict=True)
+                pairwise_range_m(at_m, *antennas_m) - start_m
+                for antennas_m, start_m in zip(banks, at_start_m, strict=True)
             ]
             nearer_m = np.einsum("nc,nc->n", weights, change_m[1] - change_m[0])
             values[:, number, :2] = in_pixels(plane, (at_m - points_m)[:, :2])
             values[:, number, 2] = nearer_m / per_row
             values[:, number, 3] = baseline.sight(at_m).rad_m
     return values
-
-
-def _ranges_m(
-    baseline: Baseline, lines: RangeLines, points_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the ranges of points from the channels of a bank, [points, channels]."""
-    antennas_m = lines.tx_m[baseline.channels], lines.rx_m[baseline.channels]
-    one, other = (np.linalg.norm(points_m[:, None] - each_m, axis=2) for each_m in antennas_m)
-    return np.asarray((one + other) / 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -168,8 +168,6 @@ class Sizes:
         The sample points, without a size of roots.
     pairs : tuple of (rows, columns)
         The sizes.
-    sides : int64 [sizes, 2]
-        The same as an array.
     counts : float64
         Number of subimages that contain a pixel.
     padded_pixels : float64
@@ -188,7 +186,6 @@ class Sizes:
 
     roots: SampledRoots
     pairs: tuple[Side, ...]
-    sides: NDArray[np.int64]
     counts: NDArray[np.float64]
     padded_pixels: NDArray[np.float64]
     visible_share: NDArray[np.float64]
@@ -197,6 +194,11 @@ class Sizes:
     leaf_error: NDArray[np.float64]
     beam_cycles_across: float = 0.0
     _in_roots: dict[int, SizesInRoot] = field(default_factory=dict, init=False)
+
+    @functools.cached_property
+    def sides(self) -> NDArray[np.int64]:
+        """`pairs` as an array, [sizes, 2]."""
+        return np.array(self.pairs, np.int64)
 
     @functools.cached_property
     def divides(self) -> NDArray[np.bool_]:
@@ -254,7 +256,6 @@ def all_sizes(roots: SampledRoots, pairs: Sequence[Side], device: Device) -> Siz
     return Sizes(
         roots,
         tuple(pairs),
-        sides,
         counts=np.array([float(sampled.count(side)) for side in pairs]),
         padded_pixels=np.array([sampled.padded_pixels(side, device.info.width) for side in pairs]),
         visible_share=share,
