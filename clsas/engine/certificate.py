@@ -232,26 +232,25 @@ class Measurement:
             some, weight = (np.concatenate(each) for each in zip(*rounds, strict=True))
             self._drawn = np.append(self._drawn, some)
             self._weight = np.append(self._weight, weight)
-        different, of_different = np.unique(some, return_inverse=True)
-        self._values = np.append(self._values, self.ideal(different)[of_different])
+        self._values = np.append(self._values, self.ideal(some))
         self.seconds += time.perf_counter() - started
 
     def sharpen(self) -> None:
         """Form the pixels drawn so far again with the best filters."""
         started = time.perf_counter()
         self._ideal, self._stopband_db = None, _STOPBANDS_DB[1]
-        different, of_different = np.unique(self._drawn, return_inverse=True)
-        self._values = self.ideal(different)[of_different]
+        self._values = self.ideal(self._drawn)
         self.seconds += time.perf_counter() - started
 
     def ideal(self, numbers: NDArray[np.int64]) -> NDArray[np.complex128]:
         """Return pixels of the ideal image, whose flat numbers are given."""
+        numbers, of_number = np.unique(numbers, return_inverse=True)
         points_m = self._image.grid.at(numbers)
         if self._ideal is None:
             self._ideal = IdealImage(
                 self._lines, self._beam, self._device, points_m, self._random, self._stopband_db
             )
-        return self._ideal.at(points_m)
+        return self._ideal.at(points_m)[of_number]
 
     def certificate(self, *, scale: bool = False) -> Certificate:
         """Return the error measured at the pixels drawn so far."""

@@ -451,11 +451,7 @@ def backproject(
     image = form(scene, method, device, progress=progress)
 
     def again(better_db: float) -> Image:
-        better_db = max(better_db, BEST_ACCURACY_DB)
-        scene = Scene.of(lines, grid, beam, better_db)
-        imager = SceneImager(
-            scene, ExactImage(better_db), device, warned=True, keep=False, tolerance_db=accuracy_db
-        )
+        imager = _better_exact(lines, grid, beam, device, better_db, accuracy_db, keep=False)
         return imager.form(lines, progress)
 
     ways = () if is_fixed or accuracy_db <= BEST_ACCURACY_DB else (again,)
@@ -699,15 +695,9 @@ class Imager:
 
     def _exactly(self, lines: RangeLines, progress: Progress | None, accuracy_db: float) -> Image:
         """Return the exact image; the imager forms the next ones exactly, too."""
-        accuracy_db = max(accuracy_db, BEST_ACCURACY_DB)
-        scene = Scene.of(lines, self.grid, self.beam, accuracy_db)
         self.plan = None
-        self._imager = SceneImager(
-            scene,
-            ExactImage(accuracy_db),
-            self.device,
-            warned=True,
-            tolerance_db=self._tolerance_db,
+        self._imager = _better_exact(
+            lines, self.grid, self.beam, self.device, accuracy_db, self._tolerance_db
         )
         return self._imager.form(lines, progress)
 
@@ -755,6 +745,22 @@ class Imager:
         """Return the grid, the method and the device."""
         how = "exact" if self.plan is None else repr(self.plan)
         return reprs.summary(self, reprs.by(self.grid.shape), how, self.device.info.label)
+
+
+def _better_exact(
+    lines: RangeLines,
+    grid: Grid,
+    beam: BeamWindow | None,
+    device: Device,
+    accuracy_db: float,
+    requested_db: float | None,
+    *,
+    keep: bool = True,
+) -> SceneImager:
+    """Return an imager of exact images, to an accuracy tightened from the one requested."""
+    accuracy_db = max(accuracy_db, BEST_ACCURACY_DB)
+    scene, method = Scene.of(lines, grid, beam, accuracy_db), ExactImage(accuracy_db)
+    return SceneImager(scene, method, device, warned=True, keep=keep, tolerance_db=requested_db)
 
 
 def _certified(

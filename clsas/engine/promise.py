@@ -112,19 +112,18 @@ def certified(
         If the error cannot be measured, or the image misses its tolerance.
     """
     tolerance_db, how = _formed(image).tolerance_db, ""
-    certificate = measured_if_possible(image, lines, device, seconds, tolerance_db)
     misses: list[str] = []
-    for form_again in again if on_miss == "refine" else ():
+    ways = iter(again if on_miss == "refine" else ())
+    while True:
+        certificate = measured_if_possible(image, lines, device, seconds, tolerance_db)
         if certificate is None or tolerance_db is None:
             break
-        if certificate.verdict(tolerance_db) != "missed":
+        form_again = next(ways, None) if certificate.verdict(tolerance_db) == "missed" else None
+        if form_again is None:
             break
         misses.append(describe_miss(_formed(image).predicted_error_db, certificate))
         image = form_again(tightened_db(certificate, tolerance_db))
-        certificate, how = (
-            measured_if_possible(image, lines, device, seconds, tolerance_db),
-            _formed(image).plan,
-        )
+        how = _formed(image).plan
     formed = replace(_formed(image), certificate=certificate, misses=tuple(misses))
     if certificate is not None and tolerance_db is not None:
         report(certificate, tolerance_db, on_miss, misses, how)
