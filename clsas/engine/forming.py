@@ -49,6 +49,7 @@ class SceneImager:
 
     Attributes
     ----------
+    plan : Plan or ExactImage
     decision : Decision or None
         How an exact image is formed; None for a factorized one.
     """
@@ -66,7 +67,7 @@ class SceneImager:
         tolerance_db: float | None = None,
     ) -> None:
         self.scene, self.device, self._warned = scene, device, warned
-        self._plan, self.decision, self._tolerance_db = plan, decision, tolerance_db
+        self.plan, self.decision, self._tolerance_db = plan, decision, tolerance_db
         method = plan.method if isinstance(plan, Plan) else plan
         if isinstance(method, ExactImage):
             self.decision = decision or decide(
@@ -111,7 +112,7 @@ class SceneImager:
 
     def _formed(self, pixels: NDArray[np.complex64], digest: str) -> Formed:
         """Return how pixels were formed; `digest` is that of their lines."""
-        plan, scene = self._plan, self.scene
+        plan, scene = self.plan, self.scene
         if self._tolerance_db is not None:
             tolerance_db: float | None = self._tolerance_db
         elif isinstance(plan, Plan):

@@ -7,6 +7,7 @@ factorization of the plan.
 
 from __future__ import annotations
 
+import math
 import time
 import weakref
 from collections.abc import Callable, Sequence
@@ -30,7 +31,16 @@ from clsas.engine.factorized.costs import Costs
 from clsas.engine.factorized.plan import ExactImage, Plan
 from clsas.engine.factorized.planner import BEST_TOLERANCE_DB, TOLERANCE, Request, planned
 from clsas.engine.forming import Progress, SceneImager, form, scene_of_plan
-from clsas.engine.promise import CERTIFICATE, ON_MISS, FormAgain, certified, is_wanted
+from clsas.engine.promise import (
+    CERTIFICATE,
+    FEWEST,
+    FIRST,
+    LEAST_SECONDS,
+    ON_MISS,
+    FormAgain,
+    certified,
+    is_wanted,
+)
 from clsas.engine.scene import Scene
 from clsas.engine.signal.spectrum import (
     FEW_CHANNELS,
@@ -39,6 +49,9 @@ from clsas.engine.signal.spectrum import (
     occupied_band,
     power_outside,
 )
+
+_SAME = ("carrier_hz", "sound_speed_m_s", "range_step_m", "length")
+"""Of lines that one imager may image: filters and their tables depend on these."""
 
 
 def plan(
@@ -455,21 +468,24 @@ def backproject(
         return imager.form(lines, progress)
 
     ways = () if is_fixed or accuracy_db <= BEST_ACCURACY_DB else (again,)
-    image = _certified(image, lines, device, started, not is_fixed, ways, **asked)
+    image = _certified(
+        image, lines, device, started, math.inf if is_fixed else LEAST_SECONDS, ways, **asked
+    )
     return _added(image, accumulate)
 
 
 class Imager:
-    """Any number of images of the same geometry, exact or factorized.
+    """Any number of images on one grid, exact or factorized, planned once.
 
-    Everything that does not depend on the samples is computed once. Exactly one of `plan`,
-    `tolerance_db` and `accuracy_db` must be given.
+    Everything that does not depend on the samples is computed once, as long as the antennas stay
+    where they are. Exactly one of `plan`, `tolerance_db` and `accuracy_db` must be given.
 
     Parameters
     ----------
     lines : RangeLines
         Lines to image. Lines that are imaged later may have other samples of about the same band,
-        but must have the same antennas, ranges and carrier.
+        and antennas or first ranges that differ a little: those of another bank, of the next pass,
+        or of a corrected track.
     grid : Grid
         Pixels of the images.
     plan : Plan, optional
@@ -519,6 +535,10 @@ class Imager:
     image, in up to 256 MiB of host memory, and the lines that it was made from. `close`, or the
     end of a ``with`` block, frees both.
     Threads must not share an imager.
+
+    A plan holds for antennas that differ a little, because subimages and filters stay accurate
+    enough. How much they may differ is not predicted. Instead, the error of the first image of such
+    lines is measured, and if it misses the tolerance, the image is planned again.
 
     Examples
     --------
@@ -595,8 +615,9 @@ class Imager:
         self._checked = weakref.ref(lines)
         if plan is not None and tolerance_db is None and not plan.is_exact:
             self._check_band(lines)
-        # Whether the next image is certified by default
-        self._is_certified = tolerance_db is not None or accuracy_db is not None
+        # Least time of the next image that is certified by default
+        is_given = tolerance_db is None and accuracy_db is None
+        self._certified_from_s = math.inf if is_given else LEAST_SECONDS
         self._planning_s = time.perf_counter() - started
 
     def __call__(
@@ -608,15 +629,19 @@ class Imager:
         accumulate: Image | None = None,
         progress: Progress | None = None,
     ) -> Image:
-        """Return the image of lines of the imager's geometry.
+        """Return the image of lines on the imager's grid.
 
         Parameters
         ----------
         lines : RangeLines
+            With the carrier, sound speed, range step and number of samples of those that the imager
+            was made for.
         certificate : bool, optional
             Whether the error of the image is measured, as by `clsas.certify`. By default,
             that of the first image is measured, if the imager was not made from a plan, and
-            planning and forming the image take 0.1 s or more.
+            planning and forming the image take 0.1 s or more. That of a factorized image is
+            also measured, whatever its time, if it is the first of lines with other antennas than
+            those that the plan was made for.
         on_miss : {"refine", "warn", "raise"}
             What to do if the measured error exceeds the tolerance beyond doubt: form the image
             again by a better plan, and then exactly, with a warning; warn; or raise ToleranceError.
@@ -635,8 +660,8 @@ class Imager:
         Raises
         ------
         TypeError, ValueError
-            If an argument is not allowed, the lines have another geometry, or the imager was
-            closed.
+            If an argument is not allowed, the lines have another carrier, sound speed, range step
+            or number of samples, or the imager was closed.
         ToleranceError
             If the image misses its tolerance, and `on_miss` is "raise".
 
@@ -655,26 +680,38 @@ class Imager:
             raise ValueError("the imager was closed; make another one")
         if accumulate is not None:
             check_accumulate(accumulate, self.grid, self.beam)
+        started = time.perf_counter() - self._planning_s
         if self._checked() is not lines:
-            if lines_digest(lines) != self._lines_digest:
-                raise ArgumentError(
-                    "lines",
-                    "have the antennas, ranges, carrier and number of samples of those that the "
-                    "imager was made for",
-                    hint="make another `Imager` for these",
-                )
+            digest = lines_digest(lines)
+            if digest != self._lines_digest:
+                self._move_to(lines, digest)
             self._check_band(lines)
             self._checked = weakref.ref(lines)
-        started = time.perf_counter() - self._planning_s
         image = self._imager.form(lines, progress)
-        is_certified, self._is_certified, self._planning_s = self._is_certified, False, 0.0
+        least_s, self._certified_from_s, self._planning_s = self._certified_from_s, math.inf, 0.0
         exactly = partial(self._exactly, lines, progress)
         ways: tuple[FormAgain, ...] = partial(self._form_again, lines, progress), exactly
         if self._imager.decision is not None:
             is_best = (self._tolerance_db or 0.0) <= BEST_ACCURACY_DB
             ways = () if is_best else (exactly,)
-        image = _certified(image, lines, self.device, started, is_certified, ways, **asked)
+        image = _certified(image, lines, self.device, started, least_s, ways, **asked)
         return _added(image, accumulate)
+
+    def _move_to(self, lines: RangeLines, digest: str) -> None:
+        """Make ready for lines with other antennas or first ranges, by the same plan."""
+        assert self._imager is not None
+        for name in _SAME:
+            given, allowed = getattr(lines, name), getattr(self._imager.scene.given_lines, name)
+            if given != allowed:
+                hint = "make another `Imager` for these lines"
+                raise ArgumentError(f"{name} of lines", f"stay {allowed}", f"{given}", hint)
+        plan = self._imager.plan
+        allowed_db = plan.tolerance_db if isinstance(plan, Plan) else plan.accuracy_db
+        scene = Scene.of(lines, self.grid, self.beam, allowed_db)
+        self._imager = SceneImager(scene, plan, self.device, tolerance_db=self._tolerance_db)
+        self._lines_digest = digest
+        if self._imager.decision is None and self._tolerance_db is not None:
+            self._certified_from_s = 0.0  # nothing was predicted for these lines
 
     def _form_again(
         self, lines: RangeLines, progress: Progress | None, tolerance_db: float
@@ -768,17 +805,21 @@ def _certified(
     lines: RangeLines,
     device: Device,
     started: float,
-    by_default: bool,
+    least_s: float,
     again: Sequence[FormAgain] = (),
     *,
     certificate: bool | None,
     on_miss: str,
 ) -> Image:
-    """Return an image that was begun at a time, with its certificate if it is to have one."""
+    """Return an image that was begun at a time, with its certificate if it is to have one.
+
+    Without a request, it has one if it took at least `least_s`.
+    """
     seconds = time.perf_counter() - started
-    if not is_wanted(certificate, seconds, by_default=by_default):
+    if not is_wanted(certificate, seconds, least_s):
         return image
-    return certified(image, lines, device, seconds, on_miss, again)
+    first = FIRST if least_s else FEWEST
+    return certified(image, lines, device, seconds, on_miss, again, first)
 
 
 def check_accumulate(image: Image, grid: Grid, beam: BeamWindow | None) -> None:

@@ -24,8 +24,8 @@ from clsas.engine.data.georeference import placed
 from clsas.engine.data.grid import Grid, without_heights
 from clsas.engine.data.lines import RangeLines, cycles_per_m_at
 from clsas.engine.device.device import Device, open_device
-from clsas.engine.factorized.plan import Plan
 from clsas.engine.factorized.planner import TOLERANCE
+from clsas.engine.imaging import Imager
 from clsas.engine.promise import report
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.interferometry.baseline import Baseline, Lattice, in_pixels, sight_lattice
@@ -312,7 +312,7 @@ def measured(
     )
     report(total, total)
     images, products = last[0]
-    response = block_sums(point_response(task.straight, task.level, task.plan), side)
+    response = block_sums(point_response(task.straight, task.level, task.imager), side)
     valid = refined.valid & ~from_elsewhere(products.power_a, response, window)
     valid &= ~in_shadow(task.blocks, refined.offset_m, refined.sd_m, valid, view.sights, window)
     refined = refined.in_pixels(side, shape)
@@ -346,7 +346,7 @@ class Task:
     """Two banks, the grid whose heights they measure, and what follows from both.
 
     The banks are those in homogeneous water: rays are exact only in the last images. `level` is the
-    plane of the grid, raised by its mean height, and `plan` that of the images there. `looks` is
+    plane of the grid, raised by its mean height, and `imager` forms images there. `looks` is
     the effective number of looks of a window. `side` is that of the blocks of pixels over which
     products of images are summed at once.
     """
@@ -358,7 +358,7 @@ class Task:
     relative_band: float
     ambiguity_m: float
     level: Grid
-    plan: Plan | None
+    imager: Imager
     window_m: float
     window: Window
     looks: float
@@ -383,7 +383,7 @@ class Task:
         looks = effective_looks(images.pixels, window)
         check_looks(window_m, looks)
         return cls(
-            straight, grid, request, baseline, relative_band, ambiguity_m, level, images.plan,
+            straight, grid, request, baseline, relative_band, ambiguity_m, level, images.imager,
             window_m, window, looks, max(min(window.sides) // _BLOCKS, 1),
         )  # fmt: skip
 

@@ -10,12 +10,10 @@ import numpy as np
 
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.certificate import Certificate
-from clsas.engine.data.digests import lines_digest
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines
 from clsas.engine.device.device import Device
-from clsas.engine.factorized.plan import Plan
 from clsas.engine.imaging import Imager
 from clsas.engine.promise import is_wanted, measured_or_reason
 from clsas.engine.water.refraction import homogeneous
@@ -23,11 +21,11 @@ from clsas.interferometry.coherence import Images
 
 
 class PairImages(NamedTuple):
-    """Images of both banks on one grid, their plan unless they are exact, and their time."""
+    """Images of both banks on one grid, what formed them, and their time."""
 
     first: Image
     second: Image
-    plan: Plan | None
+    imager: Imager
     seconds: float
 
     @property
@@ -59,27 +57,12 @@ class Pair:
     def images(self, grid: Grid) -> PairImages:
         """Return the images of both banks, formed by one plan."""
         started = time.perf_counter()
-        imager = self._imager(self.a, grid, None)
-        first = imager(self.a, certificate=False)
-        # What is left out of one bank's image, such as the distance of its receivers, may matter in
-        # that of the other.
-        plan = None if imager.plan is None or imager.plan.left_out else imager.plan
-        second = self.image(self.b, grid, plan)
-        return PairImages(first, second, plan, time.perf_counter() - started)
-
-    def image(self, lines: RangeLines, grid: Grid, plan: Plan | None) -> Image:
-        """Return an image of lines whose antennas are close to those that a plan was made for."""
-        return self._imager(lines, grid, plan)(lines, certificate=False)
-
-    def _imager(self, lines: RangeLines, grid: Grid, plan: Plan | None) -> Imager:
-        if plan is not None:
-            # Errors, time and memory of lines so similar do not differ by more than the margins.
-            alike = replace(plan, lines_digest=lines_digest(lines))
-            return Imager(lines, grid, alike, device=self.device)
-        return Imager(
-            lines, grid, tolerance_db=self.tolerance_db, accuracy_db=self.accuracy_db,
+        imager = Imager(
+            self.a, grid, tolerance_db=self.tolerance_db, accuracy_db=self.accuracy_db,
             beam=self.beam, device=self.device,
         )  # fmt: skip
+        first, second = (imager(lines, certificate=False) for lines in (self.a, self.b))
+        return PairImages(first, second, imager, time.perf_counter() - started)
 
     def certificate(self, images: PairImages) -> tuple[Certificate | None, str]:
         """Return the larger measured error of both images, or None and why it is not known.

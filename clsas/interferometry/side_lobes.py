@@ -31,7 +31,7 @@ from clsas.engine.data.lines import RangeLines, antennas_of, wavelength_m
 from clsas.engine.data.pings import channels_per_ping
 from clsas.engine.data.system import element_pattern
 from clsas.engine.data.threads import cores
-from clsas.engine.factorized.plan import Plan
+from clsas.engine.imaging import Imager
 from clsas.engine.signal.spectrum import measure_spectrum
 from clsas.interferometry.coherence import Window
 from clsas.interferometry.pair import Pair
@@ -79,15 +79,15 @@ def middle(shape: tuple[int, ...]) -> tuple[int, int]:
     return (rows - 1) // 2, (columns - 1) // 2
 
 
-def point_response(pair: Pair, grid: Grid, plan: Plan | None) -> NDArray[np.float64]:
+def point_response(pair: Pair, grid: Grid, imager: Imager) -> NDArray[np.float64]:
     """Return the power of the first bank's image of a point in the middle of a plane.
 
-    The plan is that of an image of the bank there, or None.
+    The imager is one of the bank there.
     """
     point_m = grid.positions_m()[middle(grid.shape)]
     lines, beam = pair.a, pair.beam
     along = track_directions(lines) if beam is None else beam.directions(lines)
-    pixels = pair.image(lines_of_point(lines, point_m, along), grid, plan).pixels
+    pixels = imager(lines_of_point(lines, point_m, along), certificate=False).pixels
     return pixels.real.astype(np.float64) ** 2 + pixels.imag.astype(np.float64) ** 2
 
 

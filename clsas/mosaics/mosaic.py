@@ -59,6 +59,7 @@ from clsas.engine.factorized.planner import (
 from clsas.engine.forming import SceneImager, form
 from clsas.engine.promise import (
     CERTIFICATE,
+    LEAST_SECONDS,
     ON_MISS,
     describe_miss,
     is_wanted,
@@ -1042,8 +1043,8 @@ def _image(
     image, how = _formed(request, memory_bytes, lines, grid, beam, device)
     seconds = time.perf_counter() - began
     fields |= how | {"has_pixels": holds_any(image.pixels)}
-    is_to_tolerance = not request.keys() & {"stages", "tolerance_wavelengths"}
-    if is_wanted(certificate, seconds, by_default=is_to_tolerance):
+    is_in_db = not request.keys() & {"stages", "tolerance_wavelengths"}
+    if is_wanted(certificate, seconds, LEAST_SECONDS if is_in_db else math.inf):
         fields["certificate"], fields["unmeasured"] = measured_or_reason(
             image, lines, device, seconds, tolerance_db
         )

@@ -366,4 +366,3 @@ def _beam_weights(
     sine = sines(points_m, lines.phase_centres_m[channels], along[channels]).T
     weights: NDArray[np.float64] = beam.weights(sine, wavelength_m(lines))
     return weights
-

@@ -35,7 +35,7 @@ MOST_WAVELENGTHS = 500.0
 antennas are as long, reach 120. Positions in millimetres multiply it by 1000."""
 _SHORTEST = 0.5  # wavelengths: a shorter aperture resolves nothing, and the smallest arrays have 8
 _DENSEST = 1 / 200  # wavelengths between phase centres; slow rails reach 1/20, and slips 1/1000
-_SEARCHED = 4096  # phase centres whose spacing is measured
+_SEARCHED = 512  # phase centres whose spacing is measured
 _NEIGHBOURS = 4  # a group of up to so many stray fixes is found
 _USUAL = 0.9  # quantile of distances that stands for a moving platform, which may also stand still
 # Distance of a stray fix to its fourth neighbour, over that quantile. Ends of tracks reach 2, and a
@@ -51,11 +51,12 @@ _DECIMALS = (1e-4, 1e-3, 1e-2, 0.1, 1.0)
 # degrees make 57 times the resolution that was meant.
 _RADIANS, _COARSER, _NARROWED = 3.2, 30.0, 4.0
 _END_FIRE = math.cos(math.radians(20))  # no sonar squints by more than 60 degrees from broadside
-_CHANNELS = 32  # channels whose samples are looked at
+_CHANNELS = 16  # channels whose samples are looked at
 _CHIRPED = 0.15
 """Part of the phase steps along a line that grow evenly. Chirps of one point have 0.54, of three
 that overlap 0.17 to 0.55, and 210 random scenes of compressed lines up to 0.06."""
 _PHASED = 128  # channels whose phases show whether a point is in focus
+_BRIGHTEST = 64  # channels among whose samples the brightest is searched
 _LEAST_PHASED = 32  # as many equal ones: chance then reaches 0.46 for any of a thousand directions
 # Sum of phasors over the sum of their magnitudes: of a point in focus, of one that shows how lines
 # should be read, and by how much more it must be. A step of c/fs leaves up to 0.7 of a point.
@@ -422,7 +423,7 @@ def _focused(
         return range_m, found
 
     # The brightest sample, of channels spread over all, at ranges that the grid has.
-    searched = some_channels(lines.channels, _PHASED)
+    searched = some_channels(lines.channels, _BRIGHTEST)
     range_m = pairwise_range_m(points_m[:: max(len(points_m) // 256, 1)], lines.tx_m[searched],
                                lines.rx_m[searched])  # fmt: skip
     places_m = first_m[searched, None] + step_m * np.arange(lines.length)
