@@ -35,7 +35,6 @@ from clsas.engine.promise import (
     CERTIFICATE,
     FEWEST,
     FIRST,
-    LEAST_SECONDS,
     ON_MISS,
     FormAgain,
     certified,
@@ -468,9 +467,7 @@ def backproject(
         return imager.form(lines, progress)
 
     ways = () if is_fixed or accuracy_db <= BEST_ACCURACY_DB else (again,)
-    image = _certified(
-        image, lines, device, started, math.inf if is_fixed else LEAST_SECONDS, ways, **asked
-    )
+    image = _certified(image, lines, device, started, math.inf if is_fixed else None, ways, **asked)
     return _added(image, accumulate)
 
 
@@ -615,9 +612,9 @@ class Imager:
         self._checked = weakref.ref(lines)
         if plan is not None and tolerance_db is None and not plan.is_exact:
             self._check_band(lines)
-        # Least time of the next image that is certified by default
+        # Least time from which the next image is certified by default, if it is not the usual one
         is_given = tolerance_db is None and accuracy_db is None
-        self._certified_from_s = math.inf if is_given else LEAST_SECONDS
+        self._certified_from_s: float | None = math.inf if is_given else None
         self._planning_s = time.perf_counter() - started
 
     def __call__(
@@ -805,7 +802,7 @@ def _certified(
     lines: RangeLines,
     device: Device,
     started: float,
-    least_s: float,
+    least_s: float | None,
     again: Sequence[FormAgain] = (),
     *,
     certificate: bool | None,
@@ -813,12 +810,12 @@ def _certified(
 ) -> Image:
     """Return an image that was begun at a time, with its certificate if it is to have one.
 
-    Without a request, it has one if it took at least `least_s`.
+    `least_s` is the time from which on it is certified by default: see `is_wanted`.
     """
     seconds = time.perf_counter() - started
     if not is_wanted(certificate, seconds, least_s):
         return image
-    first = FIRST if least_s else FEWEST
+    first = FEWEST if least_s == 0 else FIRST
     return certified(image, lines, device, seconds, on_miss, again, first)
 
 

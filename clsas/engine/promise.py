@@ -73,9 +73,14 @@ class ToleranceError(RuntimeError):
         return f"the image misses its tolerance: {self.certificate.describe(self.tolerance_db)}"
 
 
-def is_wanted(certificate: bool | None, seconds: float, least_s: float = LEAST_SECONDS) -> bool:
-    """Return whether an image is certified: as requested, or by default if it took long enough."""
-    return seconds >= least_s if certificate is None else certificate
+def is_wanted(certificate: bool | None, seconds: float, least_s: float | None = None) -> bool:
+    """Return whether an image is certified: as requested, or by default if it took long enough.
+
+    `least_s` is `LEAST_SECONDS`, unless another time is given.
+    """
+    if certificate is None:
+        return seconds >= (LEAST_SECONDS if least_s is None else least_s)
+    return certificate
 
 
 def certified(

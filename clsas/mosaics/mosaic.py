@@ -59,7 +59,6 @@ from clsas.engine.factorized.planner import (
 from clsas.engine.forming import SceneImager, form
 from clsas.engine.promise import (
     CERTIFICATE,
-    LEAST_SECONDS,
     ON_MISS,
     describe_miss,
     is_wanted,
@@ -1044,7 +1043,7 @@ def _image(
     seconds = time.perf_counter() - began
     fields |= how | {"has_pixels": holds_any(image.pixels)}
     is_in_db = not request.keys() & {"stages", "tolerance_wavelengths"}
-    if is_wanted(certificate, seconds, LEAST_SECONDS if is_in_db else math.inf):
+    if is_wanted(certificate, seconds, None if is_in_db else math.inf):
         fields["certificate"], fields["unmeasured"] = measured_or_reason(
             image, lines, device, seconds, tolerance_db
         )

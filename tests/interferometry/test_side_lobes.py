@@ -89,7 +89,7 @@ def test_responses_are_those_of_simulated_points(width_deg, repeated):
     speckle = clsas.PointTargets(places_m, random.standard_normal((4000, 2)) @ [1, 1j])
     lines = clsas.density_compensated(echoes_of(sonar, track, speckle))
     pair = Pair(lines, lines, -40.0, None, beam, open_device(None))
-    found = point_response(pair, grid, None)
+    found = point_response(pair, grid, pair.images(grid).imager)
     point_m = grid.positions_m()[middle(grid.shape)]
     true = clsas.density_compensated(echoes_of(sonar, track, clsas.PointTargets([point_m])))
     expected = np.abs(clsas.backproject(true, grid, beam=beam).pixels.astype(complex)) ** 2
@@ -110,4 +110,6 @@ def test_silent_lines_have_no_response():
     pair = Pair(silent, silent, -40.0, None, None, open_device(None))
     grid = clsas.Grid.plane((-1, 1, 11), (59, 61, 41))
     power = np.ones(grid.shape)
-    assert not from_elsewhere(power, point_response(pair, grid, None), Window(3, 3)).any()
+    assert not from_elsewhere(
+        power, point_response(pair, grid, pair.images(grid).imager), Window(3, 3)
+    ).any()
