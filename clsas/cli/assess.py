@@ -13,8 +13,8 @@ from clsas.cli.inputs import load_lines, read_beam, read_grid, read_request
 from clsas.cli.outputs import json_able, report
 from clsas.cli.parameters import INPUT
 from clsas.cli.wording import command
+from clsas.engine.exact.decide import BEST_ACCURACY_DB
 from clsas.engine.factorized.planner import (
-    BEST_TOLERANCE_DB,
     TOLERANCE_DB,
     WORST_TOLERANCE_DB,
     tolerance_in_db,
@@ -116,4 +116,4 @@ def _tolerance_db(request: dict[str, Any]) -> float:
     )
     if tolerance_db is None:
         tolerance_db = request.get("accuracy_db", TOLERANCE_DB)
-    return min(max(tolerance_db, BEST_TOLERANCE_DB), WORST_TOLERANCE_DB)
+    return min(max(tolerance_db, BEST_ACCURACY_DB), WORST_TOLERANCE_DB)

@@ -29,7 +29,7 @@ from clsas.engine.device.device import Device, open_device
 from clsas.engine.exact.decide import ACCURACY, ACCURACY_DB, BEST_ACCURACY_DB
 from clsas.engine.factorized.costs import Costs
 from clsas.engine.factorized.plan import ExactImage, Plan
-from clsas.engine.factorized.planner import BEST_TOLERANCE_DB, TOLERANCE, Request, planned
+from clsas.engine.factorized.planner import TOLERANCE, Request, planned
 from clsas.engine.forming import Progress, SceneImager, form, scene_of_plan
 from clsas.engine.promise import (
     CERTIFICATE,
@@ -80,7 +80,7 @@ def plan(
     grid : Grid
         Pixels of the image.
     tolerance_db : float, optional
-        Largest relative rms error against the exact image, dB, from -75 to -10.
+        Largest relative rms error against the exact image, dB, from -85 to -10.
     tolerance_wavelengths : float, optional
         The same tolerance as a range error, in wavelengths of the carrier; see Notes.
     stages : sequence of (QR, QI), optional
@@ -221,7 +221,7 @@ def factorize(
         Any number of pixels: a plane, a height map or arbitrary points.
     plan_or_tolerance : Plan or float
         A plan that `clsas.plan` made for these lines and this grid, or the largest relative rms
-        error against the exact image, dB, from -75 to -10. With a tolerance, the image is planned
+        error against the exact image, dB, from -85 to -10. With a tolerance, the image is planned
         first.
     beam : BeamWindow, optional
         Weights of the channels by aspect angle. Must be left out with a plan, which contains its
@@ -488,7 +488,7 @@ class Imager:
     plan : Plan, optional
         A plan that `clsas.plan` made for these lines and this grid.
     tolerance_db : float, optional
-        Largest relative rms error against the exact image, dB, from -75 to -10. The fastest images
+        Largest relative rms error against the exact image, dB, from -85 to -10. The fastest images
         within it are then planned, as by `clsas.plan`.
     accuracy_db : float, optional
         Largest relative rms error against the ideal sum, dB, from -85 to below 0. The images are
@@ -714,7 +714,7 @@ class Imager:
         self, lines: RangeLines, progress: Progress | None, tolerance_db: float
     ) -> Image:
         """Return the image by a plan for another tolerance, which replaces that of the imager."""
-        tolerance_db = max(tolerance_db, BEST_TOLERANCE_DB)
+        tolerance_db = max(tolerance_db, BEST_ACCURACY_DB)
         request = Request(lines, self.grid, tolerance_db=tolerance_db, beam=self.beam)
         scene, self.plan, track = planned(request, self.device, doubts=False)
         self._imager = SceneImager(

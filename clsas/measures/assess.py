@@ -119,7 +119,7 @@ def assess(
     beam : BeamWindow, optional
         Weights of the channels.
     tolerance_db : float
-        Relative rms error of the image that is allowed, in dB, from -75 to -10.
+        Relative rms error of the image that is allowed, in dB, from -85 to -10.
     sonar, track : Sonar, Track, optional
         Survey that the lines come from, with the channels of `clsas.channels`. It determines the
         element patterns, and the velocity of the receivers if the lines have none.

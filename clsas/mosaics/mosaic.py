@@ -47,7 +47,6 @@ from clsas.engine.device.device import Device
 from clsas.engine.exact.decide import ACCURACY, BEST_ACCURACY_DB
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import (
-    BEST_TOLERANCE_DB,
     DEFAULT_REQUEST,
     THESIS_STAGES,
     TOLERANCE_DB,
@@ -1035,9 +1034,8 @@ def _image(
         found = describe_miss(missed.predicted_error_db, missed.certificate)
         fields["misses"] = (*missed.misses, found)
         better_db = tightened_db(missed.certificate, tolerance_db)
-        request = {"tolerance_db": max(better_db, BEST_TOLERANCE_DB)}
-        if missed.misses or missed.is_exact:
-            request = {"accuracy_db": max(better_db, BEST_ACCURACY_DB)}
+        name = "accuracy_db" if missed.misses or missed.is_exact else "tolerance_db"
+        request = {name: max(better_db, BEST_ACCURACY_DB)}
         certificate = True
     image, how = _formed(request, memory_bytes, lines, grid, beam, device)
     seconds = time.perf_counter() - began

@@ -43,7 +43,7 @@ FIXED = {
     "_FAR _LARGEST_HALF _LEAST_HALF _MOST_EXPONENT _SINGULAR": "limits of number formats",
     "_PERPENDICULAR": "separates rounding from geometry",
     "MOST_TAPS": "follows from UPSAMPLING_TAPS",
-    "BEST_TOLERANCE_DB WORST_TOLERANCE_DB BEST_ACCURACY_DB": "limits of input",
+    "WORST_TOLERANCE_DB BEST_ACCURACY_DB": "limits of input",
     "_READOUT_BYTES _READOUT_LINES": "memory of lines read on the host, outside of images",
     "ACCURACY_DB TOLERANCE_DB NEAREST_UPSAMPLING": "defaults of the interface",
 }

@@ -80,6 +80,6 @@ def test_every_declaration_is_complete_and_made_once():
 def test_help_states_unit_and_default():
     shown = {name: option.help for name, option in options()}
     assert "(m)." in shown["heights --window-m"]
-    assert shown["heights --tolerance-db"].endswith("(dB). [-75 to -10; default: -40]")
-    assert shown["image --tolerance-db"].endswith("(dB). [-75 to -10; default: -50]")
+    assert shown["heights --tolerance-db"].endswith("(dB). [-85 to -10; default: -40]")
+    assert shown["image --tolerance-db"].endswith("(dB). [-85 to -10; default: -50]")
     assert shown["known-points --unknown"].endswith("several. [default: time_offset, sound_speed]")

@@ -491,7 +491,7 @@ def test_a_track_file_that_is_no_text(tmp_path):
         ),
         (
             "[image]\ntolerance_db = -90",
-            "[image] tolerance_db must be finite and >= -75 and <= -10",
+            "[image] tolerance_db must be finite and >= -85 and <= -10",
         ),
         (
             "[image]\ntolerance_wavelengths = 0",

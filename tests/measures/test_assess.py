@@ -208,7 +208,7 @@ def test_half_precision_is_assessed(platform):
         ({"lines": 1}, TypeError, "lines must be"),
         ({"grid": 1}, TypeError, "grid must be"),
         ({"beam": 20.0}, TypeError, "beam must be"),
-        ({"tolerance_db": -80}, ValueError, "tolerance_db must be .*>= -75"),
+        ({"tolerance_db": -90}, ValueError, "tolerance_db must be .*>= -85"),
         ({"repeats": -1}, ValueError, "repeats must be at least 0"),
         ({"sonar": 1}, TypeError, "sonar must be"),
         (

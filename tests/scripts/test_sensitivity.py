@@ -15,7 +15,7 @@ def named(name):
 def test_tuned_constants_are_numbers_that_may_be_changed():
     found = {each.name for each in sensitivity.constants()}
     assert {"MARGIN_DB", "_LEAF_SHARE", "MEASURED_CHANNELS", "GEOMETRY_ERROR"} <= found
-    assert not {"STACK", "CHUNK", "BEST_TOLERANCE_DB", "TAPS", "MOST_TAPS"} & found
+    assert not {"STACK", "CHUNK", "TAPS", "MOST_TAPS"} & found
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ from clsas.engine.data.lines import RangeLines, some_channels, wavelength_m
 from clsas.engine.data.validate import ArgumentError, ArgumentTypeError
 from clsas.engine.data.visibility import is_within, sine_width, sines
 from clsas.engine.device.device import Device
-from clsas.engine.exact.decide import ACCURACY_DB
+from clsas.engine.exact.decide import ACCURACY_DB, BEST_ACCURACY_DB
 from clsas.engine.factorized import measured_costs
 from clsas.engine.factorized.candidates import (
     EDGES_SHARE,
@@ -54,8 +54,6 @@ from clsas.engine.scene import Scene
 from clsas.engine.signal import interpolation
 from clsas.engine.signal.ambiguity import MARGIN_DB
 
-BEST_TOLERANCE_DB = -75.0
-"""Tightest tolerance that may be requested: the rounding error of a factorized image in float32."""
 WORST_TOLERANCE_DB = -10.0
 """Loosest tolerance that may be requested."""
 TOLERANCE_DB = -50.0
@@ -64,7 +62,7 @@ DEFAULT_REQUEST = {"tolerance_db": TOLERANCE_DB}
 """Request of an image without one."""
 TOLERANCE = Number(
     "dB",
-    least=BEST_TOLERANCE_DB,
+    least=BEST_ACCURACY_DB,
     most=WORST_TOLERANCE_DB,
     help="Largest relative rms error against the exact image.",
     default=f"{TOLERANCE_DB:g}",
@@ -211,7 +209,7 @@ def wavelengths(decibels: float) -> float:
 
 TOLERANCE_WAVELENGTHS = Number(
     "wavelengths",
-    least=wavelengths(BEST_TOLERANCE_DB),
+    least=wavelengths(BEST_ACCURACY_DB),
     most=wavelengths(WORST_TOLERANCE_DB),
     help="The tolerance as a range error, evenly distributed up to this many wavelengths.",
 )
@@ -321,7 +319,7 @@ def _left_to_methods_db(tolerance_db: float | None, scene: Scene) -> tuple[float
     if tolerance_db is None:
         return ACCURACY_DB, None
     rest_db = scene.ambiguity.rest_db(tolerance_db, scene.left_out_error)
-    return rest_db - MARGIN_DB, scene.ambiguity.of_passed_db(rest_db)
+    return max(rest_db - MARGIN_DB, BEST_ACCURACY_DB), scene.ambiguity.of_passed_db(rest_db)
 
 
 def _known_costs(

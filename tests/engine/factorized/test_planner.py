@@ -25,6 +25,7 @@ from factorizing import (
 )
 from tiers import also, thinned
 
+from clsas.engine.certificate import certify
 from clsas.engine.data.beam import BeamWindow
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.image_error import relative_error_db
@@ -116,6 +117,14 @@ def test_a_large_image_is_factorized(tolerance_db):
     chosen = plan(lines, grid, tolerance_db=tolerance_db, costs=Costs())
     assert not chosen.is_exact
     assert chosen.predicted_seconds < 0.5 * chosen.exact_seconds
+
+
+@pytest.mark.parametrize("case", [straight, swaying], ids=lambda case: case.__name__)
+def test_factorized_images_keep_the_tightest_tolerance(case):
+    lines, grid = made(case)
+    chosen = planned(case, -85)
+    certificate = certify(factorize(lines, grid, chosen), lines, pixels=1000, seed=0)
+    assert certificate.verdict(-85) != "missed"
 
 
 @pytest.mark.parametrize("case", [straight, swaying], ids=lambda case: case.__name__)
@@ -438,7 +447,7 @@ def test_exactly_one_request_is_needed(good, requests):
 @pytest.mark.parametrize(
     ("argument", "value", "error", "says"),
     [
-        ("tolerance_db", -75.1, ValueError, r"tolerance_db must be .*>= -75 .*got -75\.1"),
+        ("tolerance_db", -85.1, ValueError, r"tolerance_db must be .*>= -85 .*got -85\.1"),
         ("tolerance_db", -9, ValueError, "tolerance_db must be .*<= -10 dB, got -9"),
         ("tolerance_db", 0.001, ValueError, r"tolerance_db must be .*dB, got 0\.001"),
         ("tolerance_db", np.nan, ValueError, "tolerance_db must be finite.*nan"),
