@@ -216,9 +216,11 @@ def factorized(devices: list[str], names: list[str] | None = None) -> None:
                     r["driver"],
                     r["tolerance_db"],
                     "{median:.3f} ({min:.3f} to {max:.3f})".format(**r["seconds"]),
-                    "{median:.3f} ({min:.3f} to {max:.3f})".format(**r["again_seconds"]),
+                    *(
+                        f"{r[key]['median']:.3f}"
+                        for key in ("again_seconds", "moved_seconds", "plan_seconds")
+                    ),
                     f"{r['predicted_seconds']:.3f}",
-                    f"{r['plan_seconds']:.2f}",
                     "{median:.3f} ({min:.3f} to {max:.3f})".format(**r["exact_seconds"]),
                     f"{r['speedup']:.1f}",
                     f"{r['speedup_again']:.1f}",
@@ -235,8 +237,9 @@ def factorized(devices: list[str], names: list[str] | None = None) -> None:
             "tolerance dB",
             "seconds: median (min to max)",
             "again",
-            "predicted",
+            "moved",
             "planning",
+            "predicted",
             "exact: median (min to max)",
             "speedup",
             "again",
@@ -265,7 +268,8 @@ def scaling(device: str, largest: int, png_file: str | None) -> None:
         [
             size,
             *(f"{r[key]['median']:.4g}" for key in ("seconds", "exact_seconds")),
-            *(f"{r[key]:.4g}" for key in ("speedup", "plan_seconds")),
+            f"{r['speedup']:.4g}",
+            f"{r['plan_seconds']['median']:.4g}",
             *(f"{r[key]:.1f}" for key in ("error_db", "predicted_error_db")),
         ]
         for size, r in zip(sizes, measured, strict=True)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.signal import interpolation
-from clsas.engine.signal.interpolation import PHASES, TAPS, Gain, Interpolator
+from clsas.engine.signal.interpolation import PHASES, TAPS, UPSAMPLINGS, Gain, Interpolator
 from clsas.engine.signal.spectrum import Spectrum
 
 ALIGN_TAPS = APERTURE_TAPS = (4, 6, 8)
@@ -33,7 +33,6 @@ _WORST_DB = -22.0  # of aperture filters; with worse ones, errors concentrate at
 # Share of the error power of aperture filters that is of the same sign along and across a sheet.
 # With half, errors of helices exceed the prediction by 0.5 dB.
 _COHERENT = 0.08
-_RATES = tuple(np.geomspace(1, 12, 16))  # at which errors of filters are evaluated
 _BINS = 64  # frequencies of the spectrum of steering functions
 
 
@@ -82,17 +81,16 @@ def _least_rate(taps: int, most_db: float, spectrum: Spectrum, error: str) -> fl
     if errors[-1] > most_db:
         return None
     if errors[0] <= most_db:
-        return _RATES[0]
+        return UPSAMPLINGS[0]
     # Errors fall with the rate. The margins for rounding are half a per cent and a tenth of a dB.
-    return 1.005 * float(np.exp(np.interp(0.1 - most_db, -errors, np.log(_RATES))))
+    return 1.005 * float(np.exp(np.interp(0.1 - most_db, -errors, np.log(UPSAMPLINGS))))
 
 
 @functools.lru_cache(maxsize=64)
 def _errors_db(taps: int, error: str, frequency: bytes, power: bytes) -> NDArray[np.float64]:
-    """Return the errors of filters at all `_RATES`."""
-    spectrum = Spectrum(0.0, np.frombuffer(frequency), np.frombuffer(power))
-    found = [getattr(each, error) for each in interpolation.designs(taps, _RATES, spectrum)]
-    return np.minimum.accumulate(found)
+    """Return the errors of filters at all `UPSAMPLINGS`, never increasing."""
+    found = interpolation.usual_designs(taps, frequency, power)
+    return np.minimum.accumulate([getattr(each, error) for each in found])
 
 
 def steering_spectrum(of_highest: ArrayLike = 1.0, power: ArrayLike = 1.0) -> Spectrum:
@@ -177,7 +175,7 @@ class FilterRates:
             # Errors fall by less than _SLOPE_DB per tap when the oversampling grows e-fold.
             spare_db = allowed_db - _CLOSE_DB - tried.error_db
             fewer = math.exp(-spare_db / (_SLOPE_DB * self.aperture_taps))
-            oversampling = max(tried.upsampling * fewer, _RATES[0])
+            oversampling = max(tried.upsampling * fewer, UPSAMPLINGS[0])
             tried = interpolation.design(self.aperture_taps, oversampling, steering)
             if tried.error_db <= allowed_db and oversampling < aperture.upsampling:
                 aperture = tried

@@ -188,6 +188,16 @@ def designs(taps: int, upsamplings: Sequence[float], spectrum: Spectrum) -> list
     ]
 
 
+@functools.lru_cache(maxsize=64)
+def usual_designs(taps: int, frequency: bytes, power: bytes) -> tuple[Interpolator, ...]:
+    """Return the interpolators of `designs` for all `UPSAMPLINGS`, which are remembered.
+
+    The arguments are arrays of a `Spectrum`, as bytes.
+    """
+    spectrum = Spectrum(0.0, np.frombuffer(frequency), np.frombuffer(power))
+    return tuple(designs(taps, UPSAMPLINGS, spectrum))
+
+
 @functools.cache
 def _positions(taps: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the positions at which filters are fitted, polynomials there, and their fit.
@@ -246,10 +256,14 @@ def choose(
         return design(taps, upsampling, spectrum)
     power_left = power(accuracy_db) - other_error**2
     target_db = in_db(power_left / spectrum.scatter) - _SCATTER_DB
-    rates: Sequence[float] = UPSAMPLINGS if upsampling is None else (upsampling,)
     candidates = []
     for each_taps in TAPS if taps is None else (taps,):
-        for found in designs(each_taps, rates, spectrum):
+        if upsampling is None:
+            as_bytes = spectrum.frequency.tobytes(), spectrum.power.tobytes()
+            designed = usual_designs(each_taps, *as_bytes)
+        else:
+            designed = (design(each_taps, upsampling, spectrum),)
+        for found in designed:
             if found.error_db <= target_db:
                 candidates.append(found)
                 break
