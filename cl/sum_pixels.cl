@@ -11,20 +11,20 @@
  *   GROUP, POINTS  channels that a work-item adds up, and for how many points; neighbours read the same part of a line
  *
  * samples  float2 [channels][length].
- * filters  float [PHASES + 2][2][taps][2], with an even number of taps: the real parts, each twice, and then the
+ * filters  float [PHASES + 2][2][taps][2], with a multiple of 4 taps: the real parts, each twice, and then the
  *          imaginary parts, each twice.
  * whole, fraction, factors  [channels][points]. Pairs whose factor is 0 are skipped.
  *
  * Global size: (groups of points, groups of channels).
  */
 
-/* 2 samples, of which those outside the line are 0. */
-inline float4 samples_near_end(__global const float2 *line, int first, int length)
-{
-    const float2 none = 0.0f;
-    return (float4)(first >= 0 && first < length ? line[first] : none,
-                    first + 1 >= 0 && first + 1 < length ? line[first + 1] : none);
-}
+/* 4 samples or taps, which need not be aligned. vload8 is a function call with some drivers, and three times slower. */
+#ifdef __clang__
+typedef float unaligned8 __attribute__((ext_vector_type(8), aligned(4)));
+#define LOAD(p) (*(__global const unaligned8 *)(p))
+#else
+#define LOAD(p) vload8(0, p)
+#endif
 
 __kernel void sum_pixels(__global const float2 *samples, int length, __global const float *filters, int taps,
                          __global const int *whole, __global const float *fraction, __global const float2 *factors,
@@ -43,22 +43,32 @@ __kernel void sum_pixels(__global const float2 *samples, int length, __global co
             if (factor.x == 0.0f && factor.y == 0.0f)
                 continue;
             const int first = whole[pair] - (taps / 2 - 1);
-            const bool inside = first >= 0 && first + taps <= length;
             const float phase = fraction[pair] * PHASES;
-            const int entry = clamp((int)phase, 0, PHASES);
+            const int entry = phase < PHASES ? (int)phase : PHASES;
             const float share = phase - entry;
             __global const float *row = filters + (size_t)entry * 4 * taps;
-            float4 by_real = 0.0f, by_imaginary = 0.0f;
-            for (int v = 0; v < taps / 2; v++) {
-                const float4 sample = inside ? vload4(0, (__global const float *)(line + first + 2 * v))
-                                             : samples_near_end(line, first + 2 * v, length);
-                const float4 real = vload4(v, row), imaginary = vload4(v + taps / 2, row);
-                const float4 next_real = vload4(v + taps, row), next_imaginary = vload4(v + 3 * taps / 2, row);
-                by_real += sample * (real + share * (next_real - real));
-                by_imaginary += sample * (imaginary + share * (next_imaginary - imaginary));
-            }
-            const float x = by_real.x + by_real.z - (by_imaginary.y + by_imaginary.w);
-            const float y = by_real.y + by_real.w + (by_imaginary.x + by_imaginary.z);
+            float x = 0.0f, y = 0.0f;
+            if (first >= 0 && first + taps <= length) {
+                float8 by_real = 0.0f, by_imaginary = 0.0f;
+                for (int v = 0; v < 2 * taps; v += 8) {
+                    const float8 sample = LOAD((__global const float *)(line + first) + v);
+                    const float8 real = LOAD(row + v), imaginary = LOAD(row + v + 2 * taps);
+                    const float8 next_real = LOAD(row + v + 4 * taps), next_imaginary = LOAD(row + v + 6 * taps);
+                    by_real += sample * (real + share * (next_real - real));
+                    by_imaginary += sample * (imaginary + share * (next_imaginary - imaginary));
+                }
+                const float4 even = by_real.even - by_imaginary.odd, odd = by_real.odd + by_imaginary.even;
+                x = even.x + even.y + even.z + even.w;
+                y = odd.x + odd.y + odd.z + odd.w;
+            } else
+                for (int t = max(-first, 0); t < min(taps, length - first); t++) {
+                    __global const float *tap = row + 2 * t;
+                    const float real = tap[0] + share * (tap[4 * taps] - tap[0]);
+                    const float imaginary = tap[2 * taps] + share * (tap[6 * taps] - tap[2 * taps]);
+                    const float2 sample = line[first + t];
+                    x += sample.x * real - sample.y * imaginary;
+                    y += sample.y * real + sample.x * imaginary;
+                }
             sum[point - first_point] += (float2)(x * factor.x - y * factor.y, x * factor.y + y * factor.x);
         }
     }

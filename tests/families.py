@@ -276,6 +276,10 @@ def _in_water(
 ) -> BentChannels:
     """Return channels in water in which rays fall from all antennas to all pixels."""
     antennas_m = np.concatenate([channels.tx_m, channels.rx_m])
+    if channels.velocity_m_s is not None:  # where receivers are when the last echo arrives
+        reach_m = np.linalg.norm(pixels_m[None] - antennas_m[::7, None], axis=-1).max()
+        flight_s = 2.2 * reach_m / SPEED_M_S
+        antennas_m = np.concatenate([antennas_m, channels.rx_m + flight_s * channels.velocity_m_s])
     room_m = 10 * wave_m + 1.0
     top, bottom = antennas_m[:, 2].max() + room_m, pixels_m[:, 2].min() - room_m
     highest, lowest = float(pixels_m[:, 2].max()), float(antennas_m[:, 2].min())

@@ -39,7 +39,7 @@ WORST = 5
 """Number of pixels with the largest errors that a certificate lists."""
 
 _PIXELS_AT_ONCE = 1 << 12  # formed again together; these three bound memory
-_PAIRS_AT_ONCE = 1 << 15  # of pixels and channels
+_PAIRS_AT_ONCE = 1 << 16  # of pixels and channels
 _SAMPLES_AT_ONCE = 1 << 22  # of the lines in a block
 _BLOCK = 1 << 10  # pixels whose power is summed together
 _DRAWN_AT_ONCE = 1 << 11  # bounds memory for the blocks of the pixels drawn
@@ -52,10 +52,11 @@ _DENSE_TAPS = 20  # enough for -120 dB if lines are twice as dense
 _STOPBANDS_DB = (70.0, 120.0)  # least and most
 _BELOW_TOLERANCE_DB = 25.0  # by which filters are better than an image may be
 _SLACK_DB = 5.0  # by which the error of a filter may exceed that of its stop band
-_GROUP, _POINTS = 16, 16  # channels that a work-item adds up in single precision, and points
+_GROUP = 16  # channels that a work-item adds up in single precision
+_POINTS, _POINTS_OF_GPU = 64, 16  # for which it does so
 _PADDING = 64  # zeros at either end of a line that is made denser, beyond the reach of the taps
 
-_SPECTRA, _SPECTRUM_SAMPLES = 512, 256  # pieces of lines that show where the band lies
+_SPECTRA, _SPECTRUM_SAMPLES = 256, 256  # pieces of lines that show where the band lies
 _OUTSIDE = (1e-6, 1e-4, 1e-3, 1e-2, 5e-2)  # shares of the power that may lie outside the band
 _WIDEST = 0.95  # width of a band beside which there is a guard band, cycles per sample
 _GUARD, _QUIET = 0.0125, 0.25  # half the width of a guard band, and its most power, of the mean
@@ -394,56 +395,71 @@ class IdealImage:
         stopband_db: float = _STOPBANDS_DB[1],
     ) -> None:
         self._lines, self._beam, self._device = lines, beam, device
+        self._geometry = lines.without_samples()
         self._along = None if beam is None else beam.directions(lines)
         power = _spectrum(lines, points_m, random)
         self._middle = _middle_of_band(power)
         self._taps, self._denser = _filter_for(power, self._middle, stopband_db)
         middle = 0.0 if self._denser > 1 else self._middle
         self._filters = device.upload(_complex_taps(self._taps, stopband_db, middle))
-        self._kernel = device.kernel("sum_pixels", PHASES=_PHASES, GROUP=_GROUP, POINTS=_POINTS)
+        # On a CPU, one work-item reads the samples of a line for many points in turn.
+        self._points_together = _POINTS if device.info.width > 1 else _POINTS_OF_GPU
+        self._kernel = device.kernel(
+            "sum_pixels", PHASES=_PHASES, GROUP=_GROUP, POINTS=self._points_together
+        )
 
     def at(self, points_m: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the pixels at some points [points, 3], metres; complex128 [points]."""
         lines, beam = self._lines, self._beam
         image = np.zeros(len(points_m), np.complex128)
+        nearest_first = np.argsort(cdist(points_m, lines.tx_m[:1])[:, 0])  # lines are read in order
+        points_m = points_m[nearest_first]
         for first in range(0, len(points_m), _PIXELS_AT_ONCE):
             part = slice(first, first + _PIXELS_AT_ONCE)
             points, weights = points_m[part], np.zeros(len(points_m[part]))
             step = max(min(_PAIRS_AT_ONCE // len(points), _SAMPLES_AT_ONCE // lines.length), 1)
             blocks = [slice(start, start + step) for start in range(0, lines.channels, step)]
-            for pairs in in_threads(partial(self._pairs, points), blocks):
+            pairs_of = partial(self._pairs, points)
+            for pairs in in_threads(pairs_of, blocks) if len(blocks) > 1 else map(pairs_of, blocks):
                 image[part] += self._summed(pairs)
                 weights += pairs.weight.sum(axis=0)
             if beam is not None and beam.normalise:
                 image[part] *= lines.channels / np.maximum(weights, LEAST_WEIGHT_SUM)
+        image[nearest_first] = image.copy()
         return image
 
     def _pairs(self, points_m: NDArray[np.float64], channels: slice) -> _Pairs:
         """Return where some channels receive from points, and how they add up."""
-        lines = self._lines.select(channels)
+        lines, length = self._geometry.select(channels), self._lines.length
         range_m = _ranges_m(lines, points_m)
-        position = (range_m - lines.first_range_m[:, None]) / lines.range_step_m
-        counts = (position >= 0) & (position <= lines.length - 1)
+        position = range_m - lines.first_range_m[:, None]
+        position /= lines.range_step_m
+        counts = (position >= 0) & (position <= length - 1)
         weight = np.ones(range_m.shape)
         if self._beam is not None and self._along is not None:
             sines = _sines(lines, points_m, self._along[channels])
             weight = self._beam.weights(sines, _wavelength_m(lines))
-        np.clip(position, 0, lines.length - 1, out=position)
-        cycles = np.where(counts, range_m, 0) * (2 * lines.carrier_hz / lines.sound_speed_m_s)
-        samples = lines.samples
+        np.clip(position, 0, length - 1, out=position)
+        if lines.sound_speed is not None:
+            range_m[~counts] = 0.0  # infinite where no ray arrives
+        cycles = range_m
+        cycles *= 2 * lines.carrier_hz / lines.sound_speed_m_s
+        samples = self._lines.samples[channels]
         if self._denser > 1:
             cycles += self._middle * position
             samples = _twice_as_dense(samples, self._middle)
             position = 2 * (position + _PADDING)
         whole = position.astype(np.int32)
-        fraction = position - whole
+        fraction = np.subtract(position, whole, out=position)
         if self._denser == 1:
             cycles += self._middle * fraction
         cycles -= np.rint(cycles)
-        phase = (2 * np.pi * cycles).astype(np.float32)
+        phase = cycles.astype(np.float32)
+        phase *= np.float32(2 * np.pi)
+        counted = (weight * counts).astype(np.float32)
         factors = np.empty(phase.shape, np.complex64)
-        factors.real, factors.imag = np.cos(phase), np.sin(phase)
-        factors *= np.where(counts, weight, 0).astype(np.float32)
+        np.multiply(np.cos(phase), counted, out=factors.real)
+        np.multiply(np.sin(phase), counted, out=factors.imag)
         return _Pairs(samples, whole, fraction.astype(np.float32), factors, weight)
 
     def _summed(self, pairs: _Pairs) -> NDArray[np.complex128]:
@@ -454,7 +470,7 @@ class IdealImage:
         result = device.share(sums)
         device.run(
             self._kernel,
-            (-(-points // _POINTS), len(sums)),
+            (-(-points // self._points_together), len(sums)),
             samples=device.share(pairs.samples),
             length=pairs.samples.shape[1],
             filters=self._filters,
@@ -576,11 +592,11 @@ def _spectrum(
     channels = some_channels(lines.channels, _SPECTRA)
     pieces = -(-_SPECTRA // len(channels))
     points_m = points_m[random.integers(len(points_m), size=min(pieces, len(points_m)))]
-    some = lines.select(channels)
+    some = lines.without_samples().select(channels)
     position = (_ranges_m(some, points_m) - some.first_range_m[:, None]) / some.range_step_m
     middle = np.clip(position, 0, lines.length - 1).astype(np.int64)
     index = middle[..., None] + np.arange(_SPECTRUM_SAMPLES) - _SPECTRUM_SAMPLES // 2
-    taken = np.take_along_axis(some.samples[:, None], np.clip(index, 0, lines.length - 1), axis=-1)
+    taken = lines.samples[channels[:, None, None], np.clip(index, 0, lines.length - 1)]
     window = np.sin(np.pi * (np.arange(_SPECTRUM_SAMPLES) + 0.5) / _SPECTRUM_SAMPLES) ** 4
     taken = taken * np.where((index >= 0) & (index < lines.length), window, 0).astype(np.float32)
     return _power(scipy.fft.fft(taken, axis=-1)).sum(axis=(0, 1))
