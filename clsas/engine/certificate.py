@@ -397,7 +397,7 @@ class IdealImage:
         self._lines, self._beam, self._device = lines, beam, device
         self._geometry = lines.without_samples()
         self._along = None if beam is None else beam.directions(lines)
-        power = _spectrum(lines, points_m, random)
+        power = _spectrum(lines.samples, self._geometry, points_m, random)
         self._middle = _middle_of_band(power)
         self._taps, self._denser = _filter_for(power, self._middle, stopband_db)
         middle = 0.0 if self._denser > 1 else self._middle
@@ -583,22 +583,25 @@ def _wavelength_m(lines: RangeLines) -> float:
 
 
 def _spectrum(
-    lines: RangeLines, points_m: NDArray[np.float64], random: np.random.Generator
+    samples: NDArray[np.complex64],
+    geometry: RangeLines,
+    points_m: NDArray[np.float64],
+    random: np.random.Generator,
 ) -> NDArray[np.float64]:
     """Return the power spectrum of pieces of lines around points, frequencies as in FFTs.
 
     A line that is cut off near a point has all frequencies there.
     """
-    channels = some_channels(lines.channels, _SPECTRA)
-    pieces = -(-_SPECTRA // len(channels))
+    channels = some_channels(geometry.channels, _SPECTRA)
+    pieces, length = -(-_SPECTRA // len(channels)), samples.shape[1]
     points_m = points_m[random.integers(len(points_m), size=min(pieces, len(points_m)))]
-    some = lines.without_samples().select(channels)
+    some = geometry.select(channels)
     position = (_ranges_m(some, points_m) - some.first_range_m[:, None]) / some.range_step_m
-    middle = np.clip(position, 0, lines.length - 1).astype(np.int64)
+    middle = np.clip(position, 0, length - 1).astype(np.int64)
     index = middle[..., None] + np.arange(_SPECTRUM_SAMPLES) - _SPECTRUM_SAMPLES // 2
-    taken = lines.samples[channels[:, None, None], np.clip(index, 0, lines.length - 1)]
+    taken = samples[channels[:, None, None], np.clip(index, 0, length - 1)]
     window = np.sin(np.pi * (np.arange(_SPECTRUM_SAMPLES) + 0.5) / _SPECTRUM_SAMPLES) ** 4
-    taken = taken * np.where((index >= 0) & (index < lines.length), window, 0).astype(np.float32)
+    taken = taken * np.where((index >= 0) & (index < length), window, 0).astype(np.float32)
     return _power(scipy.fft.fft(taken, axis=-1)).sum(axis=(0, 1))
 
 

@@ -97,7 +97,9 @@ def test_a_second_estimate_finds_inverted_polarity():
     rotation, delay_s = 0.0, 0.0
     for search_m in ((-2.5, 2.5), (-0.8, 0.8)):
         found = measured((first, second), search_m=search_m)
-        errors = clsas.pair_errors(first, second, found, known_height_m=0.0)
+        errors = clsas.pair_errors(
+            first, second, found, known_height_m=0.0, unknowns=("phase", "delay")
+        )
         second = errors.corrected(first, second)
         rotation, delay_s = rotation + errors.phase_rad, delay_s + errors.delay_s
     sd = dict(zip(errors.unknowns, errors.sd, strict=True))
