@@ -14,11 +14,10 @@ import numpy as np
 import clsas
 from clsas.cli import options
 from clsas.cli.inputs import load, load_lines, read_beam, read_grid, read_scene
-from clsas.cli.outputs import json_able, print_json, printable, progress_bar, report, say, warn
+from clsas.cli.outputs import json_able, print_json, printable, progress_bar, report, say
 from clsas.cli.parameters import HDF5, HDF5_OR_STORE, INPUT, POSITION, STAGES, Output
 from clsas.cli.wording import command
 from clsas.engine.data.decibels import level_db
-from clsas.engine.data.digests import samples_digest
 from clsas.engine.data.reprs import Table
 from clsas.engine.factorized.plan import ExactImage
 from clsas.engine.factorized.planner import TOLERANCE_DB, Request
@@ -73,8 +72,6 @@ def certify(
         if (formed := image.formed) is not None:
             tolerance_db = formed.tolerance_db
             described = replace(described, image={"beam": formed.beam})
-            if formed.method != "mosaic" and formed.lines_digest != samples_digest(lines):
-                warn(f"{image_file} was formed from other lines than those of {lines_file}")
     found = clsas.certify(image, lines, beam=read_beam(described, beam), **how, device=device)
     figures = found.figures
     text = found.describe(tolerance_db)

@@ -24,6 +24,7 @@ from clsas.engine.data.beam import LEAST_WEIGHT_SUM, BeamWindow
 from clsas.engine.data.certificate import Certificate
 from clsas.engine.data.decibels import in_db
 from clsas.engine.data.declared import Count, Flag, check_declared
+from clsas.engine.data.digests import samples_digest
 from clsas.engine.data.georeference import placed
 from clsas.engine.data.image import Image
 from clsas.engine.data.lines import RangeLines, some_channels
@@ -57,6 +58,7 @@ _POINTS, _POINTS_OF_GPU = 64, 16  # for which it does so
 _PADDING = 64  # zeros at either end of a line that is made denser, beyond the reach of the taps
 
 _SPECTRA, _SPECTRUM_SAMPLES = 256, 256  # pieces of lines that show where the band lies
+_SPECTRUM_POINTS = 16  # around which they lie, at least
 _OUTSIDE = (1e-6, 1e-4, 1e-3, 1e-2, 5e-2)  # shares of the power that may lie outside the band
 _WIDEST = 0.95  # width of a band beside which there is a guard band, cycles per sample
 _GUARD, _QUIET = 0.0125, 0.25  # half the width of a guard band, and its most power, of the mean
@@ -117,6 +119,11 @@ def certify(
     DeviceError
         If the device does not exist.
 
+    Warns
+    -----
+    ClsasWarning
+        If the image was formed from other lines.
+
     See Also
     --------
     relative_error_db : Error of an image relative to another one.
@@ -134,7 +141,9 @@ def certify(
     of pixels, |error|^2/(N q) is an unbiased estimate of the mean error power, whether a few pixels
     are bright or all are speckle.
 
-    A fault in a single pixel of a large image is usually not found.
+    A fault in a single pixel of a large image is usually not found. Where lines do not fade towards
+    an end, values between their samples depend on how they are continued, near the end by -30 dB or
+    more of its power, so that no error much smaller has a meaning there.
 
     Examples
     --------
@@ -158,13 +167,16 @@ def certify(
     """
     validate.instance("image", image, Image)
     validate.instance("lines", lines, RangeLines)
-    formed_beam = None if image.formed is None else image.formed.beam
+    formed = image.formed
+    formed_beam = None if formed is None else formed.beam
     if beam is ...:
         beam = formed_beam
     validate.instance("beam", beam, BeamWindow, type(None))
     if beam is None and formed_beam is not None:
         allowed = "be that of `image.formed`, or be left out"
         raise ArgumentError("beam", allowed, "None for an image that was formed with a beam")
+    if formed and formed.method != "mosaic" and formed.lines_digest != samples_digest(lines):
+        validate.warn("the image was formed from other lines than those given")
     asked = check_declared(certify, {"pixels": pixels, "seed": seed, "scale": scale})
     measurement = Measurement(image, lines, beam, open_device(device), asked["seed"])
     measurement.draw(asked["pixels"])
@@ -439,9 +451,7 @@ class IdealImage:
         if self._beam is not None and self._along is not None:
             sines = _sines(lines, points_m, self._along[channels])
             weight = self._beam.weights(sines, _wavelength_m(lines))
-        np.clip(position, 0, length - 1, out=position)
-        if lines.sound_speed is not None:
-            range_m[~counts] = 0.0  # infinite where no ray arrives
+        position[~counts] = range_m[~counts] = 0.0  # also where no ray arrives
         cycles = range_m
         cycles *= 2 * lines.carrier_hz / lines.sound_speed_m_s
         samples = self._lines.samples[channels]
@@ -530,7 +540,8 @@ def _ranges_m(lines: RangeLines, points_m: NDArray[np.float64]) -> NDArray[np.fl
     square = 1 - np.sum(v * v, axis=1)[:, None]
     half = out_m - sum(d[axis] * v[:, axis, None] for axis in range(3))
     rest = out_m**2 - sum(each**2 for each in d)
-    return (half + np.sqrt(half**2 - square * rest)) / square / 2
+    root = np.maximum(half**2 - square * rest, 0.0)  # below 0 only by rounding
+    return (half + np.sqrt(root)) / square / 2
 
 
 def _distances_m(
@@ -592,17 +603,32 @@ def _spectrum(
 
     A line that is cut off near a point has all frequencies there.
     """
-    channels = some_channels(geometry.channels, _SPECTRA)
-    pieces, length = -(-_SPECTRA // len(channels)), samples.shape[1]
-    points_m = points_m[random.integers(len(points_m), size=min(pieces, len(points_m)))]
+    channels, length = some_channels(geometry.channels, _SPECTRA), samples.shape[1]
+    points = max(_SPECTRUM_POINTS, -(-_SPECTRA // len(channels)))
+    points_m = points_m[random.integers(len(points_m), size=points)]
     some = geometry.select(channels)
     position = (_ranges_m(some, points_m) - some.first_range_m[:, None]) / some.range_step_m
-    middle = np.clip(position, 0, length - 1).astype(np.int64)
-    index = middle[..., None] + np.arange(_SPECTRUM_SAMPLES) - _SPECTRUM_SAMPLES // 2
-    taken = samples[channels[:, None, None], np.clip(index, 0, length - 1)]
+    middle = np.clip(np.nan_to_num(position), 0, length - 1).astype(np.int64)
+    piece = np.arange(_SPECTRA)
+    row, column = piece % len(channels), (piece + piece // len(channels)) % points
+    power = _power_of_pieces(samples, channels[row], middle[row, column])
+    if not power.any():  # silent there, so take pieces of the loudest lines
+        energy = np.einsum("cs,cs->c", samples, samples.conj()).real
+        loudest = np.argsort(energy)[-_SPECTRUM_POINTS:]
+        power = _power_of_pieces(samples, loudest, np.abs(samples[loudest]).argmax(axis=1))
+    return power
+
+
+def _power_of_pieces(
+    samples: NDArray[np.complex64], channels: NDArray[np.int64], middle: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the power spectrum of pieces of some lines around a sample of each."""
+    index = middle[:, None] + np.arange(_SPECTRUM_SAMPLES) - _SPECTRUM_SAMPLES // 2
+    taken = samples[channels[:, None], np.clip(index, 0, samples.shape[1] - 1)]
     window = np.sin(np.pi * (np.arange(_SPECTRUM_SAMPLES) + 0.5) / _SPECTRUM_SAMPLES) ** 4
-    taken = taken * np.where((index >= 0) & (index < length), window, 0).astype(np.float32)
-    return _power(scipy.fft.fft(taken, axis=-1)).sum(axis=(0, 1))
+    inside = (index >= 0) & (index < samples.shape[1])
+    taken = taken * np.where(inside, window, 0).astype(np.float32)
+    return _power(scipy.fft.fft(taken, axis=-1)).sum(axis=0)
 
 
 def _middle_of_band(power: NDArray[np.float64]) -> float:
@@ -698,9 +724,7 @@ def _tap_numbers(taps: int) -> NDArray[np.int64]:
 @cache
 def _taps(taps: int, stopband_db: float) -> NDArray[np.float64]:
     """Return the taps of a sinc under a Kaiser window for every phase, [phases, taps]."""
-    from scipy.signal import kaiser_beta  # takes a tenth of a second
-
-    beta = kaiser_beta(stopband_db)
+    beta = 0.1102 * (stopband_db - 8.7)  # Kaiser (1974), above 50 dB
     offset = np.arange(_PHASES + 2)[:, None] / _PHASES - _tap_numbers(taps)
     inside = np.sqrt(np.maximum(1 - (2 * offset / taps) ** 2, 0))
     return np.sinc(offset) * np.i0(beta * inside) / np.i0(beta)

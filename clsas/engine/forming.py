@@ -78,6 +78,11 @@ class SceneImager:
             assert isinstance(plan, Plan)
             self._factorized = FactorizedImager(scene, plan, device, track, keep=keep)
 
+    @property
+    def suits_track(self) -> bool:
+        """False if the antennas have no mean track of the shape that the plan needs."""
+        return self.decision is not None or self._factorized.track is not None
+
     def form(self, lines: RangeLines, progress: Progress | None = None) -> Image:
         """Return the image of lines of the scene's geometry.
 

@@ -33,8 +33,6 @@ from clsas.engine.factorized.planner import TOLERANCE, Request, planned
 from clsas.engine.forming import Progress, SceneImager, form, scene_of_plan
 from clsas.engine.promise import (
     CERTIFICATE,
-    FEWEST,
-    FIRST,
     ON_MISS,
     FormAgain,
     certified,
@@ -502,8 +500,9 @@ class Imager:
     Attributes
     ----------
     plan : Plan or None
-        How the images are formed; None if they are exact because `accuracy_db` was given, or an
-        image by a better plan missed the tolerance, too.
+        How the images are formed. After a miss, it is another plan, possibly for a tighter
+        tolerance. None if images are exact because `accuracy_db` was given, or an image by a better
+        plan missed the tolerance, too.
     grid : Grid
     beam : BeamWindow or None
     device : Device
@@ -535,7 +534,8 @@ class Imager:
 
     A plan holds for antennas that differ a little, because subimages and filters stay accurate
     enough. How much they may differ is not predicted. Instead, the error of the first image of such
-    lines is measured, and if it misses the tolerance, the image is planned again.
+    lines is measured, and if it misses the tolerance, the image is planned again. A measurement at
+    some pixels may miss an error of a few channels or pixels.
 
     Examples
     --------
@@ -612,9 +612,10 @@ class Imager:
         self._checked = weakref.ref(lines)
         if plan is not None and tolerance_db is None and not plan.is_exact:
             self._check_band(lines)
-        # Least time from which the next image is certified by default, if it is not the usual one
-        is_given = tolerance_db is None and accuracy_db is None
-        self._certified_from_s: float | None = math.inf if is_given else None
+        # Whether the next image is certified by default, if it takes long enough
+        self._is_next_certified = tolerance_db is not None or accuracy_db is not None
+        # Whether the plan was made for other antennas, and no image of these has met the tolerance
+        self._is_unproven = False
         self._planning_s = time.perf_counter() - started
 
     def __call__(
@@ -636,9 +637,9 @@ class Imager:
         certificate : bool, optional
             Whether the error of the image is measured, as by `clsas.certify`. By default,
             that of the first image is measured, if the imager was not made from a plan, and
-            planning and forming the image take 0.1 s or more. That of a factorized image is
-            also measured, whatever its time, if it is the first of lines with other antennas than
-            those that the plan was made for.
+            planning and forming the image take 0.1 s or more. If the lines have other antennas than
+            those that the plan was made for, the errors of factorized images are measured, whatever
+            their time, until one meets the tolerance.
         on_miss : {"refine", "warn", "raise"}
             What to do if the measured error exceeds the tolerance beyond doubt: form the image
             again by a better plan, and then exactly, with a warning; warn; or raise ToleranceError.
@@ -685,13 +686,25 @@ class Imager:
             self._check_band(lines)
             self._checked = weakref.ref(lines)
         image = self._imager.form(lines, progress)
-        least_s, self._certified_from_s, self._planning_s = self._certified_from_s, math.inf, 0.0
-        exactly = partial(self._exactly, lines, progress)
-        ways: tuple[FormAgain, ...] = partial(self._form_again, lines, progress), exactly
+        self._planning_s = 0.0
+        least_s = None if self._is_next_certified else math.inf
+        self._is_next_certified = False
+        again, exactly = (
+            partial(each, lines, progress) for each in (self._form_again, self._exactly)
+        )
+        ways: tuple[FormAgain, ...] = again, exactly
         if self._imager.decision is not None:
             is_best = (self._tolerance_db or 0.0) <= BEST_ACCURACY_DB
             ways = () if is_best else (exactly,)
+        elif self._is_unproven and self._tolerance_db is not None:
+            least_s, tolerance_db = 0.0, self._tolerance_db
+            # Another plan for these antennas need not be better than the tolerance.
+            ways = lambda _: again(tolerance_db), again, exactly
         image = _certified(image, lines, self.device, started, least_s, ways, **asked)
+        assert image.formed is not None
+        measured = image.formed.certificate
+        if measured is not None and self._tolerance_db is not None:
+            self._is_unproven &= measured.verdict(self._tolerance_db) != "met"
         return _added(image, accumulate)
 
     def _move_to(self, lines: RangeLines, digest: str) -> None:
@@ -705,27 +718,29 @@ class Imager:
         plan = self._imager.plan
         allowed_db = plan.tolerance_db if isinstance(plan, Plan) else plan.accuracy_db
         scene = Scene.of(lines, self.grid, self.beam, allowed_db)
-        self._imager = SceneImager(scene, plan, self.device, tolerance_db=self._tolerance_db)
-        self._lines_digest = digest
-        if self._imager.decision is None and self._tolerance_db is not None:
-            self._certified_from_s = 0.0  # nothing was predicted for these lines
+        imager = SceneImager(scene, plan, self.device, tolerance_db=self._tolerance_db)
+        if not imager.suits_track and self._tolerance_db is not None:
+            imager = self._planned_again(lines, self._tolerance_db)
+        else:
+            self._is_unproven = imager.decision is None
+        self._imager, self._lines_digest, self._warned_of_band = imager, digest, False
 
     def _form_again(
         self, lines: RangeLines, progress: Progress | None, tolerance_db: float
     ) -> Image:
         """Return the image by a plan for another tolerance, which replaces that of the imager."""
+        self._imager = self._planned_again(lines, tolerance_db)
+        return self._imager.form(lines, progress)
+
+    def _planned_again(self, lines: RangeLines, tolerance_db: float) -> SceneImager:
+        """Return what forms images by a plan for these lines, which replaces that of the imager."""
         tolerance_db = max(tolerance_db, BEST_ACCURACY_DB)
         request = Request(lines, self.grid, tolerance_db=tolerance_db, beam=self.beam)
-        scene, self.plan, track = planned(request, self.device, doubts=False)
-        self._imager = SceneImager(
-            scene,
-            self.plan,
-            self.device,
-            track=track,
-            warned=True,
-            tolerance_db=self._tolerance_db,
+        scene, plan, track = planned(request, self.device, doubts=False)
+        self.plan, self._is_unproven = plan, False
+        return SceneImager(
+            scene, plan, self.device, track=track, warned=True, tolerance_db=self._tolerance_db
         )
-        return self._imager.form(lines, progress)
 
     def _exactly(self, lines: RangeLines, progress: Progress | None, accuracy_db: float) -> Image:
         """Return the exact image; the imager forms the next ones exactly, too."""
@@ -815,8 +830,7 @@ def _certified(
     seconds = time.perf_counter() - started
     if not is_wanted(certificate, seconds, least_s):
         return image
-    first = FEWEST if least_s == 0 else FIRST
-    return certified(image, lines, device, seconds, on_miss, again, first)
+    return certified(image, lines, device, seconds, on_miss, again)
 
 
 def check_accumulate(image: Image, grid: Grid, beam: BeamWindow | None) -> None:

@@ -32,8 +32,6 @@ ON_MISS = Choice(
 
 FIRST, MOST = 64, 1024
 """Pixels that are drawn at first, and in all."""
-FEWEST = 16
-"""Pixels that are drawn at first of images by a plan that was made for another geometry."""
 _LEAST_MORE = 16  # pixels for which another round is worth its overhead
 _SHARE, _LARGEST_SHARE = 0.03, 0.05  # of the time of an image
 
@@ -90,7 +88,6 @@ def certified(
     seconds: float,
     on_miss: str,
     again: Sequence[FormAgain] = (),
-    first: int = FIRST,
 ) -> Image:
     """Return an image with the certificate of its error, formed again if it misses its tolerance.
 
@@ -106,8 +103,6 @@ def certified(
     again : sequence of callable
         Better and better ways to form the image, which are tried in turn with "refine". Each gets
         the tolerance, tightened by the miss.
-    first : int
-        Number of pixels that are drawn at first.
 
     Raises
     ------
@@ -123,7 +118,7 @@ def certified(
     misses: list[str] = []
     ways = iter(again if on_miss == "refine" else ())
     while True:
-        certificate = measured_if_possible(image, lines, device, seconds, tolerance_db, first)
+        certificate = measured_if_possible(image, lines, device, seconds, tolerance_db)
         if certificate is None or tolerance_db is None:
             break
         form_again = next(ways, None) if certificate.verdict(tolerance_db) == "missed" else None
@@ -139,22 +134,17 @@ def certified(
 
 
 def measured(
-    image: Image,
-    lines: RangeLines,
-    device: Device,
-    seconds: float,
-    tolerance_db: float | None,
-    first: int = FIRST,
+    image: Image, lines: RangeLines, device: Device, seconds: float, tolerance_db: float | None
 ) -> Certificate:
     """Return the error of an image, measured in a small part of the time that the image took.
 
-    It is measured at `first` pixels in any case, and at up to 256 if these take no more than 3 % of
+    It is measured at 64 pixels in any case, and at up to 256 if these take no more than 3 % of
     the time. While it is undecided whether the image meets its tolerance, more are drawn, up to
     1024 in all: within 5 % of the time, or however long it takes if the image seems to miss.
     """
     measurement = Measurement(image, lines, _formed(image).beam, device, tolerance_db=tolerance_db)
-    measurement.draw(first)
-    first_s = measurement.seconds / first  # more than others take
+    measurement.draw(FIRST)
+    first_s = measurement.seconds / FIRST  # more than others take
 
     def affordable(share: float) -> float:
         return (share * seconds - measurement.seconds) / first_s
@@ -190,34 +180,24 @@ def more_pixels(
 
 
 def measured_if_possible(
-    image: Image,
-    lines: RangeLines,
-    device: Device,
-    seconds: float,
-    tolerance_db: float | None,
-    first: int = FIRST,
+    image: Image, lines: RangeLines, device: Device, seconds: float, tolerance_db: float | None
 ) -> Certificate | None:
     """Return the error of an image, or None with a warning if it cannot be measured."""
-    certificate, reason = measured_or_reason(image, lines, device, seconds, tolerance_db, first)
+    certificate, reason = measured_or_reason(image, lines, device, seconds, tolerance_db)
     if reason:
         validate.warn(f"the error of the image is not known: {reason}")
     return certificate
 
 
 def measured_or_reason(
-    image: Image,
-    lines: RangeLines,
-    device: Device,
-    seconds: float,
-    tolerance_db: float | None,
-    first: int = FIRST,
+    image: Image, lines: RangeLines, device: Device, seconds: float, tolerance_db: float | None
 ) -> tuple[Certificate | None, str]:
     """Return the error of an image, or None and the reason why it cannot be measured.
 
     The reason is "" for an image of zeros from lines without echoes there.
     """
     try:
-        return measured(image, lines, device, seconds, tolerance_db, first), ""
+        return measured(image, lines, device, seconds, tolerance_db), ""
     except (ArgumentError, DeviceError, cl.Error) as error:  # the image itself is not lost
         is_empty = isinstance(error, ArgumentError) and not holds_any(image.pixels)
         return None, "" if is_empty else str(error)

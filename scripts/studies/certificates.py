@@ -113,7 +113,12 @@ def rows(
                     f"disagree: {where}: {each.kind} {each.asked_db:g}: {each.true_db:.1f} dB, by "
                     f"the certificate's sums {each.by_sums_db:.1f} dB; {tried.words}", flush=True
                 )  # fmt: skip
-    print(f"{len(images)} images, {DRAWS} draws of each\n")
+    print(f"{len(images)} images, {DRAWS} draws of each")
+    for kind in ("exact", "factorized"):
+        excess_db = np.array([each.excess_db for each in images if each.kind == kind])
+        missed = ", ".join(f"{np.sum(excess_db > db)} by more than {db} dB" for db in MISSED_DB)
+        print(f"{len(excess_db)} {kind} images, misses before any is formed again: {missed}")
+    print()
     shares = statistics(images, DRAWS)
     if picture:
         drawn(images, shares).savefig(picture, dpi=110)

@@ -78,7 +78,7 @@ def test_an_image_from_elsewhere_takes_the_beam_of_the_options_and_of_the_scene(
 
 def test_other_lines_are_warned_of(folder):
     stdout, stderr = run("certify", folder / "image.h5", folder / "other.h5")
-    assert "was formed from other lines than those of" in stderr
+    assert "was formed from other lines than those given" in stderr
     assert stdout.startswith("error ")
 
 

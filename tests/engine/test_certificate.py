@@ -10,6 +10,7 @@ from judging import SLOW
 import clsas
 from clsas.engine.certificate import Measurement
 from clsas.engine.data.certificate import of_parts
+from clsas.engine.data.lines import RangeLines
 from clsas.engine.device.device import open_device
 from clsas.selftest import extremes
 
@@ -397,3 +398,35 @@ def test_what_does_not_suit_the_lines_is_refused(speckle):
     deep = clsas.Image(image.pixels, clsas.Grid.plane((0, 1, 48), (42, 43, 48), -20))
     with pytest.raises(ValueError, match="sound_speed must include the depths of pixels, 22"):
         clsas.certify(deep, water)
+
+
+def test_receivers_that_the_sound_meets_are_no_fault():
+    """Rounding must not turn their path into NaN, nor a kernel read beyond its lines."""
+    tx_m = np.stack([np.linspace(-1, 1, 20), np.zeros(20), np.zeros(20)], axis=1)
+    velocity_m_s = np.array([30.0, 20.0, 5.0])
+    point_m = np.array([[0.3, 3.0, 0.2]])
+    flight_s = np.linalg.norm(point_m - tx_m, axis=1)[:, None] / 1500
+    lines = RangeLines(
+        np.ones((20, 2000), np.complex64), 0.0, 0.005, tx_m, point_m - velocity_m_s * flight_s,
+        100e3, 1500.0, velocity_m_s,
+    )  # fmt: skip
+    image = clsas.Image(np.ones(1, np.complex64), clsas.Grid.points(point_m))
+    assert np.isfinite(clsas.certify(image, lines).error_db)
+
+
+@pytest.mark.parametrize("live", [range(300), range(7, 4000, 397)])
+def test_silent_parts_of_lines_do_not_hide_their_band(live):
+    """Lines on their carrier, the first half of which is silent, as are many channels."""
+    random, channels, length = np.random.default_rng(0), max(live) + 1, 400
+    spectrum = random.normal(size=(len(live), length, 2)) @ [1, 1j]
+    frequency = np.fft.fftfreq(length)
+    spectrum[:, (frequency < 0.15) | (frequency > 0.45)] = 0
+    samples = np.zeros((channels, length), np.complex64)
+    samples[list(live), length // 2 :] = np.fft.ifft(spectrum)[:, length // 2 :]
+    samples *= np.sin(np.pi * np.clip(np.arange(length) - length // 2, 0, None) / 200) ** 2
+    tx_m = np.stack([np.linspace(-1, 1, channels), *np.zeros((2, channels))], axis=1)
+    lines = RangeLines(samples, 20.0, 0.02, tx_m, tx_m, 0.0, 1500.0)
+    grid = clsas.Grid.plane((-1, 1, 30), (20.5, 27.5, 60))
+    image = clsas.backproject(lines, grid, accuracy_db=-60, certificate=False)
+    for seed in range(20):
+        assert clsas.certify(image, lines, pixels=64, seed=seed).error_db < -55

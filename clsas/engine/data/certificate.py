@@ -134,6 +134,8 @@ class Certificate:
         if is_undecided and self.lower_db > NO_ERROR_DB:
             bound = f"between {self.lower_db:.1f} and {self.upper_db:.1f} dB with 90 % confidence"
         text = f"error {self.error_db:.1f} dB ({bound}, measured at {self.pixels} pixels)"
+        if self.pixels == self.of_pixels:
+            text = f"error {self.error_db:.1f} dB (measured at all pixels)"
         return text if tolerance_db is None else f"{text}; {tolerance_db:g} dB requested"
 
     def __repr__(self) -> str:

@@ -47,7 +47,14 @@ from clsas.engine.factorized.leaves import (
 )
 from clsas.engine.factorized.plan import Factorization, Plan
 from clsas.engine.factorized.track import MeanTrack
-from clsas.engine.factorized.tree import Geometry, Sector, geometry_of, references, sector_of
+from clsas.engine.factorized.tree import (
+    Geometry,
+    Sector,
+    geometry_of,
+    references,
+    sector_of,
+    track_for,
+)
 from clsas.engine.factorized.virtual_channels import VirtualChannels, band_table
 from clsas.engine.scene import Scene
 
@@ -73,7 +80,7 @@ class FactorizedImager:
     ----------
     scene : Scene
     plan : Plan
-        A plan with a factorization, made for this geometry or for one that differs very little.
+        A plan with a factorization, made for this geometry or for another one.
     device : Device
     track : MeanTrack, optional
         The mean track, of the shape that the factorization has, if planning has found it.
@@ -91,7 +98,7 @@ class FactorizedImager:
         keep: bool = True,
     ) -> None:
         self.scene, self.plan, self.device = scene, plan, device.for_stages()
-        self._track = track
+        self._known_track = track
         self._most_kept_bytes = _MOST_KEPT_BYTES if keep else 0
         self._kept_sectors: list[Sector] | None = None
         self._kept_groups: LeafGroups | None = None
@@ -160,9 +167,14 @@ class FactorizedImager:
         return pixels
 
     @cached_property
+    def track(self) -> MeanTrack | None:
+        """The mean track, of the shape that the factorization has, None if there is none."""
+        return self._known_track or track_for(self.scene, self.plan.factorization)
+
+    @cached_property
     def geometry(self) -> Geometry:
         """Mean track, channels and subimages, found when they are first needed."""
-        return geometry_of(self.scene, self.plan.factorization, self._track)
+        return geometry_of(self.scene, self.plan.factorization, self.track)
 
     def _leaves(
         self, uploaded: DeviceLines, work: Slot, pixels: NDArray[np.complex64]

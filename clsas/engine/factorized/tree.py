@@ -197,6 +197,13 @@ class Geometry:
     corrections: Corrections | None = None
 
 
+def track_for(scene: Scene, factorization: Factorization) -> MeanTrack | None:
+    """Return the mean track of a scene of the shape that a factorization has, None without one."""
+    centre = factorization.resampling.centre_cycles_per_sample
+    wavelength_m = band_wavelength_m(scene.lines, centre)
+    return mean_track_of(scene.lines, factorization.aperture.shape, wavelength_m)
+
+
 def geometry_of(
     scene: Scene, factorization: Factorization, track: MeanTrack | None = None
 ) -> Geometry:
@@ -217,8 +224,7 @@ def geometry_of(
     lines, surface, beam = scene.lines, scene.surface, scene.beam
     resampling, sides = factorization.resampling, factorization.sides
     wavelength_m = band_wavelength_m(lines, resampling.centre_cycles_per_sample)
-    shape = factorization.aperture.shape
-    track = track or mean_track_of(lines, shape, wavelength_m)
+    shape, track = factorization.aperture.shape, track or track_for(scene, factorization)
     if track is None:
         raise ArgumentError(
             "lines",

@@ -148,6 +148,30 @@ def test_antennas_that_move_far_have_another_plan():
     assert relative_error_db(image, backproject(others, grid, accuracy_db=-80)) <= -50
 
 
+def test_a_miss_that_is_only_told_does_not_count_as_a_check():
+    lines, grid = made(straight)
+    imager = clsas.Imager(lines, grid, planned(lines, grid, tolerance_db=-50))
+    others = moved(lines, 0.5)
+    imager(others, certificate=False)
+    with pytest.warns(ClsasWarning, match="misses its tolerance"):
+        imager(others, on_miss="warn")
+    with pytest.raises(clsas.ToleranceError):
+        imager(others, on_miss="raise")
+    with pytest.warns(ClsasWarning, match="was formed again"):
+        image = imager(others)
+    assert relative_error_db(image, backproject(others, grid, accuracy_db=-80)) <= -50
+    assert imager.plan.tolerance_db == -50  # a plan of their own need not be better
+    assert imager(others).formed.certificate is None
+
+
+def test_antennas_that_a_plan_cannot_take_have_another_one():
+    lines, grid = made(straight)
+    imager = clsas.Imager(lines, grid, planned(lines, grid))
+    one = lines.select([lines.channels // 2])
+    assert relative_error_db(imager(one), backproject(one, grid, accuracy_db=-80)) <= -40
+    assert relative_error_db(imager(lines), backproject(lines, grid, accuracy_db=-80)) <= -40
+
+
 def test_exact_images_of_antennas_that_have_moved():
     lines, grid = made(straight)
     imager, others = clsas.Imager(lines, grid, accuracy_db=-50), moved(lines, 0.05)
