@@ -51,9 +51,8 @@ def certify(
     A few hundred pixels are formed again, straight from the lines and the
     positions of the antennas, and compared with those of the image. It may come from any imager or
     program, and be the Zarr store of a mosaic that fits into memory. LINES.H5 may also be a
-    recording of another kind. The beam is that with which clsas formed the image, or else that of
-    the scene, which may also have the sound speed. The beam of an image from elsewhere is given by
-    the options.
+    recording of another kind. The beam is that of the options if any is given, else that with which
+    clsas formed the image, or else that of the scene, which may also have the sound speed.
 
     \b
     Example:  clsas certify image.h5 lines.h5
