@@ -47,8 +47,8 @@ from clsas.engine.signal.spectrum import (
     power_outside,
 )
 
-_SAME = ("carrier_hz", "sound_speed_m_s", "range_step_m", "length")
-"""Of lines that one imager may image: filters and their tables depend on these."""
+_SAME = {"carrier_hz": 0.01, "sound_speed_m_s": 0.01, "range_step_m": 0.01, "length": 0.0}
+"""Largest relative differences of lines that one imager may image: filters depend on these."""
 
 
 def plan(
@@ -632,8 +632,8 @@ class Imager:
         Parameters
         ----------
         lines : RangeLines
-            With the carrier, sound speed, range step and number of samples of those that the imager
-            was made for.
+            With the number of samples of those that the imager was made for, and within 1 % of
+            their carrier, sound speed and range step.
         certificate : bool, optional
             Whether the error of the image is measured, as by `clsas.certify`. By default,
             that of the first image is measured, if the imager was not made from a plan, and
@@ -710,11 +710,12 @@ class Imager:
     def _move_to(self, lines: RangeLines, digest: str) -> None:
         """Make ready for lines with other antennas or first ranges, by the same plan."""
         assert self._imager is not None
-        for name in _SAME:
-            given, allowed = getattr(lines, name), getattr(self._imager.scene.given_lines, name)
-            if given != allowed:
+        for name, share in _SAME.items():
+            given, first = getattr(lines, name), getattr(self._imager.scene.given_lines, name)
+            if abs(given - first) > share * abs(first):
+                allowed = f"stay within {share:.0%} of {first:g}" if share else f"stay {first:g}"
                 hint = "make another `Imager` for these lines"
-                raise ArgumentError(f"{name} of lines", f"stay {allowed}", f"{given}", hint)
+                raise ArgumentError(f"{name} of lines", allowed, f"{given:g}", hint)
         plan = self._imager.plan
         allowed_db = plan.tolerance_db if isinstance(plan, Plan) else plan.accuracy_db
         scene = Scene.of(lines, self.grid, self.beam, allowed_db)

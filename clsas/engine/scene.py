@@ -140,7 +140,9 @@ class Scene:
     @cached_property
     def ambiguity(self) -> Ambiguity:
         """Errors that the lines themselves cause, whatever the method."""
-        return ambiguity(self.lines, self.grid, self.spectrum, self.beam, self.along)
+        return ambiguity(
+            self.lines, self.grid, self.spectrum, self.line_energy, self.beam, self.along
+        )
 
     @cached_property
     def surface(self) -> Surface:

@@ -184,6 +184,11 @@ TERMS = {
     "margin of 1 dB": Term({"factorized.errors.MARGIN_DB": 0.0}, inline=2),
     "margin: few channels": Term({"factorized.errors._FEW_CHANNELS": (0.0, 0.0)}, inline=7),
     "margin: few frequencies": Term({"signal.spectrum._FEW_FREQUENCIES": 0.0}, inline=8),
+    "few resolution cells": Term(
+        {"signal.ambiguity.scatter": constant(1.0)},
+        ("signal.ambiguity.independent_pixels",),
+        ("signal.ambiguity.scatter", "signal.ambiguity.independent_pixels"), inline=18,
+    ),
     "dark images": Term(
         {"signal.ambiguity.brightness": constant(1.0)},
         code=("signal.ambiguity.brightness", "signal.ambiguity._brightness_of_groups"), inline=30,

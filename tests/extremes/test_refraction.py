@@ -383,8 +383,8 @@ def test_an_imager_takes_other_samples():
         with clsas.Imager(lines, grid, **request) as imager:
             image = imager(replace(lines, samples=0.5j * lines.samples))
             assert oracle.error_db(image.pixels, 0.5j * ideal) < -50
-            with pytest.raises(ValueError, match="lines must have the antennas"):
-                imager(replace(lines, sound_speed=None))
+            straight = imager(replace(lines, sound_speed=None))
+            assert oracle.error_db(straight.pixels, ideal) > -20
 
 
 @pytest.mark.slow

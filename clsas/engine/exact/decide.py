@@ -109,7 +109,7 @@ class Decision:
 
     def error_db(self, scene: Scene) -> float:
         """Return the relative rms error of the image, of the lines and of what is left out, dB."""
-        of_passed = power(self.interpolator.error_db) / scene.ambiguity.brightness
+        of_passed = power(self.interpolator.error_db) / scene.ambiguity.least_brightness
         return in_db(of_passed + scene.ambiguity.error_power + scene.left_out_error)
 
 

@@ -406,7 +406,7 @@ def _completed(found: Plan, request: Request, scene: Scene, costs: KnownCosts) -
     """Return a plan of the simplified scene as one of the request: with all errors, and origins."""
     ambiguity, errors = scene.ambiguity, found.errors
     if not found.is_exact:
-        errors = errors.times(1 / ambiguity.brightness)
+        errors = errors.times(1 / ambiguity.least_brightness)
     errors = replace(
         errors,
         line_ends=ambiguity.ends,

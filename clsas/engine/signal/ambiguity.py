@@ -5,7 +5,8 @@ unknown to which end of the band the energy between its edges belongs. Every ima
 errors to its prediction, and warns if they are too large.
 
 The lines also decide how large any error becomes relative to the image. It is larger if most of
-what the channels receive cancels in the image (`brightness`).
+what the channels receive cancels in the image (`brightness`), and may be larger by chance if the
+image has few resolution cells (`scatter`).
 """
 
 from __future__ import annotations
@@ -13,22 +14,26 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
 from clsas.engine.data import validate
-from clsas.engine.data.beam import BeamWindow
+from clsas.engine.data.beam import BeamWindow, normalising
 from clsas.engine.data.decibels import in_db, power
 from clsas.engine.data.fourier import turned
 from clsas.engine.data.geometry import pairwise_range_m
 from clsas.engine.data.grid import Grid
 from clsas.engine.data.lines import (
+    GOLDEN,
     RangeLines,
+    antennas_of,
+    cycles_per_m_at,
     some_channels,
     wavelength_m,
 )
 from clsas.engine.data.visibility import is_within, sines
 from clsas.engine.signal.interpolation import TAPS
-from clsas.engine.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum
+from clsas.engine.signal.spectrum import NEEDED_OVERSAMPLING, Spectrum, representative_channels
 
 BEST_DB = -85.0
 """Smallest relative rms error of an image that single precision allows."""
@@ -57,12 +62,21 @@ class Ambiguity:
         Sample rate over the width of the occupied band.
     brightness : float
         Power of the image over the power that its beam passes; see `brightness`.
+    scatter : float
+        Factor by which chance may raise the relative error power of images with few resolution
+        cells; see `scatter`.
     """
 
     ends: float = 0.0
     aliasing: float = 0.0
     oversampling: float = np.inf
     brightness: float = 1.0
+    scatter: float = 1.0
+
+    @property
+    def least_brightness(self) -> float:
+        """Power of the image over the power that its beam passes, as low as chance may make it."""
+        return self.brightness / self.scatter
 
     @property
     def error_power(self) -> float:
@@ -73,9 +87,10 @@ class Ambiguity:
         """Return the error relative to what the beam passes that meets `requested_db`, dB.
 
         The result is never below `BEST_DB`. If the image is so dark that the request cannot be met,
-        `warn` warns.
+        `warn` warns. It does not warn of what only chance may cause, which predicted errors
+        include.
         """
-        return max(requested_db + in_db(self.brightness), min(requested_db, BEST_DB))
+        return max(requested_db + in_db(self.least_brightness), min(requested_db, BEST_DB))
 
     def rest_db(self, requested_db: float, other_error: float = 0.0) -> float:
         """Return the error left for all other causes, dB, so that the image meets `requested_db`.
@@ -125,18 +140,21 @@ def ambiguity(
     lines: RangeLines,
     grid: Grid,
     spectrum: Spectrum,
+    energy: NDArray[np.float64],
     beam: BeamWindow | None = None,
     along: NDArray[np.float64] | None = None,
 ) -> Ambiguity:
     """Return the unavoidable error power of an image on a grid.
 
-    `along` are the unit directions of the track, [channels, 3], or None without a beam.
+    `energy` is the energy of every line in any unit, [channels]. `along` are the unit directions of
+    the track, [channels, 3], or None without a beam.
     """
     return Ambiguity(
         ends_error(lines, grid, spectrum, beam, along),
         spectrum.aliasing,
         spectrum.oversampling,
         brightness(lines, grid, spectrum, beam, along),
+        scatter(independent_pixels(lines, grid, spectrum, energy, beam, along)),
     )
 
 
@@ -366,3 +384,97 @@ def _beam_weights(
     sine = sines(points_m, lines.phase_centres_m[channels], along[channels]).T
     weights: NDArray[np.float64] = beam.weights(sine, wavelength_m(lines))
     return weights
+
+
+# Chance in images with few resolution cells.
+
+_PIXELS = 256  # pixels sampled; with more independent pixels, the scatter is below `MARGIN_DB`
+_NOISE_CHANNELS = 256  # channels sampled in addition to the loudest; a beam passes some of them
+# Terms sampled of the sums over channels and frequencies; twice as many change nothing.
+_TERMS = 256
+_KEPT = 0.995  # share of images that must meet their accuracy
+
+
+def scatter(independent: float) -> float:
+    """Return the factor of relative error power that 99.5 % of noise images do not exceed.
+
+    By chance, the power of an image with few resolution cells may be far below its expected value,
+    and the power of its errors far above.
+
+    Parameters
+    ----------
+    independent : float
+        Number of `independent_pixels` of the images.
+
+    Notes
+    -----
+    The ratio of two mean powers over N independent complex Gaussian values has the F distribution
+    of 2 N and 2 N degrees of freedom.
+    """
+    quantile = scipy.special.fdtri(2 * independent, 2 * independent, _KEPT)
+    return max(float(quantile) / power(MARGIN_DB), 1.0)
+
+
+def independent_pixels(
+    lines: RangeLines,
+    grid: Grid,
+    spectrum: Spectrum,
+    energy: NDArray[np.float64],
+    beam: BeamWindow | None,
+    along: NDArray[np.float64] | None,
+) -> float:
+    """Return the number of independent pixels of a noise image, from 1 to 256.
+
+    Parameters
+    ----------
+    lines, grid, spectrum, beam, along
+        As for `brightness`.
+    energy : float64 [channels]
+        Energy of every line, in any unit.
+
+    Notes
+    -----
+    A pixel is a sum of many terms, one for every channel and frequency. N is the inverse of the
+    mean squared correlation of two pixels, over all pairs. Terms are sampled in proportion to their
+    power. Sums of so few terms are correlated by 1/`_TERMS` even if the phases are random. This is
+    subtracted, which overestimates N by up to a third for N up to 60.
+    """
+    is_whole = grid.size <= _PIXELS
+    number = np.arange(_PIXELS)
+    points_m = grid.at(
+        np.arange(grid.size) if is_whole else (number * GOLDEN % 1 * grid.size).astype(np.int64)
+    )
+    some, factor = representative_channels(lines, _NOISE_CHANNELS, energy)
+    weights = np.ones((len(points_m), len(some)))
+    if beam is not None and along is not None:
+        weights = _beam_weights(lines, some, points_m, beam, along)
+        if beam.normalise:
+            mean = weights.mean(axis=1, keepdims=True)
+            weights *= normalising(mean * lines.channels, lines.channels)
+    seen = np.mean(weights**2, axis=0)
+    held = np.cumsum(seen * factor.astype(np.float64) ** 2 * (energy[some] / (energy.max() or 1.0)))
+    if not held[-1]:
+        return float(_PIXELS)
+    term = np.arange(_TERMS)
+    chosen = np.searchsorted(held, (term + 0.5) / _TERMS * held[-1])
+    away = 2 * (term * GOLDEN % 1) - 1
+    share = np.cumsum(spectrum.share)
+    frequency = np.copysign(np.interp(np.abs(away), share / share[-1], spectrum.frequency), away)
+    channels = some[chosen]
+    range_m = pairwise_range_m(points_m, *antennas_of(lines, channels))
+    per_m = cycles_per_m_at(lines, spectrum.centre + frequency)
+    terms = turned(range_m * per_m).astype(np.complex64)
+    sample = (range_m - lines.first_range_m[channels]) / lines.range_step_m
+    is_reached = (sample > -1) & (sample < lines.length)
+    terms *= is_reached * weights[:, chosen] / np.sqrt(_TERMS * seen[chosen])
+    alike = np.abs(terms @ terms.conj().T) ** 2
+    own = np.abs(terms).astype(np.float64) ** 2
+    both = np.multiply.outer(own.sum(axis=1), own.sum(axis=1))
+    if not is_whole:  # a pixel is not sampled twice
+        np.fill_diagonal(alike, 0.0)
+        np.fill_diagonal(both, 0.0)
+    if not both.any():
+        return float(_PIXELS)
+    by_few = 1 / _TERMS
+    mean = float(alike.sum(dtype=np.float64) / both.sum())
+    return 1 / float(np.clip((mean - by_few) / (1 - by_few), 1 / _PIXELS, 1.0))

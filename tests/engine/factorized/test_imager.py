@@ -185,9 +185,9 @@ def test_exact_images_of_antennas_that_have_moved():
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("carrier_hz", 90e3, "carrier_hz of lines must stay 120000.0, got 90000.0"),
-        ("range_step_m", 0.01, "range_step_m of lines must stay"),
-        ("sound_speed_m_s", 1490.0, "sound_speed_m_s of lines must stay 1500.0, got 1490.0"),
+        ("carrier_hz", 90e3, "carrier_hz of lines must stay within 1% of 120000, got 90000"),
+        ("range_step_m", 0.01, "range_step_m of lines must stay within 1% of"),
+        ("sound_speed_m_s", 1450.0, "sound_speed_m_s of lines must stay within 1% of 1500, got"),
     ],
 )
 def test_lines_of_another_band_are_refused(name, value, message):
