@@ -40,7 +40,7 @@ from clsas.engine.promise import more_pixels
 from clsas.selftest import oracle
 
 PIXELS = {False: 4000, True: 450}  # that are known; fewer where sound speed varies: rays are slow
-DRAWS = 40
+DRAWS = 10
 LONG, SHORT = (64, 256, 512, 1024), (64, 128, 256, 512, 1024)  # pixels after each round
 FIXED = (64, 256, 1024)
 COLUMNS = ("%", *(f"{count} pixels" for count in FIXED), "64 to 1024", "256 to 1024")
