@@ -7,7 +7,6 @@ factorization of the plan.
 
 from __future__ import annotations
 
-import math
 import time
 import weakref
 from collections.abc import Callable, Sequence
@@ -465,7 +464,7 @@ def backproject(
         return imager.form(lines, progress)
 
     ways = () if is_fixed or accuracy_db <= BEST_ACCURACY_DB else (again,)
-    image = _certified(image, lines, device, started, math.inf if is_fixed else None, ways, **asked)
+    image = _certified(image, lines, device, started, not is_fixed, ways, **asked)
     return _added(image, accumulate)
 
 
@@ -687,8 +686,7 @@ class Imager:
             self._checked = weakref.ref(lines)
         image = self._imager.form(lines, progress)
         self._planning_s = 0.0
-        least_s = None if self._is_next_certified else math.inf
-        self._is_next_certified = False
+        by_default, self._is_next_certified = self._is_next_certified, False
         again, exactly = (
             partial(each, lines, progress) for each in (self._form_again, self._exactly)
         )
@@ -697,10 +695,12 @@ class Imager:
             is_best = (self._tolerance_db or 0.0) <= BEST_ACCURACY_DB
             ways = () if is_best else (exactly,)
         elif self._is_unproven and self._tolerance_db is not None:
-            least_s, tolerance_db = 0.0, self._tolerance_db
+            tolerance_db = self._tolerance_db
+            if certificate is None:  # whatever its time
+                asked["certificate"] = True
             # Another plan for these antennas need not be better than the tolerance.
             ways = lambda _: again(tolerance_db), again, exactly
-        image = _certified(image, lines, self.device, started, least_s, ways, **asked)
+        image = _certified(image, lines, self.device, started, by_default, ways, **asked)
         assert image.formed is not None
         measured = image.formed.certificate
         if measured is not None and self._tolerance_db is not None:
@@ -818,18 +818,15 @@ def _certified(
     lines: RangeLines,
     device: Device,
     started: float,
-    least_s: float | None,
+    by_default: bool,
     again: Sequence[FormAgain] = (),
     *,
     certificate: bool | None,
     on_miss: str,
 ) -> Image:
-    """Return an image that was begun at a time, with its certificate if it is to have one.
-
-    `least_s` is the time from which on it is certified by default: see `is_wanted`.
-    """
+    """Return an image that was begun at a time, with its certificate if it is to have one."""
     seconds = time.perf_counter() - started
-    if not is_wanted(certificate, seconds, least_s):
+    if not is_wanted(certificate, seconds, by_default=by_default):
         return image
     return certified(image, lines, device, seconds, on_miss, again)
 

@@ -30,8 +30,7 @@ ON_MISS = Choice(
     "it, or end with an error.",
 )
 
-FIRST, MOST = 64, 1024
-"""Pixels that are drawn at first, and in all."""
+FIRST, MOST = 64, 1024  # pixels that are drawn at first, and in all
 _LEAST_MORE = 16  # pixels for which another round is worth its overhead
 _SHARE, _LARGEST_SHARE = 0.03, 0.05  # of the time of an image
 
@@ -71,14 +70,12 @@ class ToleranceError(RuntimeError):
         return f"the image misses its tolerance: {self.certificate.describe(self.tolerance_db)}"
 
 
-def is_wanted(certificate: bool | None, seconds: float, least_s: float | None = None) -> bool:
-    """Return whether an image is certified: as requested, or by default if it took long enough.
+def is_wanted(certificate: bool | None, seconds: float, *, by_default: bool = True) -> bool:
+    """Return whether an image that took some time is certified.
 
-    `least_s` is `LEAST_SECONDS`, unless another time is given.
+    Without a request, it is certified `by_default` if it took long enough.
     """
-    if certificate is None:
-        return seconds >= (LEAST_SECONDS if least_s is None else least_s)
-    return certificate
+    return by_default and seconds >= LEAST_SECONDS if certificate is None else certificate
 
 
 def certified(

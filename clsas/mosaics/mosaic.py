@@ -1041,7 +1041,7 @@ def _image(
     seconds = time.perf_counter() - began
     fields |= how | {"has_pixels": holds_any(image.pixels)}
     is_in_db = not request.keys() & {"stages", "tolerance_wavelengths"}
-    if is_wanted(certificate, seconds, None if is_in_db else math.inf):
+    if is_wanted(certificate, seconds, by_default=is_in_db):
         fields["certificate"], fields["unmeasured"] = measured_or_reason(
             image, lines, device, seconds, tolerance_db
         )

@@ -77,7 +77,7 @@ def interpolations(stages: int, dimensions: int) -> float:
 
 def _least_rate(taps: int, most_db: float, spectrum: Spectrum, error: str) -> float | None:
     """Return the lowest rate at which a filter's error is at most `most_db`, or None."""
-    errors = _errors_db(taps, error, spectrum.frequency.tobytes(), spectrum.power.tobytes())
+    errors = _errors_db(taps, error, *spectrum.as_bytes)
     if errors[-1] > most_db:
         return None
     if errors[0] <= most_db:

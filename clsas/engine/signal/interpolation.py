@@ -192,7 +192,7 @@ def designs(taps: int, upsamplings: Sequence[float], spectrum: Spectrum) -> list
 def usual_designs(taps: int, frequency: bytes, power: bytes) -> tuple[Interpolator, ...]:
     """Return the interpolators of `designs` for all `UPSAMPLINGS`, which are remembered.
 
-    The arguments are arrays of a `Spectrum`, as bytes.
+    The arrays are `Spectrum.as_bytes`.
     """
     spectrum = Spectrum(0.0, np.frombuffer(frequency), np.frombuffer(power))
     return tuple(designs(taps, UPSAMPLINGS, spectrum))
@@ -259,8 +259,7 @@ def choose(
     candidates = []
     for each_taps in TAPS if taps is None else (taps,):
         if upsampling is None:
-            as_bytes = spectrum.frequency.tobytes(), spectrum.power.tobytes()
-            designed = usual_designs(each_taps, *as_bytes)
+            designed = usual_designs(each_taps, *spectrum.as_bytes)
         else:
             designed = (design(each_taps, upsampling, spectrum),)
         for found in designed:

@@ -85,6 +85,11 @@ class Spectrum:
         return self.power if self.line_power is None else self.line_power
 
     @property
+    def as_bytes(self) -> tuple[bytes, bytes]:
+        """Frequencies and power as bytes, by which results are remembered."""
+        return self.frequency.tobytes(), self.power.tobytes()
+
+    @property
     def bin_width(self) -> float:
         """Distance between frequencies, cycles per sample."""
         return float(self.frequency[1] - self.frequency[0])
